@@ -1,0 +1,95 @@
+"""The answer of the channel that was asked for co-evidence: present, absent, or unqueried.
+
+Absence is a measurement with a type of its own. A sensor that was not asked says nothing, which is a third
+thing and neither of the two.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.checks import in_range
+
+
+@dataclass(frozen=True, slots=True)
+class Absent:
+    """The sector was searched and the co-evidence is not there.
+
+    Parameters
+    ----------
+    miss_rate : float
+        beta_c(theta, d): probability that a visible source of this class is missed, in [0, 1].
+    clutter_rate : float
+        Probability that the channel reports co-evidence where there is none, in [0, 1).
+
+    Examples
+    --------
+    >>> Absent(miss_rate=0.04).log_likelihoods().round(3)
+    array([ 0.   , -3.219,  0.   ])
+    """
+
+    miss_rate: float
+    clutter_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        in_range("miss_rate", self.miss_rate, 0.0, 1.0)
+        in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_high=True)
+
+    def log_likelihoods(self) -> np.ndarray:
+        """Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible."""
+        spurious = np.log1p(-self.clutter_rate)
+        with np.errstate(divide="ignore"):
+            missed = np.log(self.miss_rate)
+        return np.array([spurious, missed + spurious, spurious]) + 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """The sector was searched and the co-evidence is there.
+
+    Parameters
+    ----------
+    miss_rate : float
+        beta_c(theta, d) of the channel, in [0, 1].
+    clutter_rate : float
+        Probability of co-evidence where there is no such source, in (0, 1): with zero a single false detection
+        would remove the hidden explanation for ever.
+
+    Examples
+    --------
+    >>> Present(miss_rate=0.04, clutter_rate=0.01).log_likelihoods().round(2)
+    array([-4.61, -0.04, -4.61])
+    """
+
+    miss_rate: float
+    clutter_rate: float = 0.01
+
+    def __post_init__(self) -> None:
+        in_range("miss_rate", self.miss_rate, 0.0, 1.0)
+        in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
+
+    def log_likelihoods(self) -> np.ndarray:
+        """Log p(present | hidden, visible, none), shape (3,), nats."""
+        spurious = np.log(self.clutter_rate)
+        found = np.log1p(-self.miss_rate * (1.0 - self.clutter_rate))
+        return np.array([spurious, found, spurious])
+
+
+@dataclass(frozen=True, slots=True)
+class Unqueried:
+    """The channel was not asked: no frame, outside its field of view, or no such sensor.
+
+    Examples
+    --------
+    >>> Unqueried("no detections file").log_likelihoods()
+    array([0., 0., 0.])
+    """
+
+    reason: str
+
+    def log_likelihoods(self) -> np.ndarray:
+        """Zero for every explanation, shape (3,): beta = 1, it moves nothing."""
+        return np.zeros(3)
+
+
+CoEvidence = Absent | Present | Unqueried

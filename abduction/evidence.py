@@ -1,0 +1,58 @@
+"""What a signature says of each explanation, as log-likelihoods."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+
+@dataclass(frozen=True, slots=True)
+class SignatureEvidence:
+    r"""Log-likelihoods of one observation under every explanation, up to a common constant.
+
+    The hidden explanation has one hypothesis per direction k, so that
+
+    .. math:: \ell_{hid}(y) = \sum_k P(k \mid hid)\, \ell_{hid,k}(y)
+
+    is the integral over the hidden state of eq. (post), with the direction weights carried by the filter.
+
+    Parameters
+    ----------
+    directions : tuple of str
+        Labels of the hidden hypotheses, for example ``("left", "right")``; at least one, all different.
+    hidden : tuple of float
+        log l_hid,k, one per direction, nats.
+    visible : float
+        log l_vis, nats.
+    none : float
+        log l_0, nats.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a likelihood is not finite or the numbers do not fit the directions.
+
+    Examples
+    --------
+    >>> SignatureEvidence(("left", "right"), (1.2, -0.3), -2.0, 0.1).hidden
+    (1.2, -0.3)
+    """
+
+    directions: tuple[str, ...]
+    hidden: tuple[float, ...]
+    visible: float
+    none: float
+
+    def __post_init__(self) -> None:
+        if not self.directions or len(set(self.directions)) != len(self.directions):
+            raise InvalidArgumentError(f"directions: expected different labels, got {self.directions!r}")
+        finite_array("hidden", self.hidden, (len(self.directions),))
+        finite_array("visible", self.visible, ())
+        finite_array("none", self.none, ())
+
+    @property
+    def log_likelihoods(self) -> np.ndarray:
+        """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
+        return np.array([*self.hidden, self.visible, self.none])

@@ -1,0 +1,1 @@
+"""Everything that touches a file, a camera, a data set, a bus or a clock."""

@@ -1,0 +1,1 @@
+"""A blind junction in the computer: recordings with known truth."""

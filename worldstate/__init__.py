@@ -1,0 +1,1 @@
+"""A structured world-state, kept alive when a sensor goes blind."""

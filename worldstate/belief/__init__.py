@@ -1,0 +1,1 @@
+"""Beliefs: what is carried from one measurement to the next."""

@@ -1,0 +1,76 @@
+"""Checks for the public boundary: called once there, trusted inside.
+
+Every check names the argument, what came and what was expected.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.errors import InvalidArgumentError
+
+
+def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> NDArray[np.float64]:
+    """Return `value` as finite float64 of the given shape; `None` leaves an axis free.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, a type that is no number, NaN or infinity.
+
+    Examples
+    --------
+    >>> finite_array("position_m", [1, 2, 3], (3,))
+    array([1., 2., 3.])
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(f"{name}: expected numbers, got {type(value).__name__}") from error
+    check_shape(name, array.shape, shape)
+    if not np.isfinite(array).all():
+        raise InvalidArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
+    return array
+
+
+def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None]) -> None:
+    """Refuse a shape that does not fit; `None` in `expected` leaves an axis free.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the shapes do not agree.
+
+    Examples
+    --------
+    >>> check_shape("block", (4800, 56), (None, 56))
+    """
+    fits = len(got) == len(expected) and all(e in (None, g) for g, e in zip(got, expected, strict=True))
+    if not fits:
+        wanted = ", ".join("any" if e is None else str(e) for e in expected)
+        raise InvalidArgumentError(f"{name}: expected shape ({wanted}), got {got}")
+
+
+def in_range(
+    name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False
+) -> float:
+    """Return `value` as a float if it lies in the range, ends included unless said otherwise.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is no number, not finite, or outside.
+
+    Examples
+    --------
+    >>> in_range("alpha", 0.02, 0, 1, open_low=True)
+    0.02
+    """
+    number = float(finite_array(name, value, ()))
+    below = number <= low if open_low else number < low
+    above = number >= high if open_high else number > high
+    if below or above:
+        left, right = "(" if open_low else "[", ")" if open_high else "]"
+        raise InvalidArgumentError(f"{name}: expected a number in {left}{low}, {high}{right}, got {number}")
+    return number

@@ -1,0 +1,1 @@
+"""Protocols and metrics that hold the library against data."""

@@ -1,0 +1,118 @@
+"""What an adapter hands to the filter: one look of one modality at the world."""
+
+from dataclasses import dataclass
+
+from worldstate.abduction.co_evidence import CoEvidence
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.checks import in_range
+from worldstate.values import NotUsable
+
+
+@dataclass(frozen=True, slots=True)
+class Bearing:
+    """A measured azimuth.
+
+    Parameters
+    ----------
+    azimuth_rad : float
+        In (-pi, pi], left positive, in `base_link`.
+    std_rad : float
+        Standard deviation of a line-of-sight source; a hidden one has a measurement model of its own.
+    prominence : float
+        Peak-to-median ratio of the spatial spectrum the bearing was read from, >= 1.
+
+    Examples
+    --------
+    >>> Bearing(0.3, 0.06, 1.4).azimuth_rad
+    0.3
+    """
+
+    azimuth_rad: float
+    std_rad: float
+    prominence: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """A measured approach rate: the reciprocal time-to-arrival 1/TTA = -r_dot/r.
+
+    Parameters
+    ----------
+    inverse_tta_hz : float
+        1/s, positive while closing.
+    std_hz : float
+        Standard deviation, 1/s, > 0.
+
+    Examples
+    --------
+    >>> Approach(inverse_tta_hz=0.5, std_hz=0.25).inverse_tta_hz
+    0.5
+    """
+
+    inverse_tta_hz: float
+    std_hz: float
+
+    def __post_init__(self) -> None:
+        in_range("std_hz", self.std_hz, 0.0, float("inf"), open_low=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One object that the co-evidence channel reports in plain view.
+
+    Parameters
+    ----------
+    azimuth_rad : float
+        In (-pi, pi], left positive, in `base_link`.
+    std_rad : float
+        Standard deviation of the azimuth.
+    label : str
+        Class name as the detector says it.
+    score : float
+        Detector confidence in [0, 1].
+    width_rad : float
+        Angular width.
+    moving : bool
+        False for an object that has stood still long enough to be parked.
+
+    Examples
+    --------
+    >>> Sighting(0.2, 0.02, "car", 0.9).moving
+    True
+    """
+
+    azimuth_rad: float
+    std_rad: float
+    label: str
+    score: float
+    width_rad: float = 0.0
+    moving: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Evidence of one modality at one instant, with the answer of its co-evidence channel.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        End of the observed interval, nanoseconds on the stream's clock.
+    signature : SignatureEvidence
+        Log-likelihoods of the observation under every explanation.
+    co_evidence : CoEvidence
+        Present, Absent or Unqueried.
+    bearing, approach : Bearing or Approach, or NotUsable
+        Marginalised where not usable.
+    sightings : tuple of Sighting
+        All that the co-evidence channel reports, in the queried sector or not.
+    source : str
+        Name of the modality.
+    """
+
+    stamp_ns: int
+    signature: SignatureEvidence
+    co_evidence: CoEvidence
+    bearing: Bearing | NotUsable
+    approach: Approach | NotUsable
+    sightings: tuple[Sighting, ...] = ()
+    source: str = "acoustic"

@@ -1,0 +1,1 @@
+"""S_t = {entities, relations, context, cues} as immutable values."""

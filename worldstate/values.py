@@ -1,0 +1,62 @@
+"""Small values that every storey of the house speaks of."""
+
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+NANOSECONDS_PER_SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class NotUsable:
+    """An estimate that was asked for and cannot be given, with the reason.
+
+    It is neither zero nor missing: whoever fuses it must marginalise the quantity.
+
+    Examples
+    --------
+    >>> NotUsable("no stable tone")
+    NotUsable(reason='no stable tone')
+    """
+
+    reason: str
+
+
+@overload
+def wrap_angle(angle_rad: float) -> float: ...
+@overload
+def wrap_angle(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def wrap_angle(angle_rad: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+    """Wrap an angle in radians into (-pi, pi].
+
+    Examples
+    --------
+    >>> round(wrap_angle(3 * np.pi / 2), 3), wrap_angle(-np.pi) == np.pi
+    (-1.571, True)
+    """
+    wrapped = np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2 * np.pi)
+    return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped
+
+
+def seconds(stamp_ns: int) -> float:
+    """Convert integer nanoseconds to seconds.
+
+    Examples
+    --------
+    >>> seconds(1_500_000_000)
+    1.5
+    """
+    return stamp_ns / NANOSECONDS_PER_SECOND
+
+
+def nanoseconds(time_s: float) -> int:
+    """Convert seconds to the nearest integer nanosecond.
+
+    Examples
+    --------
+    >>> nanoseconds(1.5)
+    1500000000
+    """
+    return round(time_s * NANOSECONDS_PER_SECOND)
