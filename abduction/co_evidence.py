@@ -52,8 +52,8 @@ class Present:
     miss_rate : float
         beta_c(theta, d) of the channel, in [0, 1].
     clutter_rate : float
-        Probability of co-evidence where there is no such source, in (0, 1): with zero a single false detection
-        would remove the hidden explanation for ever.
+        Probability of co-evidence where there is no such source, in (0, 1): with zero a single false
+        detection would remove the hidden explanation for ever.
 
     Examples
     --------
