@@ -3,7 +3,6 @@
 A reader never meets half a file, and a run that fails leaves nothing behind.
 """
 
-import os
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -78,7 +77,7 @@ def write_text(path: str | Path, text: str) -> None:
 def _take_name(temporary: Path, target: Path) -> None:
     if target.is_dir() and not temporary.is_dir():
         raise InputFileError(target, "expected a file name to write to, found a folder")
-    os.replace(temporary, target)
+    temporary.replace(target)
 
 
 def _remove(path: Path) -> None:
