@@ -1,0 +1,233 @@
+r"""Competition of explanations: hidden source, visible source, no source.
+
+Hypotheses stand in the order of `SignatureEvidence`: hidden in each of K directions, visible, none. All is
+done in nats, and a prior of zero is a log of -inf.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import check_shape, finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+from .co_evidence import CoEvidence
+from .evidence import SignatureEvidence
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """Probabilities of the explanations after one look.
+
+    Parameters
+    ----------
+    directions : tuple of str
+        Labels of the hidden hypotheses.
+    log_probabilities : tuple of float
+        Log posterior (hidden_1 .. hidden_K, visible, none), nats; sums to one when exponentiated.
+    log_lambda : float
+        Log of the mixture likelihood ratio Lambda, nats; see `log_lambda`.
+    log_evidence : float
+        log Z: what the priors expected of this observation, nats.
+
+    Examples
+    --------
+    >>> posterior = Posterior(("left", "right"), tuple(np.log([0.5, 0.1, 0.1, 0.3])), 0.4, -1.0)
+    >>> round(posterior.hidden_total, 3)
+    0.6
+    """
+
+    directions: tuple[str, ...]
+    log_probabilities: tuple[float, ...]
+    log_lambda: float
+    log_evidence: float
+
+    @property
+    def probabilities(self) -> NDArray[np.float64]:
+        """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,)."""
+        return np.exp(self.log_probabilities)
+
+    @property
+    def hidden(self) -> tuple[float, ...]:
+        """P(hidden in direction k), one per direction."""
+        return tuple(self.probabilities[:-2].tolist())
+
+    @property
+    def hidden_total(self) -> float:
+        """P(hidden), all directions together."""
+        return float(self.probabilities[:-2].sum())
+
+    @property
+    def visible(self) -> float:
+        """P(visible source)."""
+        return float(np.exp(self.log_probabilities[-2]))
+
+    @property
+    def none(self) -> float:
+        """P(no source)."""
+        return float(np.exp(self.log_probabilities[-1]))
+
+
+def abduce(
+    log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence, evidence_weight: float = 1.0
+) -> Posterior:
+    r"""Weigh the explanations of one observation.
+
+    .. math::
+        p(h \mid y, V) = \pi_h\, \ell_h(y)^\kappa\, p(V \mid h) \,/\, Z,
+
+    eq. (post) with V absent: :math:`p(V \mid h)` is :math:`\beta_c(\theta, d)` for the visible explanation
+    and 1 for the others.
+
+    Parameters
+    ----------
+    log_prior : array_like, shape (K + 2,)
+        Log prior of (hidden_1 .. hidden_K, visible, none), nats; normalised or not, -inf for a prior of zero.
+    evidence : SignatureEvidence
+        Log-likelihoods of the observation.
+    co_evidence : CoEvidence
+        What the channel that was asked answered.
+    evidence_weight : float
+        kappa in (0, 1]. Windows that overlap repeat most of their samples: at a 0.1-s hop a 1-s window would
+        be counted ten times by a recursion that took each for independent.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On a prior of another shape, with NaN, +inf or no mass, or if no explanation remains possible.
+
+    References
+    ----------
+    Paper, Section V, eq. (post); [1] "Hearing What You Cannot See" supplies the explanations.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.co_evidence import Absent
+    >>> heard = SignatureEvidence(("left", "right"), hidden=(1.0, -1.0), visible=1.2, none=-2.0)
+    >>> seen = abduce(np.log([0.1, 0.1, 0.4, 0.4]), heard, Absent(miss_rate=0.04))
+    >>> round(seen.hidden_total, 3), round(seen.visible, 3)
+    (0.742, 0.128)
+    """
+    prior = _checked_log_prior(log_prior, len(evidence.directions))
+    weight = in_range("evidence_weight", evidence_weight, 0.0, 1.0, open_low=True)
+    log_likelihood = _log_likelihood(evidence, co_evidence, weight)
+    joint = prior + log_likelihood
+    log_evidence = _log_sum(joint)
+    if log_evidence == -np.inf:
+        raise InvalidArgumentError("log_prior: expected mass on an explanation that the co-evidence allows")
+    return Posterior(
+        evidence.directions,
+        tuple((joint - log_evidence).tolist()),
+        _log_ratio(prior, log_likelihood),
+        log_evidence,
+    )
+
+
+def log_lambda(
+    log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence, evidence_weight: float = 1.0
+) -> float:
+    r"""Return the log of the mixture likelihood ratio that the Neyman-Pearson test thresholds, nats.
+
+    .. math::
+        \Lambda(y) = \frac{\ell_{hid}(y)}{w_{vis}\, \beta_c(\theta, d)\, \ell_{vis}(y) + w_0\, \ell_0(y)},
+        \qquad w = \pi / (1 - \pi_{hid}),
+
+    with :math:`\ell_{hid} = \sum_k P(k \mid hid)\, \ell_{hid,k}`. It does not depend on how probable a hidden
+    source is beforehand; where that prior is zero, all directions weigh alike. +inf where neither other
+    explanation is possible.
+
+    Parameters and errors are those of `abduce`.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.co_evidence import Absent, Unqueried
+    >>> heard = SignatureEvidence(("side",), hidden=(1.0,), visible=1.0, none=-1.0)
+    >>> round(log_lambda(np.log([0.2, 0.4, 0.4]), heard, Unqueried("no camera")), 3)
+    0.566
+    >>> round(log_lambda(np.log([0.2, 0.4, 0.4]), heard, Absent(miss_rate=0.04)), 3)
+    2.434
+    """
+    prior = _checked_log_prior(log_prior, len(evidence.directions))
+    weight = in_range("evidence_weight", evidence_weight, 0.0, 1.0, open_low=True)
+    return _log_ratio(prior, _log_likelihood(evidence, co_evidence, weight))
+
+
+def statistic(
+    evidence: SignatureEvidence, co_evidence: CoEvidence, reference_prior: Sequence[float]
+) -> float:
+    r"""Return eq. (post) at a fixed prior: the score in [0, 1] that a threshold was set for.
+
+    With a classifier's likelihood ratios and its own training prior this is
+
+    .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}},
+
+    the published :math:`P_l + P_r` at beta = 1 and ours, with the visible explanation removed, at beta = 0.
+    It is a monotone map of Lambda, whatever context and time say of the priors.
+
+    Parameters
+    ----------
+    evidence : SignatureEvidence
+        Log-likelihoods of the observation.
+    co_evidence : CoEvidence
+        What the channel that was asked answered.
+    reference_prior : sequence of float, shape (K + 2,)
+        Probabilities, not logs, of (hidden_1 .. hidden_K, visible, none).
+
+    Raises
+    ------
+    InvalidArgumentError
+        As `abduce`.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.co_evidence import Absent, Unqueried
+    >>> posteriors, prior = np.array([0.3, 0.1, 0.5, 0.1]), np.array([0.25, 0.25, 0.25, 0.25])
+    >>> ratios = np.log(posteriors / prior)
+    >>> heard = SignatureEvidence(("left", "right"), tuple(ratios[:2]), ratios[2], ratios[3])
+    >>> [round(statistic(heard, answer, prior), 3) for answer in (Unqueried("no camera"), Absent(0.0))]
+    [0.4, 0.8]
+    """
+    prior = finite_array("reference_prior", reference_prior, (len(evidence.directions) + 2,))
+    if (prior < 0).any():
+        raise InvalidArgumentError("reference_prior: expected probabilities, got a negative number")
+    with np.errstate(divide="ignore"):
+        return abduce(np.log(prior), evidence, co_evidence).hidden_total
+
+
+def _checked_log_prior(log_prior: ArrayLike, directions: int) -> NDArray[np.float64]:
+    prior = np.asarray(log_prior, dtype=np.float64)
+    check_shape("log_prior", prior.shape, (directions + 2,))
+    if not np.isfinite(prior.max()):
+        raise InvalidArgumentError(f"log_prior: expected logs with some mass, got {prior.tolist()}")
+    return prior
+
+
+def _log_likelihood(
+    evidence: SignatureEvidence, co_evidence: CoEvidence, weight: float
+) -> NDArray[np.float64]:
+    hidden, visible, none = co_evidence.log_likelihoods()
+    log_likelihood = np.empty(len(evidence.directions) + 2)
+    log_likelihood[:] = weight * evidence.log_likelihoods
+    log_likelihood[:-2] += hidden
+    log_likelihood[-2:] += visible, none
+    return log_likelihood
+
+
+def _log_ratio(prior: NDArray[np.float64], log_likelihood: NDArray[np.float64]) -> float:
+    hidden, others = prior[:-2], prior[-2:]
+    if np.isneginf(hidden).all():
+        hidden = np.zeros_like(hidden)
+    if np.isneginf(others).all():
+        return float("inf")
+    hidden_mean = _log_sum(hidden + log_likelihood[:-2]) - _log_sum(hidden)
+    return hidden_mean - (_log_sum(others + log_likelihood[-2:]) - _log_sum(others))
+
+
+def _log_sum(values: NDArray[np.float64]) -> float:
+    """log(sum(exp(values))) without overflow; a sum of nothing possible is -inf."""
+    largest = float(values.max())
+    if largest == -np.inf:
+        return largest
+    return largest + float(np.log(np.exp(values - largest).sum()))
