@@ -1,0 +1,164 @@
+r"""How much an absence weighs: the miss rate of the channel that was asked, beta_c(theta, d)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InputFileError, InvalidArgumentError, WorldstateError
+
+from .schema import check_schema
+
+SCHEMA = "worldstate.MissRateTable"
+VERSION = "1.0.0"
+
+Rows = tuple[tuple[float, ...], ...]
+
+# What the paper measured on clean frames: .04 at boresight, .14 at 20-30 deg; .97 under the harshest noise.
+BORESIGHT_MISS_RATE = 0.04
+MISS_RATE_PER_DEG = (0.14 - 0.04) / 25.0
+HARSHEST_MISS_RATE = 0.97
+
+
+@dataclass(frozen=True, slots=True)
+class MissRateTable:
+    r"""Probability that a visible source is missed, over azimuth and degradation.
+
+    .. math:: \beta_c(\theta, d) = p(V = absent \mid h_{vis}, \theta, d),
+
+    bilinear between the points of the table, the same on both sides, and 1 beyond its last azimuth, where the
+    channel does not see, and its last degradation, where none was measured. It never falls with the azimuth or the degradation: a table that says so was
+    measured on too little.
+
+    Parameters
+    ----------
+    azimuth_deg : tuple of float
+        Azimuth magnitudes, increasing from 0 to the edge of the view, degrees.
+    degradation : tuple of float
+        Degradation levels d, increasing from 0 (clean) to at most 1 (blind).
+    beta : tuple of tuple of float
+        Miss rates in [0, 1], one row an azimuth, one column a degradation.
+    per_class : mapping of str to tuple of tuple of float
+        Rows of their own for some classes; all others use `beta`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the axes do not increase or do not fit, or a rate falls or leaves [0, 1].
+
+    Examples
+    --------
+    >>> table = MissRateTable((0, 30), (0, 1), ((0.04, 0.9), (0.14, 1.0)))
+    >>> round(table(np.radians(15.0), 0.0), 3), table(np.radians(40.0), 0.0)
+    (0.09, 1.0)
+    """
+
+    azimuth_deg: tuple[float, ...]
+    degradation: tuple[float, ...]
+    beta: Rows
+    per_class: Mapping[str, Rows] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_axis("azimuth_deg", self.azimuth_deg, 180.0)
+        _check_axis("degradation", self.degradation, 1.0)
+        shape = (len(self.azimuth_deg), len(self.degradation))
+        _check_rates("beta", self.beta, shape)
+        for label, rows in self.per_class.items():
+            _check_rates(f"beta of {label}", rows, shape)
+
+    def __call__(self, azimuth_rad: float, degradation: float = 0.0, label: str | None = None) -> float:
+        """Return beta at one azimuth (radians, any sign) and degradation in [0, 1]."""
+        magnitude_deg = abs(float(np.degrees(azimuth_rad)))
+        level = in_range("degradation", degradation, 0.0, 1.0)
+        if magnitude_deg > self.azimuth_deg[-1] or level > self.degradation[-1]:
+            return 1.0
+        rows = self.beta if label is None else self.per_class.get(label, self.beta)
+        along = [float(np.interp(level, self.degradation, row)) for row in rows]
+        return float(np.interp(magnitude_deg, self.azimuth_deg, along))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values with the schema's name and version."""
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "azimuth_deg": list(self.azimuth_deg),
+            "degradation": list(self.degradation),
+            "beta": _lists(self.beta),
+            "per_class": {label: _lists(rows) for label, rows in self.per_class.items()},
+        }
+
+    @classmethod
+    def from_dict(cls, data: object, source: object = "miss-rate table") -> "MissRateTable":
+        """Return the table that `to_dict` wrote; keys it does not know are ignored.
+
+        Raises
+        ------
+        InputFileError
+            If something is missing, of the wrong type or out of range; it begins with `source`.
+        SchemaVersionError
+            If the major version is another one.
+        """
+        fields: Mapping[str, Any] = check_schema(data, SCHEMA, VERSION, source)
+        try:
+            per_class = {str(label): _rows(rows) for label, rows in dict(fields.get("per_class", {})).items()}
+            azimuth_deg, degradation = _numbers(fields["azimuth_deg"]), _numbers(fields["degradation"])
+            return cls(azimuth_deg, degradation, _rows(fields["beta"]), per_class)
+        except KeyError as error:
+            raise InputFileError(source, f"expected a key {error}") from error
+        except WorldstateError as error:
+            raise InputFileError(source, str(error)) from error
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputFileError(source, f"expected a table of numbers: {error}") from error
+
+
+def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
+    """Return the table used where none was measured.
+
+    Clean frames: .04 at boresight, .14 at 25 deg and on at that slope to the edge of the view; from there
+    linearly in d to .97 everywhere.
+
+    Parameters
+    ----------
+    half_view_deg : float
+        Half of the horizontal field of view, degrees, in (0, 180].
+
+    Examples
+    --------
+    >>> table = default_miss_rates()
+    >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.5)
+    (0.04, 0.14, 0.97, 1.0)
+    """
+    edge_deg = in_range("half_view_deg", half_view_deg, 0.0, 180.0, open_low=True)
+    clean = min(BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * edge_deg, HARSHEST_MISS_RATE)
+    return MissRateTable(
+        (0.0, edge_deg), (0.0, 1.0), ((BORESIGHT_MISS_RATE, HARSHEST_MISS_RATE), (clean, HARSHEST_MISS_RATE))
+    )
+
+
+def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
+    axis = finite_array(name, values, (None,))
+    if axis.size < 2 or axis[0] != 0.0 or axis[-1] > limit or (np.diff(axis) <= 0).any():
+        raise InvalidArgumentError(f"{name}: expected numbers that increase from 0 to at most {limit}")
+
+
+def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
+    rates: NDArray[np.float64] = finite_array(name, rows, shape)
+    if (rates < 0).any() or (rates > 1).any():
+        raise InvalidArgumentError(f"{name}: expected miss rates in [0, 1]")
+    if (np.diff(rates, axis=0) < 0).any() or (np.diff(rates, axis=1) < 0).any():
+        raise InvalidArgumentError(f"{name}: expected miss rates that never fall with azimuth or degradation")
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _rows(rows: Any) -> Rows:
+    return tuple(_numbers(row) for row in rows)
+
+
+def _lists(rows: Rows) -> list[list[float]]:
+    return [list(row) for row in rows]

@@ -1,0 +1,241 @@
+"""From statistic to advisory: the sustained rule and the policy that carries its numbers.
+
+The threshold of a policy is set in `neyman_pearson`, its map to risk in `risk_map`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+from .risk_map import RiskMap, risk_map_from_dict
+
+
+@dataclass(frozen=True, slots=True)
+class SustainedRule:
+    """State of the rule "in alarm while the statistic has held for k consecutive hops".
+
+    Parameters
+    ----------
+    sustain_hops : int
+        k >= 1; 1 alarms at any single window, as the published rule does with the argmax.
+    run : int
+        Consecutive hops held so far, counted up to k.
+
+    Examples
+    --------
+    >>> rule = SustainedRule(sustain_hops=2)
+    >>> rule.advance(True).alarm, rule.advance(True).advance(True).alarm
+    (False, True)
+    """
+
+    sustain_hops: int
+    run: int = 0
+
+    def __post_init__(self) -> None:
+        _check_sustain_hops(self.sustain_hops)
+
+    @property
+    def alarm(self) -> bool:
+        """Whether the last k hops all held."""
+        return self.run >= self.sustain_hops
+
+    def advance(self, held: bool) -> "SustainedRule":
+        """Return the state after one more hop."""
+        return replace(self, run=min(self.run + 1, self.sustain_hops) if held else 0)
+
+
+@dataclass(frozen=True, slots=True)
+class CueingPolicy:
+    """Numbers of one false-alarm budget, fixed on calibration data and applied unchanged.
+
+    Parameters
+    ----------
+    gamma : float
+        Alarm when the statistic is at or above it.
+    sustain_hops : int
+        Consecutive hops that it has to hold.
+    alpha : float
+        Share of hazard-free windows in alarm that gamma was set for.
+    reference_prior : tuple of float
+        Probabilities of (hidden_1 .. hidden_K, visible, none) at which the statistic is formed.
+    risk_map : RiskMap
+        From statistic to calibrated risk.
+    miss_rate : float
+        The beta at which the statistic was formed on the calibration data: 0 with the visible explanation
+        removed, 1 for the published statistic. The statistic falls as beta rises, so a gamma set at 0 keeps
+        its budget at every beta.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or the prior does not sum to one.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.risk_map import PlattMap
+    >>> policy = CueingPolicy(0.8, 3, 0.02, (0.25, 0.25, 0.25, 0.25), PlattMap(-1.0, 0.0))
+    >>> policy.exceeded(0.9), round(policy.risk_map(0.9), 2)
+    (True, 0.9)
+    """
+
+    gamma: float
+    sustain_hops: int
+    alpha: float
+    reference_prior: tuple[float, ...]
+    risk_map: RiskMap
+    miss_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        finite_array("gamma", self.gamma, ())
+        _check_sustain_hops(self.sustain_hops)
+        in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
+        in_range("miss_rate", self.miss_rate, 0.0, 1.0)
+        prior = finite_array("reference_prior", self.reference_prior, (None,))
+        if prior.size < 3 or (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
+            raise InvalidArgumentError("reference_prior: expected 3 or more positive numbers, sum one")
+
+    def exceeded(self, statistic: float) -> bool:
+        """Whether a statistic is at or above the threshold."""
+        return statistic >= self.gamma
+
+    def rule(self) -> SustainedRule:
+        """Return the sustained rule at its start."""
+        return SustainedRule(self.sustain_hops)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {
+            "gamma": self.gamma,
+            "sustain_hops": self.sustain_hops,
+            "alpha": self.alpha,
+            "reference_prior": list(self.reference_prior),
+            "risk_map": self.risk_map.to_dict(),
+            "miss_rate": self.miss_rate,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "CueingPolicy":
+        """Return the policy that `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If a number is out of range; KeyError or TypeError where one is missing or none.
+        """
+        return cls(
+            gamma=float(data["gamma"]),
+            sustain_hops=data["sustain_hops"],
+            alpha=float(data["alpha"]),
+            reference_prior=tuple(float(p) for p in data["reference_prior"]),
+            risk_map=risk_map_from_dict(data["risk_map"]),
+            miss_rate=float(data["miss_rate"]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CueingPolicies:
+    """The policies of one model: one for each budget and miss rate that it was calibrated at.
+
+    Parameters
+    ----------
+    policies : tuple of CueingPolicy
+        At least one.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is none.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.risk_map import PlattMap
+    >>> policy = CueingPolicy(0.8, 3, 0.02, (0.25, 0.25, 0.25, 0.25), PlattMap(-1.0, 0.0))
+    >>> CueingPolicies((policy,)).for_alpha(0.02).gamma
+    0.8
+    """
+
+    policies: tuple[CueingPolicy, ...]
+
+    def __post_init__(self) -> None:
+        if not self.policies:
+            raise InvalidArgumentError("policies: expected at least one")
+
+    def for_alpha(self, alpha: float, miss_rate: float = 0.0) -> CueingPolicy:
+        """Return the policy of a budget, calibrated at the given miss rate (0 or 1 in a trained model).
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the model was not calibrated for it; the message lists the budgets that it holds.
+        """
+        for policy in self.policies:
+            if np.isclose(policy.alpha, alpha, rtol=1e-6) and np.isclose(policy.miss_rate, miss_rate):
+                return policy
+        held = ", ".join(sorted({f"{policy.alpha:g}" for policy in self.policies}))
+        raise InvalidArgumentError(f"alpha: expected a calibrated budget ({held}), got {alpha:g}")
+
+
+def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.float64]:
+    """Return the smallest statistic of the last k hops; -inf where there are fewer.
+
+    The sustained rule is in alarm exactly where this is at or above the threshold.
+
+    Parameters
+    ----------
+    statistic : array_like, shape (windows,)
+        One recording, in the order of time.
+    sustain_hops : int
+        k >= 1.
+
+    Examples
+    --------
+    >>> sustained_statistic([0.2, 0.9, 0.8, 0.1], sustain_hops=2)
+    array([-inf,  0.2,  0.8,  0.1])
+    """
+    values = finite_array("statistic", statistic, (None,))
+    hops = _check_sustain_hops(sustain_hops)
+    held = np.full(values.shape, -np.inf)
+    if values.size >= hops:
+        held[hops - 1 :] = np.lib.stride_tricks.sliding_window_view(values, hops).min(axis=1)
+    return held
+
+
+def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
+    """Return where the last k hops all held, shape (windows,): `SustainedRule` over a whole recording.
+
+    Examples
+    --------
+    >>> sustained_alarm([True, True, False, True], sustain_hops=2)
+    array([False,  True, False, False])
+    """
+    return sustained_statistic(np.asarray(held, dtype=bool), sustain_hops) >= 0.5
+
+
+def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1, 3)) -> NDArray[np.bool_]:
+    """Return where the most probable class is a hazard: the published rule's decision, shape (windows,).
+
+    Parameters
+    ----------
+    probabilities : array_like, shape (windows, classes)
+        Columns front, left, none, right.
+    hazard_columns : tuple of int
+        Which of them are hazards.
+
+    Examples
+    --------
+    >>> argmax_hazard([[0.1, 0.6, 0.2, 0.1], [0.5, 0.3, 0.1, 0.1]])
+    array([ True, False])
+    """
+    return np.isin(finite_array("probabilities", probabilities, (None, None)).argmax(axis=1), hazard_columns)
+
+
+def _check_sustain_hops(sustain_hops: int) -> int:
+    if not isinstance(sustain_hops, int | np.integer) or isinstance(sustain_hops, bool) or sustain_hops < 1:
+        raise InvalidArgumentError(f"sustain_hops: expected a whole number >= 1, got {sustain_hops!r}")
+    return int(sustain_hops)

@@ -1,0 +1,94 @@
+r"""Sigmoid of a decision value, fitted as in Lin, Lin and Weng's note on Platt's method.
+
+.. math:: p(f) = 1 / (1 + \exp(A f + B))
+
+Source: Lin, Lin, Weng, "A note on Platt's probabilistic outputs for support vector machines", 2007.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+_ITERATIONS = 100
+_SMALLEST_STEP = 1e-10
+_GRADIENT_TOLERANCE = 1e-5
+_RIDGE = 1e-12
+
+
+def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> NDArray[np.float64]:
+    """Return 1 / (1 + exp(slope * value + offset)) without overflow, broadcast.
+
+    Examples
+    --------
+    >>> sigmoid(np.array([0.0, 1e6]), -1.0, 0.0)
+    array([0.5, 1. ])
+    """
+    exponent: NDArray[np.float64] = np.asarray(slope) * value + np.asarray(offset)
+    return np.asarray(np.exp(-np.logaddexp(0.0, exponent)))
+
+
+def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
+    """Return (A, B) of greatest likelihood, with the targets drawn in by Platt's prior.
+
+    Parameters
+    ----------
+    values : array_like, shape (n,)
+        Decision values of samples that the machine was not trained on.
+    positive : array_like of bool, shape (n,)
+        Labels.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are no samples or they do not fit.
+
+    Examples
+    --------
+    >>> slope, offset = fit_sigmoid([-2.0, -1.0, 1.0, 2.0], [False, False, True, True])
+    >>> round(slope, 2), abs(round(offset, 2))
+    (-0.67, 0.0)
+    """
+    decision = finite_array("values", values, (None,))
+    label = finite_array("positive", positive, decision.shape) > 0.5
+    if not decision.size:
+        raise InvalidArgumentError("values: expected at least one decision value")
+    n_positive, n_negative = int(label.sum()), int((~label).sum())
+    target = np.where(label, (n_positive + 1) / (n_positive + 2), 1 / (n_negative + 2))
+    return _newton(decision, target, np.array([0.0, np.log((n_negative + 1) / (n_positive + 1))]))
+
+
+def _newton(
+    decision: NDArray[np.float64], target: NDArray[np.float64], start: NDArray[np.float64]
+) -> tuple[float, float]:
+    point, loss = start, _loss(decision, target, start)
+    for _ in range(_ITERATIONS):
+        gradient, curvature = _derivatives(decision, target, point)
+        if np.abs(gradient).max() < _GRADIENT_TOLERANCE:
+            break
+        step = -np.linalg.solve(curvature, gradient)
+        while np.abs(step).max() >= _SMALLEST_STEP:
+            if _loss(decision, target, point + step) < loss + 1e-4 * float(gradient @ step):
+                break
+            step = step / 2.0
+        else:
+            break
+        point = point + step
+        loss = _loss(decision, target, point)
+    return float(point[0]), float(point[1])
+
+
+def _loss(decision: NDArray[np.float64], target: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+    exponent = point[0] * decision + point[1]
+    return float(np.sum(np.logaddexp(0.0, exponent) - (1.0 - target) * exponent))
+
+
+def _derivatives(
+    decision: NDArray[np.float64], target: NDArray[np.float64], point: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    probability = sigmoid(decision, point[0], point[1])
+    design = np.stack([decision, np.ones_like(decision)])
+    gradient = design @ (target - probability)
+    curvature = (design * (probability * (1.0 - probability))) @ design.T
+    return gradient, curvature + _RIDGE * np.eye(2)

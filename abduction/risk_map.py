@@ -1,0 +1,206 @@
+"""Calibrated risk: monotone maps from the statistic to the frequency of a hidden hazard."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+from .platt import fit_sigmoid, sigmoid
+
+
+class RiskMap(Protocol):
+    """A monotone map of the statistic into [0, 1]."""
+
+    @overload
+    def __call__(self, statistic: float) -> float: ...
+    @overload
+    def __call__(self, statistic: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class IsotonicMap:
+    """Linear between knots, constant beyond them.
+
+    Parameters
+    ----------
+    statistics : tuple of float
+        Knots, not falling.
+    risks : tuple of float
+        Risk at each knot, in [0, 1], not falling.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a sequence falls, they differ in length or a risk leaves [0, 1].
+
+    Examples
+    --------
+    >>> IsotonicMap((0.2, 0.6), (0.0, 1.0))(0.3).__round__(3)
+    0.25
+    """
+
+    statistics: tuple[float, ...]
+    risks: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        knots = finite_array("statistics", self.statistics, (None,))
+        risks = finite_array("risks", self.risks, (knots.size,))
+        if not knots.size or (np.diff(knots) < 0).any() or (np.diff(risks) < 0).any():
+            raise InvalidArgumentError("risk map: expected at least one knot and sequences that do not fall")
+        if risks[0] < 0 or risks[-1] > 1:
+            raise InvalidArgumentError("risks: expected numbers in [0, 1]")
+
+    @overload
+    def __call__(self, statistic: float) -> float: ...
+    @overload
+    def __call__(self, statistic: NDArray[np.float64]) -> NDArray[np.float64]: ...
+    def __call__(self, statistic: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+        """Return the risk at a statistic or an array of them."""
+        risk = np.interp(statistic, self.statistics, self.risks)
+        return float(risk) if np.ndim(statistic) == 0 else risk
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {"kind": "isotonic", "statistics": list(self.statistics), "risks": list(self.risks)}
+
+
+@dataclass(frozen=True, slots=True)
+class PlattMap:
+    r"""A sigmoid of the statistic's log-odds: two numbers, for small samples.
+
+    .. math:: r = 1 / (1 + \exp(a\, \mathrm{logit}(s) + b)), \qquad a \le 0.
+
+    Parameters
+    ----------
+    slope : float
+        a, not positive.
+    offset : float
+        b.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the slope is positive, which would fall with the statistic.
+
+    Examples
+    --------
+    >>> PlattMap(-1.0, 0.0)(0.3).__round__(3)
+    0.3
+    """
+
+    slope: float
+    offset: float
+
+    def __post_init__(self) -> None:
+        finite_array("slope, offset", (self.slope, self.offset), (2,))
+        if self.slope > 0:
+            raise InvalidArgumentError(f"slope: expected a number <= 0, got {self.slope}")
+
+    @overload
+    def __call__(self, statistic: float) -> float: ...
+    @overload
+    def __call__(self, statistic: NDArray[np.float64]) -> NDArray[np.float64]: ...
+    def __call__(self, statistic: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+        """Return the risk at a statistic or an array of them."""
+        risk = sigmoid(_logit(np.asarray(statistic, dtype=np.float64)), self.slope, self.offset)
+        return float(risk) if np.ndim(statistic) == 0 else risk
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {"kind": "platt", "slope": self.slope, "offset": self.offset}
+
+
+def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
+    """Fit the isotonic regression of hazard labels on statistics.
+
+    Parameters
+    ----------
+    statistics : array_like, shape (n,)
+        Scores that the classifier gave to recordings it was not trained on.
+    hazards : array_like of bool, shape (n,)
+        Whether a hidden hazard was there.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If both labels are not there.
+
+    References
+    ----------
+    Zadrozny and Elkan, "Transforming classifier scores into accurate multiclass probability estimates", 2002.
+
+    Examples
+    --------
+    >>> fit_isotonic([0.1, 0.2, 0.3, 0.9], [False, True, False, True])(0.25)
+    0.5
+    """
+    from sklearn.isotonic import IsotonicRegression
+
+    scores, labels = _checked_sample(statistics, hazards)
+    fit = IsotonicRegression(y_min=0.0, y_max=1.0, out_of_bounds="clip").fit(scores, labels)
+    return IsotonicMap(tuple(fit.X_thresholds_.tolist()), tuple(fit.y_thresholds_.tolist()))
+
+
+def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
+    """Fit the sigmoid of hazard labels on the log-odds of statistics; a falling fit is held flat.
+
+    Parameters and errors are those of `fit_isotonic`.
+
+    References
+    ----------
+    Platt, "Probabilistic outputs for support vector machines", 1999.
+
+    Examples
+    --------
+    >>> round(fit_platt([0.1, 0.2, 0.3, 0.9], [False, True, False, True])(0.9), 2)
+    0.74
+    """
+    scores, labels = _checked_sample(statistics, hazards)
+    slope, offset = fit_sigmoid(_logit(scores), labels)
+    if slope > 0:
+        slope, offset = 0.0, float(np.log((~labels).sum() / labels.sum()))
+    return PlattMap(slope, offset)
+
+
+def risk_map_from_dict(data: Mapping[str, Any]) -> RiskMap:
+    """Return the map that `to_dict` wrote.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On an unknown kind or numbers out of range.
+
+    Examples
+    --------
+    >>> risk_map_from_dict({"kind": "platt", "slope": -1.0, "offset": 0.0})
+    PlattMap(slope=-1.0, offset=0.0)
+    """
+    if data["kind"] == "isotonic":
+        return IsotonicMap(tuple(map(float, data["statistics"])), tuple(map(float, data["risks"])))
+    if data["kind"] == "platt":
+        return PlattMap(float(data["slope"]), float(data["offset"]))
+    raise InvalidArgumentError(f"risk map: expected kind isotonic or platt, got {str(data['kind'])[:40]!r}")
+
+
+def _logit(statistic: NDArray[np.float64]) -> NDArray[np.float64]:
+    bounded = np.clip(statistic, 1e-9, 1.0 - 1e-9)
+    return np.asarray(np.log(bounded / (1.0 - bounded)))
+
+
+def _checked_sample(
+    statistics: ArrayLike, hazards: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    scores = finite_array("statistics", statistics, (None,))
+    labels = finite_array("hazards", hazards, scores.shape) > 0.5
+    if not labels.any() or labels.all():
+        raise InvalidArgumentError("hazards: expected windows with and without a hazard")
+    return scores, labels
