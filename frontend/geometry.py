@@ -1,0 +1,92 @@
+"""Pure geometry of microphones and far-field directions, in `base_link` axes (x forward, y left, z up)."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SPEED_OF_SOUND_M_S = 343.0
+"""In dry air at 20 degrees Celsius; the value that pyroomacoustics assumes."""
+
+Ambiguity = Literal["cone", "front-back", "up-down", "mirror", "none"]
+
+# Spread across an axis, relative to the largest, below which an array counts as flat there.
+_FLAT = 1e-3
+# Direction cosine above which a normal counts as lying along an axis of the vehicle.
+_ALONG_AXIS = 0.985
+
+
+def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> NDArray[np.float64]:
+    r"""Unit vectors that point towards far-field sources.
+
+    .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
+
+    Parameters
+    ----------
+    azimuths_rad, elevations_rad : array_like, broadcast together
+        Azimuth, left positive, and elevation, up positive.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+
+    Examples
+    --------
+    >>> direction_vectors([0.0, np.pi / 2]).round(6) + 0.0
+    array([[1., 0., 0.],
+           [0., 1., 0.]])
+    """
+    azimuth, elevation = np.broadcast_arrays(
+        np.asarray(azimuths_rad, dtype=np.float64), np.asarray(elevations_rad, dtype=np.float64)
+    )
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def nearest_spacings_m(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance from every microphone to its nearest neighbour, metres.
+
+    Parameters
+    ----------
+    positions_m : ndarray, shape (M, 3)
+
+    Returns
+    -------
+    ndarray, shape (M,)
+
+    Examples
+    --------
+    >>> nearest_spacings_m(np.array([[0, 0, 0], [0, 0.1, 0], [0, 0.3, 0]])).round(3)
+    array([0.1, 0.1, 0.2])
+    """
+    distance = np.linalg.norm(positions_m[:, None] - positions_m[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    return np.asarray(distance.min(axis=1))
+
+
+def ambiguity(positions_m: NDArray[np.float64]) -> Ambiguity:
+    """Directions that an array of this shape cannot tell apart, whatever the algorithm.
+
+    A linear array knows only the angle to its axis (``cone``). A planar one cannot tell a direction from its
+    mirror image in its own plane: ``front-back`` if it stands across the road, ``up-down`` if it lies flat,
+    ``mirror`` if it is tilted or faces sideways. A three-dimensional array has no such twin (``none``).
+
+    Parameters
+    ----------
+    positions_m : ndarray, shape (M, 3)
+
+    Examples
+    --------
+    >>> ambiguity(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]))
+    'front-back'
+    """
+    spread, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=True)[1:]
+    thickness = np.pad(spread, (0, 3 - len(spread)))
+    if thickness[1] < _FLAT * thickness[0]:
+        return "cone"
+    if thickness[2] >= _FLAT * thickness[0]:
+        return "none"
+    normal = np.abs(axes[2])
+    if normal[0] > _ALONG_AXIS:
+        return "front-back"
+    return "up-down" if normal[2] > _ALONG_AXIS else "mirror"
