@@ -29,9 +29,9 @@ class MissRateTable:
 
     .. math:: \beta_c(\theta, d) = p(V = absent \mid h_{vis}, \theta, d),
 
-    bilinear between the points of the table, the same on both sides, and 1 beyond its last azimuth, where the
-    channel does not see, and its last degradation, where none was measured. It never falls with the azimuth or the degradation: a table that says so was
-    measured on too little.
+    bilinear between the points of the table, the same on both sides. It is 1 beyond the last azimuth, where
+    the channel does not see, and beyond the last degradation, where none was measured. It never falls with
+    the azimuth or the degradation: a table that says so was measured on too little.
 
     Parameters
     ----------

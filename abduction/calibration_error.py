@@ -1,0 +1,140 @@
+"""Whether a risk of .3 comes true in 30 % of the cases: reliability, ECE with its floor, Brier score."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+BINS = 10
+_FLOOR_DRAWS = 400
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ReliabilityCurve:
+    """Predicted against observed frequency, in the bins that hold anything.
+
+    Parameters
+    ----------
+    predicted, observed : ndarray, shape (bins,)
+        Mean risk and share of hazards of each bin.
+    counts : ndarray of int, shape (bins,)
+        Windows in each.
+
+    Examples
+    --------
+    >>> reliability_curve([0.15, 0.25, 0.9], [False, True, True], bins=2).counts
+    array([2, 1])
+    """
+
+    predicted: Numbers
+    observed: Numbers
+    counts: NDArray[np.intp]
+
+
+def reliability_curve(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> ReliabilityCurve:
+    """Return the reliability curve over bins of equal width on [0, 1].
+
+    Parameters
+    ----------
+    risk : array_like, shape (n,)
+        Predicted probabilities in [0, 1].
+    hazards : array_like of bool, shape (n,)
+        What came true.
+    bins : int
+        How many.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the sample is empty, the shapes differ or a risk is no probability.
+    """
+    predicted, labels = _checked_sample(risk, hazards)
+    index = _bin_index(predicted, bins)
+    counts = np.bincount(index, minlength=bins)
+    filled = counts > 0
+    mean_risk = np.bincount(index, predicted, bins)[filled] / counts[filled]
+    frequency = np.bincount(index, labels, bins)[filled] / counts[filled]
+    return ReliabilityCurve(mean_risk, frequency, counts[filled])
+
+
+def expected_calibration_error(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> float:
+    r"""Return the expected calibration error.
+
+    .. math:: ECE = \sum_b \frac{n_b}{n} \left| \overline{r}_b - \overline{y}_b \right|
+
+    Parameters and errors are those of `reliability_curve`.
+
+    References
+    ----------
+    Guo et al., "On calibration of modern neural networks", 2017.
+
+    Examples
+    --------
+    >>> round(expected_calibration_error([0.1, 0.1, 0.9, 0.9], [False, False, True, True]), 3)
+    0.1
+    """
+    curve = reliability_curve(risk, hazards, bins)
+    return float(curve.counts @ np.abs(curve.predicted - curve.observed) / curve.counts.sum())
+
+
+def calibration_error_floor(
+    risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
+) -> float:
+    """Return the mean ECE that labels drawn from these very risks would score: the sampling floor at this n.
+
+    Parameters
+    ----------
+    risk : array_like, shape (n,)
+        Predicted probabilities in [0, 1].
+    rng : numpy.random.Generator
+        Draws the labels.
+    bins, draws : int
+        Bins of the ECE; how many sets of labels.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As `reliability_curve`.
+
+    Examples
+    --------
+    >>> round(calibration_error_floor(np.full(400, 0.5), np.random.default_rng(0)), 2)
+    0.02
+    """
+    predicted, _ = _checked_sample(risk, np.zeros(np.shape(risk)))
+    index = _bin_index(predicted, bins)
+    labels = rng.random((draws, predicted.size)) < predicted
+    membership = (index[:, None] == np.arange(bins)).astype(np.float64)
+    gaps = np.abs((labels - predicted) @ membership)
+    return float(gaps.sum(axis=1).mean() / predicted.size)
+
+
+def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
+    """Return the mean squared difference between risk and what came true.
+
+    Parameters and errors are those of `reliability_curve`.
+
+    Examples
+    --------
+    >>> round(brier_score([0.1, 0.8], [False, True]), 3)
+    0.025
+    """
+    predicted, labels = _checked_sample(risk, hazards)
+    return float(np.mean((predicted - labels) ** 2))
+
+
+def _bin_index(predicted: Numbers, bins: int) -> NDArray[np.intp]:
+    return np.minimum((predicted * bins).astype(np.intp), bins - 1)
+
+
+def _checked_sample(risk: ArrayLike, hazards: ArrayLike) -> tuple[Numbers, Numbers]:
+    predicted = finite_array("risk", risk, (None,))
+    labels = (finite_array("hazards", hazards, predicted.shape) > 0.5).astype(np.float64)
+    if not predicted.size or predicted.min() < 0.0 or predicted.max() > 1.0:
+        raise InvalidArgumentError("risk: expected at least one number, all in [0, 1]")
+    return predicted, labels

@@ -1,0 +1,68 @@
+r"""Class probabilities from probabilities of pairs.
+
+For classes i and j let :math:`r_{ij}` estimate :math:`P(i \mid i \text{ or } j)`. The probabilities are
+
+.. math:: \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2 \quad \text{with} \quad \sum_i p_i = 1,
+
+whose optimality conditions are linear and whose solution is never negative.
+
+Source: Wu, Lin, Weng, "Probability estimates for multi-class classification by pairwise coupling", 2004,
+second method.
+"""
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# As in libsvm: no pair is ever certain, and so no log-likelihood is ever infinite.
+SMALLEST_PROBABILITY = 1e-7
+
+
+def class_pairs(n_classes: int) -> list[tuple[int, int]]:
+    """Return all pairs i < j in the order of a one-against-one machine.
+
+    Examples
+    --------
+    >>> class_pairs(3)
+    [(0, 1), (0, 2), (1, 2)]
+    """
+    return list(combinations(range(n_classes), 2))
+
+
+def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]:
+    """Return class probabilities, shape (n, classes), positive and summing to one.
+
+    Parameters
+    ----------
+    pairwise : ndarray, shape (n, classes * (classes - 1) / 2)
+        P(i | i or j) for each of `class_pairs`.
+    n_classes : int
+        At least 2.
+
+    Examples
+    --------
+    >>> couple(np.array([[0.5 / 0.8, 0.5 / 0.7, 0.3 / 0.5]]), 3).round(3)
+    array([[0.5, 0.3, 0.2]])
+    """
+    bounded = np.clip(pairwise, SMALLEST_PROBABILITY, 1.0 - SMALLEST_PROBABILITY)
+    right_side = np.zeros((n_classes + 1, 1))
+    right_side[n_classes] = 1.0
+    solution = np.linalg.solve(_optimality_matrix(bounded, n_classes), right_side)[:, :n_classes, 0]
+    positive = np.maximum(solution, SMALLEST_PROBABILITY)
+    probabilities: NDArray[np.float64] = positive / positive.sum(axis=1, keepdims=True)
+    return probabilities
+
+
+def _optimality_matrix(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]:
+    """Bordered quadratic form [[Q, 1], [1', 0]], shape (n, classes + 1, classes + 1)."""
+    matrix = np.zeros((len(pairwise), n_classes + 1, n_classes + 1))
+    matrix[:, :n_classes, n_classes] = matrix[:, n_classes, :n_classes] = 1.0
+    for column, (i, j) in enumerate(class_pairs(n_classes)):
+        first = pairwise[:, column]
+        second = 1.0 - first
+        matrix[:, i, i] += second**2
+        matrix[:, j, j] += first**2
+        matrix[:, i, j] -= first * second
+        matrix[:, j, i] -= first * second
+    return matrix

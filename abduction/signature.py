@@ -1,0 +1,206 @@
+r"""The published signature model: from a feature vector to likelihoods of the explanations.
+
+A linear one-against-one machine on standardised features; each pair's decision value goes through a sigmoid,
+and the pairs are coupled into posteriors of front, left, none and right. Dividing by the class frequencies of
+the training set leaves likelihoods, which is what eq. (post) takes.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+from .evidence import SignatureEvidence
+from .pairwise import class_pairs, couple
+from .platt import sigmoid
+
+CLASSES = ("front", "left", "none", "right")
+DIRECTIONS = ("left", "right")
+FRONT, LEFT, NONE, RIGHT = range(4)
+# Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
+EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
+PAIRS = len(class_pairs(len(CLASSES)))
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignatureModel:
+    r"""Coefficients of the published classifier, no rows of the data it was trained on.
+
+    .. math:: f_{ij}(x) = w_{ij}^T (x - \mu) / \sigma + b_{ij}, \qquad
+              P(i \mid i \text{ or } j, x) = 1 / (1 + \exp(A_{ij} f_{ij} + B_{ij})).
+
+    Parameters
+    ----------
+    mean, scale : ndarray, shape (features,)
+        Standardisation; scale > 0.
+    coefficients : ndarray, shape (6, features)
+        w, one row for each pair of the classes front, left, none, right.
+    intercepts : ndarray, shape (6,)
+        b.
+    slopes, offsets : ndarray, shape (6,)
+        A and B of the sigmoids.
+    class_prior : ndarray, shape (4,)
+        Class frequencies of the training set, mirrored rows included.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If shapes do not agree, a number is not finite, a scale is not positive or the prior is none.
+
+    References
+    ----------
+    Schulz et al., "Hearing What You Cannot See: Acoustic Vehicle Detection Around Corners", 2021.
+
+    Examples
+    --------
+    >>> pairs = np.zeros(6)
+    >>> model = SignatureModel(np.zeros(2), np.ones(2), np.zeros((6, 2)), pairs, pairs, pairs, np.full(4, 0.25))
+    >>> model.predict_proba([[0.3, 0.1]])
+    array([[0.25, 0.25, 0.25, 0.25]])
+    """
+
+    mean: Numbers
+    scale: Numbers
+    coefficients: Numbers
+    intercepts: Numbers
+    slopes: Numbers
+    offsets: Numbers
+    class_prior: Numbers
+
+    def __post_init__(self) -> None:
+        features = np.size(self.mean)
+        shapes: dict[str, tuple[int, ...]] = {
+            "mean": (features,),
+            "scale": (features,),
+            "coefficients": (PAIRS, features),
+            "intercepts": (PAIRS,),
+            "slopes": (PAIRS,),
+            "offsets": (PAIRS,),
+            "class_prior": (len(CLASSES),),
+        }
+        for name, shape in shapes.items():
+            value = finite_array(name, getattr(self, name), shape).copy()
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if (self.scale <= 0).any():
+            raise InvalidArgumentError("scale: expected positive numbers")
+        if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
+            raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the columns of `predict_proba`."""
+        return CLASSES
+
+    @property
+    def directions(self) -> tuple[str, ...]:
+        """Names of the hidden hypotheses of `evidence`."""
+        return DIRECTIONS
+
+    @property
+    def n_features(self) -> int:
+        """Length of the feature vector."""
+        return int(self.mean.size)
+
+    @property
+    def reference_prior(self) -> tuple[float, ...]:
+        """Training prior in the order of the explanations (left, right, visible, none)."""
+        return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
+
+    def decision_values(self, X: ArrayLike) -> Numbers:
+        """Return f, shape (n, 6): positive where the first class of the pair is the better one.
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another shape, NaN or infinity.
+        """
+        features = finite_array("X", X, (None, self.n_features))
+        values: Numbers = (features - self.mean) / self.scale @ self.coefficients.T + self.intercepts
+        return values
+
+    def predict_proba(self, X: ArrayLike) -> Numbers:
+        """Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+
+        Parameters and errors are those of `decision_values`.
+        """
+        return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
+
+    def log_likelihoods(self, X: ArrayLike) -> Numbers:
+        r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
+
+        Parameters and errors are those of `decision_values`.
+        """
+        ratios = np.log(self.predict_proba(X)) - np.log(self.class_prior)
+        return np.asarray(ratios[:, EXPLANATION_COLUMNS])
+
+    def evidence(self, feature: ArrayLike) -> SignatureEvidence:
+        """Return the log-likelihoods of one feature vector, shape (features,).
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another shape, NaN or infinity.
+        """
+        left, right, visible, none = self.log_likelihoods(np.atleast_2d(feature))[0].tolist()
+        return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values; reading them back gives the same model to the bit."""
+        names = ("mean", "scale", "coefficients", "intercepts", "slopes", "offsets", "class_prior")
+        return {"classes": list(CLASSES)} | {name: getattr(self, name).tolist() for name in names}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "SignatureModel":
+        """Return the model that `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the classes are others or the numbers do not fit; KeyError where one is missing.
+        """
+        if tuple(data["classes"]) != CLASSES:
+            raise InvalidArgumentError(f"classes: expected {CLASSES}, got {str(data['classes'])[:80]}")
+        return cls(
+            mean=data["mean"],
+            scale=data["scale"],
+            coefficients=data["coefficients"],
+            intercepts=data["intercepts"],
+            slopes=data["slopes"],
+            offsets=data["offsets"],
+            class_prior=data["class_prior"],
+        )
+
+
+def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Numbers:
+    r"""Return eq. (post) at the training prior for many windows at once, shape (n,).
+
+    .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
+
+    Parameters
+    ----------
+    probabilities : array_like, shape (n, 4)
+        Posteriors of front, left, none, right.
+    miss_rate : float
+        beta: 1 gives the published statistic, 0 removes the visible explanation.
+
+    Examples
+    --------
+    >>> [hazard_statistic([[0.5, 0.3, 0.1, 0.1]], beta).round(3).item() for beta in (1.0, 0.0)]
+    [0.4, 0.8]
+    """
+    posteriors = finite_array("probabilities", probabilities, (None, len(CLASSES)))
+    hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]
+    statistic: Numbers = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
+    return statistic

@@ -1,0 +1,174 @@
+"""Training of the published classifier: standardise, mirror, linear machine, sigmoid per pair.
+
+scikit-learn's own ``SVC(probability=True)`` is deprecated, and it couples probabilities inside libsvm, where
+they cannot be taken out as plain numbers. The recipe is repeated here on top of the machine itself.
+"""
+
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.svm import SVC
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+from .pairwise import class_pairs
+from .platt import fit_sigmoid
+from .signature import CLASSES, FRONT, LEFT, NONE, RIGHT, SignatureModel
+
+SEGMENTS = 2
+PLATT_FOLDS = 5
+
+Numbers = NDArray[np.float64]
+Labels = NDArray[np.str_]
+
+
+class Classifier(Protocol):
+    """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Learn from features (n, features) and class names (n,)."""
+        ...
+
+    def predict_proba(self, X: ArrayLike) -> Numbers:
+        """Return posteriors of front, left, none, right, shape (n, 4)."""
+        ...
+
+
+class PublishedClassifier:
+    """The published pipeline, scikit-learn style.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Draws the folds from which the sigmoids are fitted.
+    penalty : float
+        C of the machine.
+
+    Attributes
+    ----------
+    model_ : SignatureModel
+        After `fit`: all that inference needs.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> y = np.repeat(CLASSES, 10)
+    >>> X = rng.normal(size=(40, 60)) + 3.0 * np.arange(60) * np.repeat([[0], [1], [2], [3]], 10, axis=0)
+    >>> PublishedClassifier(rng).fit(X, y).predict_proba(X).shape
+    (40, 4)
+    """
+
+    model_: SignatureModel
+
+    def __init__(self, rng: np.random.Generator, penalty: float = 1.0) -> None:
+        self.rng = rng
+        self.penalty = penalty
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Fit on features, shape (n, features), and class names, shape (n,).
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the features are not finite or a class is missing or unknown.
+        """
+        features = finite_array("X", X, (None, None))
+        features, labels = mirror_hazards(features, _checked_labels(y, len(features)))
+        mean, scale = _standardisation(features)
+        standard = (features - mean) / scale
+        codes = np.searchsorted(CLASSES, labels)
+        machine = SVC(kernel="linear", C=self.penalty, decision_function_shape="ovo").fit(standard, codes)
+        slopes, offsets = self._fit_sigmoids(standard, codes)
+        self.model_ = SignatureModel(
+            mean=mean,
+            scale=scale,
+            coefficients=machine.coef_,
+            intercepts=machine.intercept_,
+            slopes=slopes,
+            offsets=offsets,
+            class_prior=np.bincount(codes) / codes.size,
+        )
+        return self
+
+    def predict_proba(self, X: ArrayLike) -> Numbers:
+        """Return posteriors of front, left, none, right, shape (n, 4)."""
+        return self.model_.predict_proba(X)
+
+    def _fit_sigmoids(self, standard: Numbers, codes: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
+        fits = []
+        for first, second in class_pairs(len(CLASSES)):
+            chosen = (codes == first) | (codes == second)
+            is_first = codes[chosen] == first
+            fits.append(fit_sigmoid(self._held_out_decisions(standard[chosen], is_first), is_first))
+        slopes, offsets = np.array(fits).T
+        return slopes, offsets
+
+    def _held_out_decisions(self, standard: Numbers, is_first: NDArray[np.bool_]) -> Numbers:
+        """Decision values of machines that did not see the sample, positive for the first class."""
+        decisions = np.empty(len(standard))
+        fold = self.rng.permutation(len(standard)) % PLATT_FOLDS
+        for held_out in range(PLATT_FOLDS):
+            test, train = fold == held_out, fold != held_out
+            if is_first[train].all() or not is_first[train].any():
+                decisions[test] = 1.0 if is_first[train].all() else -1.0
+                continue
+            machine = SVC(kernel="linear", C=self.penalty).fit(standard[train], is_first[train])
+            decisions[test] = machine.decision_function(standard[test]) if test.any() else 0.0
+        return decisions
+
+
+def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
+    """Return the features of the mirrored scene: azimuths reversed within each segment.
+
+    Parameters
+    ----------
+    X : ndarray, shape (n, segments * azimuths)
+        Segment-major: all azimuths of the first segment, then those of the next.
+    segments : int
+        Stretches of time that a feature vector covers.
+
+    Examples
+    --------
+    >>> mirror_features(np.array([[1, 2, 3, 4, 5, 6]]))
+    array([[3, 2, 1, 6, 5, 4]])
+    """
+    return X.reshape(len(X), segments, -1)[:, :, ::-1].reshape(X.shape)
+
+
+def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
+    """Append the mirror images of all left and right windows, sides swapped.
+
+    Only these two classes are mirrored, as published: hazards become more frequent than they were.
+
+    Parameters
+    ----------
+    X : ndarray, shape (n, 2 * azimuths)
+    y : ndarray of str, shape (n,)
+
+    Examples
+    --------
+    >>> mirror_hazards(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array(["left", "none"]))[1]
+    array(['left', 'none', 'right'], dtype='<U5')
+    """
+    hazard = np.isin(y, (CLASSES[LEFT], CLASSES[RIGHT]))
+    swapped = np.where(y[hazard] == CLASSES[LEFT], CLASSES[RIGHT], CLASSES[LEFT])
+    return np.concatenate([X, mirror_features(X[hazard])]), np.concatenate([y, swapped])
+
+
+def _standardisation(features: Numbers) -> tuple[Numbers, Numbers]:
+    deviation = features.std(axis=0)
+    # A feature that never changes carries nothing; leave it as it is.
+    return features.mean(axis=0), np.where(deviation > 10 * np.finfo(float).eps, deviation, 1.0)
+
+
+def _checked_labels(y: ArrayLike, n: int) -> Labels:
+    labels = np.asarray(y, dtype=np.str_)
+    if labels.shape != (n,):
+        raise InvalidArgumentError(f"y: expected {n} class names, got shape {labels.shape}")
+    present = set(labels.tolist())
+    hazards = {CLASSES[LEFT], CLASSES[RIGHT]}
+    if not present <= set(CLASSES) or not {CLASSES[FRONT], CLASSES[NONE]} <= present or not present & hazards:
+        raise InvalidArgumentError(f"y: expected the classes {CLASSES}, got {sorted(present)[:8]}")
+    return labels
