@@ -1,0 +1,216 @@
+"""Multichannel recordings in blocks, with everything that can be wrong with them said at the door."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import soundfile
+from numpy.typing import NDArray
+
+from worldstate.adapters.riff import data_size
+from worldstate.errors import InputFileError, InvalidArgumentError
+
+Samples = NDArray[np.float32]
+
+CONTAINERS = ("WAV", "WAVEX", "RF64", "W64", "FLAC")
+# Lossy codecs keep what the ear needs and lose the phase between microphones.
+ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE")
+SHORTEST_S = 1.0
+
+
+class AudioSource:
+    """An open recording; use `open_audio` to get one.
+
+    A context manager, so that the file is closed on the way out.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    sample_rate_hz : int
+        As the header says; OVAD's is 47,998, not 48,000.
+    channels : int
+        Number of microphones M.
+    frames : int
+        Samples per channel.
+    """
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self._file = file
+        self.path = path
+        self.sample_rate_hz = int(file.samplerate)
+        self.channels = int(file.channels)
+        self.frames = int(file.frames)
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return self.frames / self.sample_rate_hz
+
+    def blocks(self, frames: int = 4800) -> Iterator[Samples]:
+        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter.
+
+        Parameters
+        ----------
+        frames : int
+            Samples per channel in a block, >= 1.
+
+        Yields
+        ------
+        ndarray
+            Shape (n, M), float32, full scale 1; a new array each time, the reader's to keep.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If `frames` is below one.
+        InputFileError
+            If a sample is NaN or infinite, or the data ends before the promised length.
+        """
+        if frames < 1:
+            raise InvalidArgumentError(f"frames: expected at least 1, got {frames}")
+        self._seek(0)
+        for start in range(0, self.frames, frames):
+            block = self._read(min(frames, self.frames - start))
+            _refuse_non_finite(self.path, block, start)
+            yield block
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        self._file.close()
+
+    def __enter__(self) -> "AudioSource":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def check_end(self) -> None:
+        """Read the last sample, which a FLAC file that was cut short cannot give."""
+        self._seek(self.frames - 1)
+        self._read(1)
+
+    def first_second(self) -> Samples:
+        """Return the first second, shape (sample_rate_hz, M)."""
+        self._seek(0)
+        return self._read(self.sample_rate_hz)
+
+    def _seek(self, frame: int) -> None:
+        try:
+            self._file.seek(frame)
+        except soundfile.SoundFileError as error:
+            raise _cut_short(self.path, self.frames) from error
+
+    def _read(self, frames: int) -> Samples:
+        try:
+            block: Samples = self._file.read(frames, dtype="float32", always_2d=True)
+        except soundfile.SoundFileError as error:
+            raise _cut_short(self.path, self.frames) from error
+        if len(block) < frames:
+            raise _cut_short(self.path, self.frames)
+        return block
+
+
+def open_audio(path: str | Path, expect_channels: int | None = None) -> AudioSource:
+    """Open a WAV, RF64, W64 or FLAC recording and check what can be checked before the first block.
+
+    FLAC holds 8 channels at most and WAV 4 GiB, nine minutes of 56 channels: use RF64 or W64 beyond.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    expect_channels : int, optional
+        Number of microphones of the array that it shall fit.
+
+    Returns
+    -------
+    AudioSource
+        Open, at its start.
+
+    Raises
+    ------
+    InputFileError
+        Names the file, for: missing, not audio, lossy, empty, shorter than one second, cut short (the header
+        promises more than the file holds), another number of channels, a sample in the first second that is
+        NaN or infinite, and channels constant over the first second (numbered from 1 as in the file).
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "noise.wav"
+    ...     soundfile.write(name, np.random.default_rng(0).uniform(-1, 1, (9600, 4)), 8000)
+    ...     with open_audio(name, expect_channels=4) as source:
+    ...         source.channels, source.duration_s, [block.shape for block in source.blocks(4800)]
+    (4, 1.2, [(4800, 4), (4800, 4)])
+    """
+    name = Path(path)
+    source = AudioSource(name, _open_file(name))
+    try:
+        _check(source, expect_channels)
+    except BaseException:
+        source.close()
+        raise
+    return source
+
+
+def _open_file(path: Path) -> Any:
+    if not path.is_file():
+        problem = "expected an audio file, found a folder" if path.is_dir() else "no such file"
+        raise InputFileError(path, problem)
+    try:
+        file = soundfile.SoundFile(path)
+    except (soundfile.SoundFileError, OSError) as error:
+        raise InputFileError(path, "expected WAV, RF64, W64 or FLAC audio, found something else") from error
+    if file.format not in CONTAINERS or file.subtype not in ENCODINGS:
+        kind = f"{file.format} {file.subtype}"
+        file.close()
+        raise InputFileError(path, f"expected WAV, RF64, W64 or FLAC with plain samples, got {kind}")
+    return file
+
+
+def _check(source: AudioSource, expect_channels: int | None) -> None:
+    _refuse_cut_file(source)
+    if source.frames == 0:
+        raise InputFileError(source.path, "expected samples, the recording is empty")
+    if expect_channels is not None and source.channels != expect_channels:
+        problem = f"expected {expect_channels} channels, one per microphone, got {source.channels}"
+        raise InputFileError(source.path, problem)
+    if source.duration_s < SHORTEST_S:
+        raise InputFileError(source.path, f"expected at least 1 s of audio, got {source.duration_s:.3f} s")
+    source.check_end()
+    first = source.first_second()
+    _refuse_non_finite(source.path, first, 0)
+    _refuse_silent(source.path, first)
+
+
+def _refuse_cut_file(source: AudioSource) -> None:
+    size = data_size(source.path)
+    if size is not None and size.is_cut:
+        problem = f"cut short: expected {size.declared} bytes of samples by its header, got {size.available}"
+        raise InputFileError(source.path, problem)
+
+
+def _cut_short(path: Path, frames: int) -> InputFileError:
+    return InputFileError(path, f"cut short or damaged: expected {frames} samples a channel by its header")
+
+
+def _refuse_non_finite(path: Path, block: Samples, start: int) -> None:
+    finite = np.isfinite(block)
+    if not finite.all():
+        sample, channel = np.argwhere(~finite)[0]
+        where = f"channel {channel + 1}, sample {start + sample}"
+        raise InputFileError(path, f"expected finite samples, got {block[sample, channel]} in {where}")
+
+
+def _refuse_silent(path: Path, first: Samples) -> None:
+    silent = np.flatnonzero((first == first[0]).all(axis=0)) + 1
+    if silent.size:
+        numbers = ", ".join(map(str, silent))
+        problem = f"expected sound on every channel, got one constant value for a second on channel {numbers}"
+        raise InputFileError(path, problem)

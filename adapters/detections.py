@@ -1,0 +1,292 @@
+"""What a camera's detector reported, frame by frame."""
+
+import json
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.values import nanoseconds
+
+MAX_BYTES = 64 << 20
+MAX_FRAMES = 100_000
+MAX_BOXES_A_FRAME = 1000
+MAX_FRAME_RATE_HZ = 1000.0
+# Decisions at 47,998 Hz fall up to half a sample (10 us) before the frame that they belong to.
+STAMP_SLACK_NS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectionFrame:
+    """All boxes of one image.
+
+    Parameters
+    ----------
+    boxes_px : ndarray
+        Shape (n, 4): left, top, right, bottom; pixels from the upper left corner.
+    scores : ndarray
+        Shape (n,), in [0, 1].
+    labels : tuple of str
+        n class names, as the detector says them.
+
+    Examples
+    --------
+    >>> frame = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9]), ("car",))
+    >>> len(frame), frame.select(DetectionFilter()), frame.select(DetectionFilter(min_height_px=200))
+    (1, array([0]), array([], dtype=int64))
+    """
+
+    boxes_px: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    labels: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def select(self, keep: "DetectionFilter") -> NDArray[np.int64]:
+        """Return the indices of the boxes that `keep` lets through."""
+        heights_px = self.boxes_px[:, 3] - self.boxes_px[:, 1]
+        named = np.array([label in keep.labels for label in self.labels], dtype=bool)
+        return np.flatnonzero(named & (self.scores >= keep.min_score) & (heights_px > keep.min_height_px))
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionFilter:
+    """Which boxes count; the defaults are those of the authors of OVAD.
+
+    Parameters
+    ----------
+    labels : frozenset of str
+        Classes that count as a road user.
+    min_score : float
+        Lowest score, in [0, 1].
+    min_height_px : float
+        Boxes must be higher than this, which leaves the far ones out.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> sorted(DetectionFilter().labels)
+    ['car', 'motorcycle']
+    """
+
+    labels: Collection[str] = frozenset({"car", "motorcycle"})
+    min_score: float = 0.75
+    min_height_px: float = 100.0
+
+    def __post_init__(self) -> None:
+        in_range("min_score", self.min_score, 0.0, 1.0)
+        in_range("min_height_px", self.min_height_px, 0.0, math.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectionLog:
+    """Frames of one camera in the order of time.
+
+    Parameters
+    ----------
+    frames : tuple of DetectionFrame
+        One per image, empty ones included: an image without boxes was searched.
+    stamps_ns : ndarray
+        Shape (n,), int64, strictly increasing, nanoseconds on the stream's clock.
+    source : str
+        Where it comes from, for messages: the file's name.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the two do not fit or the stamps are not in order.
+
+    Examples
+    --------
+    >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    >>> log = DetectionLog.at_rate([empty] * 30, frame_rate_hz=10.0)
+    >>> log.latest(1_040_000_000, max_age_ns=150_000_000), log.latest(9_000_000_000, max_age_ns=150_000_000)
+    (10, None)
+    """
+
+    frames: tuple[DetectionFrame, ...]
+    stamps_ns: NDArray[np.int64]
+    source: str = "detections"
+
+    def __post_init__(self) -> None:
+        if len(self.frames) != len(self.stamps_ns):
+            got = f"{len(self.stamps_ns)} stamps for {len(self.frames)} frames"
+            raise InvalidArgumentError(f"stamps_ns: expected one per frame, got {got}")
+        backward = np.flatnonzero(np.diff(self.stamps_ns) <= 0)
+        if backward.size:
+            where = f"frame {backward[0] + 1} is not later than frame {backward[0]}"
+            raise InvalidArgumentError(f"stamps_ns: expected increasing time stamps, {where}")
+
+    @classmethod
+    def at_rate(
+        cls,
+        frames: Collection[DetectionFrame],
+        frame_rate_hz: float,
+        start_ns: int = 0,
+        source: str = "detections",
+    ) -> "DetectionLog":
+        """Stamp frame i with start + i / rate, counted from the start of the recording.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the rate is not above 0 and at most 1000.
+        """
+        in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
+        stamps = [start_ns + nanoseconds(i / frame_rate_hz) for i in range(len(frames))]
+        return cls(tuple(frames), np.array(stamps, dtype=np.int64), source)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def latest(self, stamp_ns: int, max_age_ns: int) -> int | None:
+        """Return the number of the last frame taken at or before `stamp_ns`, None if too old or not there."""
+        index = int(np.searchsorted(self.stamps_ns, stamp_ns + STAMP_SLACK_NS, side="right")) - 1
+        if index < 0 or stamp_ns - int(self.stamps_ns[index]) > max_age_ns:
+            return None
+        return index
+
+
+def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int = 0) -> DetectionLog:
+    """Read per-frame detections in OVAD's JSON.
+
+    ``{"detections_per_frame": [{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...]},
+    ...]}`` with other keys ignored. A detector of your own may add ``"stamp_ns"`` to every frame; without it
+    frame i shows the time i / `frame_rate_hz` from the start of the recording.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; at most 64 MiB, 100,000 frames, 1000 boxes a frame.
+    frame_rate_hz : float
+        Frames a second where the frames carry no stamp.
+    start_ns : int
+        Stamp of the first frame where the frames carry none.
+
+    Returns
+    -------
+    DetectionLog
+        Every box, unfiltered.
+
+    Raises
+    ------
+    InputFileError
+        Names the file and the frame: missing, too large, no JSON, keys missing, other types, lengths that
+        differ, numbers that are not finite, boxes turned inside out, scores outside [0, 1], stamps out of
+        order.
+    InvalidArgumentError
+        If the rate is not above 0 and at most 1000.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "camera_baseline_results.json"
+    ...     frame = '{"boxes": [[10, 20, 60, 140]], "scores": [0.9], "classes_str": ["car"]}'
+    ...     _ = name.write_text('{"detections_per_frame": [' + frame + "]}")
+    ...     read_detections(name).frames[0].labels
+    ('car',)
+    """
+    in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
+    name = Path(path)
+    document = _load(name)
+    rows = document.get("detections_per_frame") if isinstance(document, dict) else None
+    if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
+        problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
+        raise InputFileError(name, problem)
+    frames = [_frame(name, number, row) for number, row in enumerate(rows)]
+    try:
+        return _stamp(name, rows, frames, frame_rate_hz, start_ns)
+    except InvalidArgumentError as error:
+        raise InputFileError(name, str(error)) from error
+
+
+def _load(path: Path) -> Any:
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputFileError(path, f"expected a detections file ({error.strerror})") from error
+    if len(text) > MAX_BYTES:
+        raise InputFileError(path, f"expected a detections file of at most {MAX_BYTES} bytes")
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise InputFileError(path, f"expected detections as JSON, it does not parse: {error}") from error
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _frame(path: Path, number: int, row: Any) -> DetectionFrame:
+    try:
+        return _parse_frame(row)
+    except InvalidArgumentError as error:
+        raise InputFileError(path, f"frame {number}: {error}") from error
+
+
+def _parse_frame(row: Any) -> DetectionFrame:
+    boxes, scores, labels = (_list(row, key) for key in ("boxes", "scores", "classes_str"))
+    if not len(boxes) == len(scores) == len(labels) <= MAX_BOXES_A_FRAME:
+        got = f"{len(boxes)} boxes, {len(scores)} scores, {len(labels)} classes_str"
+        raise InvalidArgumentError(f"expected as many of each, at most {MAX_BOXES_A_FRAME}, got {got}")
+    if not all(isinstance(label, str) for label in labels):
+        raise InvalidArgumentError("classes_str: expected class names")
+    if not all(isinstance(box, list) and len(box) == 4 for box in boxes):
+        raise InvalidArgumentError("boxes: expected four numbers each, x1 y1 x2 y2")
+    boxes_px = _numbers("boxes", [value for box in boxes for value in box]).reshape(-1, 4)
+    frame = DetectionFrame(boxes_px, _numbers("scores", scores), tuple(labels))
+    _check_frame(frame)
+    return frame
+
+
+def _check_frame(frame: DetectionFrame) -> None:
+    if (frame.boxes_px[:, :2] > frame.boxes_px[:, 2:]).any():
+        raise InvalidArgumentError("boxes: expected x1 <= x2 and y1 <= y2")
+    if ((frame.scores < 0.0) | (frame.scores > 1.0)).any():
+        raise InvalidArgumentError("scores: expected numbers in [0, 1]")
+
+
+def _list(row: Any, key: str) -> list[Any]:
+    value = row.get(key) if isinstance(row, dict) else None
+    if not isinstance(value, list):
+        raise InvalidArgumentError(f"{key}: expected a list, got {type(value).__name__}")
+    return value
+
+
+def _numbers(name: str, values: list[Any]) -> NDArray[np.float64]:
+    # numpy alone would take True and "1" for numbers.
+    wrong = next((type(v).__name__ for v in values if type(v) not in (int, float)), None)
+    if wrong is not None:
+        raise InvalidArgumentError(f"{name}: expected numbers, got {wrong}")
+    try:
+        array = np.array(values, dtype=np.float64)
+    except OverflowError:
+        array = np.array([math.inf])
+    if not np.isfinite(array).all():
+        raise InvalidArgumentError(f"{name}: expected finite numbers")
+    return array
+
+
+def _stamp(
+    path: Path, rows: list[Any], frames: list[DetectionFrame], frame_rate_hz: float, start_ns: int
+) -> DetectionLog:
+    stamps = [row.get("stamp_ns") for row in rows]
+    if all(stamp is None for stamp in stamps):
+        return DetectionLog.at_rate(frames, frame_rate_hz, start_ns, str(path))
+    for number, stamp in enumerate(stamps):
+        if type(stamp) is not int or not 0 <= stamp < 1 << 63:
+            raise InputFileError(path, f"frame {number}: expected stamp_ns as an integer, got {stamp!r}")
+    return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), str(path))

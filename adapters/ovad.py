@@ -1,0 +1,269 @@
+"""The layout of OVAD: what was recorded where, with which label, and when the vehicle came into sight.
+
+``<root>/DataLog.csv`` with the columns ID, Environment, Class and T0, and one folder a recording,
+``<root>/<environment>/<class>/<ID>/``, with ``out_multi.wav`` and, for a standing ego, camera detections.
+"""
+
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeGuard, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.audio import AudioSource, open_audio
+from worldstate.adapters.csv_rows import read_rows
+from worldstate.adapters.detections import DetectionLog, read_detections
+from worldstate.errors import InputFileError
+from worldstate.values import wrap_angle
+
+Label = Literal["left", "none", "right"]
+
+FRAME_RATE_HZ = 10.0
+LOG_NAME = "DataLog.csv"
+AUDIO_NAME = "out_multi.wav"
+# The data set's description names the first, its authors' code opens the second.
+DETECTION_NAMES = ("camera_baseline_results.json", "camera_baseline_detections.json")
+COLUMNS = ("ID", "Environment", "Class", "T0")
+MAX_T0_FRAME = 1_000_000
+# S or D for a standing or moving ego, then the junction: its type and number.
+ENVIRONMENT = re.compile(r"(?P<ego>[SD])(?P<junction>[A-Z][0-9]{1,3})", re.ASCII)
+IDENTIFIER = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One recording and what is known of it.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder.
+    recording_id : str
+        Unique in the data set.
+    environment : str or None
+        Such as ``"SA1"``: standing ego, junction A1. None where no log is there and the folder does not tell.
+    label : str or None
+        Side that the vehicle comes from, or ``"none"``.
+    t0_frame : int or None
+        Frame, from the start of the recording, in which the vehicle enters line of sight; None where there is
+        no vehicle or it is not known.
+
+    Examples
+    --------
+    >>> recording = Recording(Path("SA1/left/1_00_0002"), "1_00_0002", "SA1", "left", 70)
+    >>> recording.junction, recording.moving_ego, recording.t0_s
+    ('A1', False, 7.0)
+    """
+
+    path: Path
+    recording_id: str
+    environment: str | None = None
+    label: Label | None = None
+    t0_frame: int | None = None
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Recording":
+        """Find a recording from its folder alone, with its log where that stands three folders up.
+
+        Raises
+        ------
+        InputFileError
+            If the folder or its sound is missing, the log is damaged or it contradicts the folder.
+        """
+        # A recording may be a link to another disk, so links are followed only where ".." asks for it.
+        folder = Path(path).resolve() if ".." in Path(path).parts else Path(path).absolute()
+        if not (folder / AUDIO_NAME).is_file():
+            raise InputFileError(path, f"expected a recording folder with {AUDIO_NAME}")
+        log = next((root / LOG_NAME for root in folder.parents[2:3] if (root / LOG_NAME).is_file()), None)
+        listed = () if log is None else _read_log(log.parent)
+        entry = next((recording for recording in listed if recording.recording_id == folder.name), None)
+        if entry is None:
+            return cls(folder, folder.name, _environment_of(folder), _label_of(folder))
+        if entry.path != folder:
+            place = f"{entry.environment}/{entry.label}"
+            raise InputFileError(log, f"expected {folder.name} in {place}, as listed, found it at {path}")
+        return entry
+
+    @property
+    def audio_path(self) -> Path:
+        """The sound: 56 channels of 24 bit at 47,998 Hz in OVAD."""
+        return self.path / AUDIO_NAME
+
+    @property
+    def detections_path(self) -> Path | None:
+        """Camera detections, None where there are none, as for every moving ego."""
+        found = (self.path / name for name in DETECTION_NAMES)
+        return next((path for path in found if path.is_file()), None)
+
+    @property
+    def junction(self) -> str | None:
+        """Such as ``"A1"``: the place, the same for a standing and a moving ego."""
+        return self.environment[1:] if self.environment else None
+
+    @property
+    def moving_ego(self) -> bool | None:
+        """Whether the ego vehicle moves, None where not known."""
+        return self.environment.startswith("D") if self.environment else None
+
+    @property
+    def t0_s(self) -> float | None:
+        """Line-of-sight entry, seconds from the start of the recording."""
+        return None if self.t0_frame is None else self.t0_frame / FRAME_RATE_HZ
+
+    def open_audio(self, expect_channels: int | None = None) -> AudioSource:
+        """Open the sound; raises what `adapters.audio.open_audio` raises."""
+        return open_audio(self.audio_path, expect_channels)
+
+    def read_detections(self) -> DetectionLog | None:
+        """Read the camera detections, None where there are none; raises what the reader raises."""
+        path = self.detections_path
+        return None if path is None else read_detections(path, FRAME_RATE_HZ)
+
+
+class OvadDataset:
+    r"""All recordings that ``DataLog.csv`` lists, in its order.
+
+    Parameters
+    ----------
+    root : str or Path
+        Folder with ``DataLog.csv``.
+    ids : collection of str, optional
+        Keep these only, as `read_id_list` reads them from an official list. Some may be in another data set;
+        at least one must be here.
+
+    Attributes
+    ----------
+    root : Path
+        As given.
+    recordings : tuple of Recording
+        Listed ones; their files are checked when they are opened.
+
+    Raises
+    ------
+    InputFileError
+        If the log is missing or damaged: columns missing, an ID twice, an environment or class that is none,
+        T0 no integer, or nothing of `ids` in it.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     log = "ID,Environment,Class,T0\n1_00_0002,SA1,left,70\n"
+    ...     _ = (Path(folder) / "DataLog.csv").write_text(log)
+    ...     [(r.recording_id, r.junction, r.label, r.t0_s) for r in OvadDataset(folder).recordings]
+    [('1_00_0002', 'A1', 'left', 7.0)]
+    """
+
+    def __init__(self, root: str | Path, ids: Collection[str] | None = None) -> None:
+        self.root = Path(root)
+        listed = _read_log(self.root)
+        kept = tuple(r for r in listed if ids is None or r.recording_id in ids)
+        if ids is not None and not kept:
+            problem = f"expected some of the {len(ids)} wanted IDs, found none"
+            raise InputFileError(self.root / LOG_NAME, problem)
+        self.recordings = kept
+
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+
+def read_id_list(path: str | Path) -> frozenset[str]:
+    r"""Read the IDs of an official list: a CSV file with a column ID.
+
+    Raises
+    ------
+    InputFileError
+        If it is missing, has no such column, or names an ID that is none or one twice.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / "test.csv").write_text("ID\n1_00_0002\n1_00_0003\n")
+    ...     sorted(read_id_list(Path(folder) / "test.csv"))
+    ['1_00_0002', '1_00_0003']
+    """
+    name = Path(path)
+    ids = [_identifier(name, line, row["ID"]) for line, row in read_rows(name, ("ID",))]
+    _refuse_duplicates(name, ids)
+    return frozenset(ids)
+
+
+def to_base_link(ovad_azimuth_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Turn azimuths that grow to the right, as OVAD counts them, into left-positive ones.
+
+    Parameters
+    ----------
+    ovad_azimuth_rad : ndarray
+        Radians, right positive, any shape.
+
+    Returns
+    -------
+    ndarray
+        Radians in (-pi, pi], left positive, same shape and order.
+
+    Examples
+    --------
+    >>> np.degrees(to_base_link(np.radians([-90.0, 0.0, 30.0]))).round(6)
+    array([ 90.,   0., -30.])
+    """
+    return wrap_angle(-np.asarray(ovad_azimuth_rad, dtype=np.float64)) + 0.0
+
+
+def _read_log(root: Path) -> tuple[Recording, ...]:
+    name = root / LOG_NAME
+    recordings = tuple(_recording(name, line, row) for line, row in read_rows(name, COLUMNS))
+    _refuse_duplicates(name, [recording.recording_id for recording in recordings])
+    return recordings
+
+
+def _recording(log: Path, line: int, row: dict[str, str]) -> Recording:
+    identifier = _identifier(log, line, row["ID"])
+    environment, label = row["Environment"], row["Class"]
+    if not ENVIRONMENT.fullmatch(environment):
+        problem = f"line {line}: expected an Environment such as SA1 or DB3, got {environment!r}"
+        raise InputFileError(log, problem)
+    if not _is_label(label):
+        raise InputFileError(log, f"line {line}: expected Class left, none or right, got {label!r}")
+    folder = log.parent / environment / label / identifier
+    return Recording(folder, identifier, environment, label, _t0_frame(log, line, label, row["T0"]))
+
+
+def _identifier(path: Path, line: int, text: str) -> str:
+    if not IDENTIFIER.fullmatch(text):
+        raise InputFileError(path, f"line {line}: expected an ID such as 1_00_0002, got {text!r}")
+    return text
+
+
+def _t0_frame(log: Path, line: int, label: Label, text: str) -> int | None:
+    # The log gives recordings without a vehicle a T0 too, at which nothing happens.
+    if label == "none" and not text:
+        return None
+    if not (text.isascii() and text.isdecimal() and len(text) < 8 and int(text) <= MAX_T0_FRAME):
+        raise InputFileError(log, f"line {line}: expected T0 as a frame number, an integer, got {text!r}")
+    return None if label == "none" else int(text)
+
+
+def _refuse_duplicates(path: Path, ids: list[str]) -> None:
+    seen: set[str] = set()
+    for identifier in ids:
+        if identifier in seen:
+            raise InputFileError(path, f"expected every ID once, got {identifier} twice")
+        seen.add(identifier)
+
+
+def _is_label(text: str) -> TypeGuard[Label]:
+    return text in get_args(Label)
+
+
+def _label_of(folder: Path) -> Label | None:
+    name = folder.parent.name
+    return name if _is_label(name) else None
+
+
+def _environment_of(folder: Path) -> str | None:
+    name = folder.parent.parent.name
+    return name if ENVIRONMENT.fullmatch(name) else None

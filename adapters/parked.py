@@ -1,0 +1,87 @@
+"""Which boxes stand still: a parked car is no co-evidence for the sound of a moving one."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.detections import STAMP_SLACK_NS, DetectionLog
+from worldstate.checks import in_range
+from worldstate.values import nanoseconds
+
+
+@dataclass(frozen=True, slots=True)
+class ParkedRule:
+    """A box is parked when a box stood at its place in `share` of the frames of the last `span_s` seconds.
+
+    For a standing camera: seen from a moving one nothing stands still, so that nothing is parked.
+
+    Parameters
+    ----------
+    span_s : float
+        How long it must have stood, > 0.
+    tolerance_px : float
+        How far every edge may have moved.
+    share : float
+        Share of the past frames in which it must be there; below 1 because detectors miss now and then.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> ParkedRule().tolerance_px
+    5.0
+    """
+
+    span_s: float = 1.0
+    tolerance_px: float = 5.0
+    share: float = 0.8
+
+    def __post_init__(self) -> None:
+        in_range("span_s", self.span_s, 0.0, math.inf, open_low=True)
+        in_range("tolerance_px", self.tolerance_px, 0.0, math.inf)
+        in_range("share", self.share, 0.0, 1.0, open_low=True)
+
+
+def parked(log: DetectionLog, frame: int, box_px: NDArray[np.float64], rule: ParkedRule) -> bool:
+    """Tell whether a box of `frame` has stood still, from that frame and earlier ones alone.
+
+    Parameters
+    ----------
+    log : DetectionLog
+        All boxes, unfiltered: a parked car may be seen with a lower score for a moment.
+    frame : int
+        Number of the frame that the box is in.
+    box_px : ndarray
+        Shape (4,).
+    rule : ParkedRule
+        How still and for how long.
+
+    Returns
+    -------
+    bool
+        False as long as the log does not reach back over the whole span: not known to be parked.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.detections import DetectionFrame
+    >>> still = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9]), ("car",))
+    >>> log = DetectionLog.at_rate([still] * 20, frame_rate_hz=10.0)
+    >>> [parked(log, i, still.boxes_px[0], ParkedRule()) for i in (9, 10)]
+    [False, True]
+    """
+    since_ns = int(log.stamps_ns[frame]) - nanoseconds(rule.span_s)
+    first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
+    past = log.frames[first:frame]
+    if not past or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
+        return False
+    there = [_holds(earlier.boxes_px, box_px, rule.tolerance_px) for earlier in past]
+    return float(np.mean(there)) >= rule.share
+
+
+def _holds(boxes_px: NDArray[np.float64], box_px: NDArray[np.float64], tolerance_px: float) -> bool:
+    return bool((np.abs(boxes_px - box_px) <= tolerance_px).all(axis=1).any())

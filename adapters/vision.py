@@ -1,0 +1,227 @@
+"""Is the co-evidence there? Asks recorded camera detections about a sector."""
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from worldstate.abduction.absence import MissRateTable, default_miss_rates
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.detections import DetectionFilter, DetectionLog
+from worldstate.adapters.parked import ParkedRule, parked
+from worldstate.adapters.protocol import Side
+from worldstate.adapters.sector import WHOLE_SIDES, Sector
+from worldstate.checks import in_range
+from worldstate.errors import InputFileError
+from worldstate.measurement import Bearing, Sighting
+from worldstate.values import NotUsable, nanoseconds, seconds
+
+# Points at which a miss rate is averaged over the part of the sector that is in view.
+SAMPLES = 8
+BORDER_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class VisionSettings:
+    """How the camera is asked.
+
+    Parameters
+    ----------
+    half_width_rad : float
+        Half the width of the sector around a bearing, in (0, pi/2].
+    clutter_rate : float
+        Probability that a moving object of the class is reported where there is none, in (0, 1).
+    max_frame_age_s : float
+        A frame older than this no longer answers.
+    keep : DetectionFilter
+        Which boxes count.
+    still : ParkedRule
+        Which boxes are parked.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> round(math.degrees(VisionSettings().half_width_rad))
+    10
+    """
+
+    half_width_rad: float = math.radians(10.0)
+    clutter_rate: float = 0.01
+    max_frame_age_s: float = 0.15
+    keep: DetectionFilter = field(default_factory=DetectionFilter)
+    still: ParkedRule = field(default_factory=ParkedRule)
+
+    def __post_init__(self) -> None:
+        in_range("half_width_rad", self.half_width_rad, 0.0, math.pi / 2, open_low=True)
+        in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
+        in_range("max_frame_age_s", self.max_frame_age_s, 0.0, math.inf)
+
+
+class VisionQuery:
+    r"""The camera as the channel that is asked for co-evidence.
+
+    The answer to "is a moving object of a class that the signature predicts in this sector?" is
+
+    - `Unqueried` where there are no detections, no frame at that time, or nothing of the sector is in view;
+    - `Present` where a moving box of an expected class reaches into the sector;
+    - `Absent` otherwise.
+
+    Its miss rate is the expectation over the sector, with 1 where the camera does not see and the mean over
+    the expected classes C,
+
+    .. math:: \beta = \frac{1}{|S|} \int_S \frac{1}{|C|} \sum_{c \in C} \beta_c(\theta, d)\, d\theta
+
+    with theta the angle off the optical axis. The frame used is the latest one at or before the stamp.
+
+    Parameters
+    ----------
+    camera : PinholeCamera
+        The camera that took the frames.
+    detections : DetectionLog or None
+        None where there are none, as for all moving-ego recordings: every answer is `Unqueried`.
+    miss_rate : MissRateTable, optional
+        beta_c(theta, d); the paper's figures where none was measured.
+    degradation : float or callable
+        d in [0, 1], or a function from the stamp to d.
+    settings : VisionSettings, optional
+        How it is asked.
+
+    Raises
+    ------
+    InputFileError
+        If a box lies outside the image: the detections come from another camera.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.detections import DetectionFrame
+    >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    >>> query = VisionQuery(PinholeCamera(), DetectionLog.at_rate([empty] * 30, frame_rate_hz=10.0))
+    >>> answer = query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))
+    >>> type(answer).__name__, round(answer.miss_rate, 2)
+    ('Absent', 0.06)
+    >>> query.ask(nanoseconds(1.0), Bearing(1.0, 0.05))
+    Unqueried(reason='sector outside the field of view')
+    """
+
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        detections: DetectionLog | None,
+        miss_rate: MissRateTable | None = None,
+        degradation: float | Callable[[int], float] = 0.0,
+        settings: VisionSettings | None = None,
+    ) -> None:
+        self.camera = camera
+        self.detections = detections
+        self.miss_rate = miss_rate or default_miss_rates()
+        self.settings = settings or VisionSettings()
+        self._degradation = degradation
+        self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
+        self._view = Sector.between(*camera.view_rad)
+        if detections is not None:
+            _check_size(camera, detections)
+
+    def ask(
+        self,
+        stamp_ns: int,
+        bearing: Bearing | NotUsable,
+        expected_labels: Collection[str] | None = None,
+        side: Side | None = None,
+    ) -> CoEvidence:
+        """Search a sector of the frame at `stamp_ns`.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            On the stream's clock.
+        bearing : Bearing or NotUsable
+            The sector lies around it, unless `side` is given. Without either all that lies ahead is searched.
+        expected_labels : collection of str, optional
+            Classes that the signature predicts; all that the filter lets through where not given.
+        side : {"left", "right"}, optional
+            Search that whole side, 0 to 90 deg, for a source whose bearing is coarse.
+
+        Returns
+        -------
+        CoEvidence
+            Present, Absent or Unqueried.
+        """
+        if self.detections is None:
+            return Unqueried("no detections file")
+        if self._frame(stamp_ns) is None:
+            return Unqueried(f"no frame at {seconds(stamp_ns):.3f} s")
+        labels = self.settings.keep.labels if expected_labels is None else expected_labels
+        if not labels:
+            return Unqueried("the signature predicts no class that a camera would see")
+        sector = self._sector(bearing, side)
+        beta = self._expected_miss_rate(sector, stamp_ns, labels)
+        if beta is None:
+            return Unqueried("sector outside the field of view")
+        if any(_explains(sighting, sector, labels) for sighting in self.sightings(stamp_ns)):
+            return Present(beta, self.settings.clutter_rate)
+        return Absent(beta, self.settings.clutter_rate)
+
+    def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
+        """Return all that the filter lets through in the frame at `stamp_ns`, parked ones included."""
+        frame = self._frame(stamp_ns)
+        if frame is None or self.detections is None:
+            return ()
+        if frame != self._last[0]:
+            self._last = (frame, self._look(self.detections, frame))
+        return self._last[1]
+
+    def _frame(self, stamp_ns: int) -> int | None:
+        if self.detections is None:
+            return None
+        return self.detections.latest(stamp_ns, nanoseconds(self.settings.max_frame_age_s))
+
+    def _look(self, log: DetectionLog, number: int) -> tuple[Sighting, ...]:
+        frame = log.frames[number]
+        return tuple(
+            self.camera.sighting(
+                frame.boxes_px[i],
+                frame.labels[i],
+                float(frame.scores[i]),
+                moving=not parked(log, number, frame.boxes_px[i], self.settings.still),
+            )
+            for i in frame.select(self.settings.keep)
+        )
+
+    def _sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:
+        if side is not None or isinstance(bearing, NotUsable):
+            return WHOLE_SIDES[side]
+        return Sector(bearing.azimuth_rad, self.settings.half_width_rad)
+
+    def _expected_miss_rate(self, sector: Sector, stamp_ns: int, labels: Collection[str]) -> float | None:
+        """Return beta over the sector, None where nothing of it is in view."""
+        in_view = sector.overlap(self._view)
+        if in_view is None:
+            return None
+        d = self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
+        angles = self.camera.off_axis(in_view.midpoints(SAMPLES)).tolist()
+        seen = float(np.mean([self.miss_rate(angle, d, label) for label in labels for angle in angles]))
+        share = in_view.half_width_rad / sector.half_width_rad
+        return share * seen + (1.0 - share)
+
+
+def _explains(sighting: Sighting, sector: Sector, labels: Collection[str]) -> bool:
+    inside = sector.touches(sighting.azimuth_rad, sighting.width_rad)
+    return inside and sighting.moving and sighting.label in labels
+
+
+def _check_size(camera: PinholeCamera, log: DetectionLog) -> None:
+    size = np.array([camera.width_px, camera.height_px])
+    for number, frame in enumerate(log.frames):
+        corners = frame.boxes_px.reshape(-1, 2)
+        outside = ((corners < -BORDER_PX) | (corners > size + BORDER_PX)).any(axis=1)
+        if outside.any():
+            x, y = corners[outside][0]
+            image = f"the camera's {camera.width_px} x {camera.height_px} px"
+            problem = f"frame {number}: expected boxes within {image}, got a corner at ({x:g}, {y:g})"
+            raise InputFileError(log.source, problem)
