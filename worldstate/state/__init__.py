@@ -1,1 +1,24 @@
 """S_t = {entities, relations, context, cues} as immutable values."""
+
+from .context import Context, Occluder, Priors, Rates, blind_corner
+from .cue import RiskCue
+from .entity import Classification, Entity, Visibility
+from .relation import EGO, Relation
+from .world_state import SCHEMA_NAME, SCHEMA_VERSION, WorldState
+
+__all__ = [
+    "EGO",
+    "SCHEMA_NAME",
+    "SCHEMA_VERSION",
+    "Classification",
+    "Context",
+    "Entity",
+    "Occluder",
+    "Priors",
+    "Rates",
+    "Relation",
+    "RiskCue",
+    "Visibility",
+    "WorldState",
+    "blind_corner",
+]

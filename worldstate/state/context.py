@@ -1,0 +1,270 @@
+"""Context: what is known of the place before anything is heard."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+from .reading import Record
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Rates at which explanations give way to each other, 1/s.
+
+    The defaults are those of a side street with a few vehicles a minute: a hidden vehicle is heard for some
+    three seconds before it comes into view, and stays in view for about as long.
+
+    Parameters
+    ----------
+    arrival_hz : float
+        none -> hidden, per direction.
+    emergence_hz : float
+        hidden -> visible.
+    departure_hz : float
+        hidden -> none: it turns away or falls silent.
+    reocclusion_hz : float
+        visible -> hidden, all directions together.
+    visible_arrival_hz : float
+        none -> visible, for traffic that was never hidden.
+    visible_departure_hz : float
+        visible -> none.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If one is negative or not finite.
+
+    Examples
+    --------
+    >>> Rates(arrival_hz=0.01).emergence_hz
+    0.3
+    """
+
+    arrival_hz: float = 0.05
+    emergence_hz: float = 0.3
+    departure_hz: float = 0.1
+    reocclusion_hz: float = 0.05
+    visible_arrival_hz: float = 0.05
+    visible_departure_hz: float = 0.3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            in_range(field.name, getattr(self, field.name), 0.0, 1e3)
+
+    @property
+    def values_hz(self) -> tuple[float, float, float, float, float, float]:
+        """All six in the order of the fields."""
+        return (
+            self.arrival_hz,
+            self.emergence_hz,
+            self.departure_hz,
+            self.reocclusion_hz,
+            self.visible_arrival_hz,
+            self.visible_departure_hz,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_record(cls, record: Record) -> "Rates":
+        """Return the rates that `to_dict` wrote."""
+        return cls(**{field.name: record.number(field.name) for field in fields(cls)})
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """Probabilities of the three explanations.
+
+    Parameters
+    ----------
+    hidden, visible, none : float
+        In [0, 1]; they sum to one.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If they do not.
+
+    Examples
+    --------
+    >>> Priors(0.2, 0.3, 0.5).hidden
+    0.2
+    """
+
+    hidden: float
+    visible: float
+    none: float
+
+    def __post_init__(self) -> None:
+        values = (self.hidden, self.visible, self.none)
+        if min(values) < 0 or not math.isclose(sum(values), 1.0, abs_tol=1e-6):
+            raise InvalidArgumentError(f"priors: expected three probabilities that sum to one, got {values}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {"hidden": self.hidden, "visible": self.visible, "none": self.none}
+
+    @classmethod
+    def from_record(cls, record: Record) -> "Priors":
+        """Return the priors that `to_dict` wrote."""
+        return cls(record.probability("hidden"), record.probability("visible"), record.probability("none"))
+
+
+@dataclass(frozen=True, slots=True)
+class Occluder:
+    """A static thing that hides one approach: the landmark that hidden entities are related to.
+
+    Parameters
+    ----------
+    id : str
+        Name, unique in the context.
+    direction : str
+        Label of the approach side that it hides, as the signature model says it.
+    edge_azimuth_rad : float
+        Azimuth of its edge, where hidden vehicles come into view; left positive.
+    hidden_azimuth_rad, hidden_std_rad : float
+        Where behind it vehicles are before they are seen, and how widely they spread.
+
+    Examples
+    --------
+    >>> Occluder("corner", "left", 0.56, 0.96, 0.35).direction
+    'left'
+    """
+
+    id: str
+    direction: str
+    edge_azimuth_rad: float
+    hidden_azimuth_rad: float
+    hidden_std_rad: float
+
+    def __post_init__(self) -> None:
+        in_range("edge_azimuth_rad", self.edge_azimuth_rad, -math.pi, math.pi)
+        in_range("hidden_azimuth_rad", self.hidden_azimuth_rad, -math.pi, math.pi)
+        in_range("hidden_std_rad", self.hidden_std_rad, 0.0, math.pi, open_low=True)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {
+            "id": self.id,
+            "direction": self.direction,
+            "edge_azimuth_rad": self.edge_azimuth_rad,
+            "hidden_azimuth_rad": self.hidden_azimuth_rad,
+            "hidden_std_rad": self.hidden_std_rad,
+        }
+
+    @classmethod
+    def from_record(cls, record: Record) -> "Occluder":
+        """Return the occluder that `to_dict` wrote."""
+        return cls(
+            record.text("id"),
+            record.text("direction"),
+            record.number("edge_azimuth_rad"),
+            record.number("hidden_azimuth_rad"),
+            record.number("hidden_std_rad"),
+        )
+
+
+def blind_corner(direction: str, side: int) -> Occluder:
+    """Return the building corner of a blind junction, edge at 32 deg, vehicles behind it at 55 +- 20 deg.
+
+    Parameters
+    ----------
+    direction : str
+        Label of the approach side.
+    side : {1, -1}
+        1 for left, -1 for right.
+
+    Examples
+    --------
+    >>> round(blind_corner("right", -1).edge_azimuth_rad, 2)
+    -0.56
+    """
+    edge, hidden, std = math.radians(32.0), math.radians(55.0), math.radians(20.0)
+    return Occluder(f"corner_{direction}", direction, side * edge, side * hidden, std)
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """The place and the ego vehicle.
+
+    Parameters
+    ----------
+    rates : Rates
+        How explanations change by themselves.
+    occluders : tuple of Occluder
+        One per approach side, in the order of the signature model's directions.
+    priors : Priors or None
+        Explanation priors: at the start in a context that is given (None for the equilibrium of the rates),
+        predicted to the time stamp in a snapshot.
+    ego_speed_mps, degradation : float or None
+        Ego speed, and degradation level d of the co-evidence channel in [0, 1].
+    site : str or None
+        Name of the place.
+    view_half_angle_rad : float
+        Half the horizontal field of view of the co-evidence channel, centred on the x axis.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Without an occluder, or if two share an id or a direction.
+
+    Examples
+    --------
+    >>> Context().directions
+    ('left', 'right')
+    """
+
+    rates: Rates = Rates()
+    occluders: tuple[Occluder, ...] = (blind_corner("left", 1), blind_corner("right", -1))
+    priors: Priors | None = None
+    ego_speed_mps: float | None = None
+    degradation: float | None = None
+    site: str | None = None
+    view_half_angle_rad: float = 0.6
+
+    def __post_init__(self) -> None:
+        for names in (self.directions, tuple(occluder.id for occluder in self.occluders)):
+            if not names or len(set(names)) != len(names):
+                raise InvalidArgumentError(f"occluders: expected different ids and directions, got {names}")
+        in_range("view_half_angle_rad", self.view_half_angle_rad, 0.0, math.pi)
+
+    @property
+    def directions(self) -> tuple[str, ...]:
+        """Labels of the approach sides."""
+        return tuple(occluder.direction for occluder in self.occluders)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {
+            "site": self.site,
+            "ego_speed_mps": self.ego_speed_mps,
+            "degradation": self.degradation,
+            "priors": None if self.priors is None else self.priors.to_dict(),
+            "rates": self.rates.to_dict(),
+            "occluders": [occluder.to_dict() for occluder in self.occluders],
+            "view_half_angle_rad": self.view_half_angle_rad,
+        }
+
+    @classmethod
+    def from_record(cls, record: Record) -> "Context":
+        """Return the context that `to_dict` wrote.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If a value is missing, of the wrong type or out of range.
+        """
+        return cls(
+            rates=Rates.from_record(record.record("rates")),
+            occluders=tuple(Occluder.from_record(item) for item in record.records("occluders")),
+            priors=record.maybe("priors", lambda key: Priors.from_record(record.record(key))),
+            ego_speed_mps=record.maybe("ego_speed_mps", record.number),
+            degradation=record.maybe("degradation", record.probability),
+            site=record.maybe("site", record.text),
+            view_half_angle_rad=record.number("view_half_angle_rad"),
+        )

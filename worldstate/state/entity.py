@@ -1,0 +1,176 @@
+"""Entities: road users that the world-state holds, seen or not."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from .reading import Record
+
+STATUSES = ("hidden", "emerged", "visible")
+ANSWERS = ("visible", "absent", "unqueried")
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Classification:
+    """A class label with its probability, given that the entity exists."""
+
+    label: str
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class Visibility:
+    """What the co-evidence channel last said of an entity.
+
+    Parameters
+    ----------
+    answer : {"visible", "absent", "unqueried"}
+        Found, searched for and not found, or not searched for.
+    miss_rate : float or None
+        Probability that the channel misses such an entity in view; None where it was not asked.
+    """
+
+    answer: str
+    miss_rate: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Entity:
+    """One road user. Unknown is None, never 0; all quantities are in `base_link`.
+
+    Parameters
+    ----------
+    id : str
+        UUID, stable for the life of the entity, through occlusion and back into view.
+    status : {"hidden", "emerged", "visible"}
+        Behind an occluder; in line of sight by its sound but not seen; handed over to vision.
+    existence_probability : float
+        Probability that it exists; before vision has it, P(hidden on its side) + P(in view, come from there).
+    hidden_probability : float
+        Probability that it exists and is hidden.
+    azimuth_rad, azimuth_std_rad : float
+        Left positive, in (-pi, pi]. Hidden entities have a coarse azimuth: their side is what can be known.
+    created_ns, updated_ns : int
+        First and last time stamps of the belief, ns.
+    classification : tuple of Classification
+        Labels of the signature while hidden, of the detector once seen.
+    moving : bool
+        False for an object that vision holds for parked.
+    direction : str or None
+        Approach side that it is or was hidden on.
+    azimuth_rate_rad_s : float or None
+        d azimuth / dt, rad/s; None while hidden.
+    range_m : float or None
+        None while it cannot be observed, as from a standing ego without a ranging sensor.
+    position_m, velocity_mps : tuple of three floats or None
+        None without a range.
+    inverse_tta_hz, inverse_tta_std_hz : float or None
+        1/TTA = -r_dot/r, 1/s, positive while closing, and its standard deviation; None until measured.
+    tta_s : float or None
+        Time to arrival, s; None unless 1/TTA is positive by more than one standard deviation.
+    visibility : Visibility
+        Last answer of the co-evidence channel.
+    sources : tuple of str
+        Modalities that contributed.
+    last_seen_ns : int or None
+        Last sighting; None if never seen.
+
+    Examples
+    --------
+    >>> hidden = Entity("id", "hidden", 0.9, 0.9, 0.8, azimuth_std_rad=0.3, created_ns=0, updated_ns=0)
+    >>> hidden.range_m is None
+    True
+    """
+
+    id: str
+    status: str
+    existence_probability: float
+    hidden_probability: float
+    azimuth_rad: float
+    azimuth_std_rad: float
+    created_ns: int
+    updated_ns: int
+    classification: tuple[Classification, ...] = ()
+    moving: bool = True
+    direction: str | None = None
+    azimuth_rate_rad_s: float | None = None
+    range_m: float | None = None
+    position_m: Vector | None = None
+    velocity_mps: Vector | None = None
+    inverse_tta_hz: float | None = None
+    inverse_tta_std_hz: float | None = None
+    tta_s: float | None = None
+    visibility: Visibility = Visibility("unqueried")
+    sources: tuple[str, ...] = ()
+    last_seen_ns: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {
+            "id": self.id,
+            "status": self.status,
+            "existence_probability": self.existence_probability,
+            "hidden_probability": self.hidden_probability,
+            "classification": [{"label": c.label, "probability": c.probability} for c in self.classification],
+            "moving": self.moving,
+            "direction": self.direction,
+            "azimuth_rad": self.azimuth_rad,
+            "azimuth_std_rad": self.azimuth_std_rad,
+            "azimuth_rate_rad_s": self.azimuth_rate_rad_s,
+            "range_m": self.range_m,
+            "position_m": _listed(self.position_m),
+            "velocity_mps": _listed(self.velocity_mps),
+            "inverse_tta_hz": self.inverse_tta_hz,
+            "inverse_tta_std_hz": self.inverse_tta_std_hz,
+            "tta_s": self.tta_s,
+            "visibility": {"answer": self.visibility.answer, "miss_rate": self.visibility.miss_rate},
+            "sources": list(self.sources),
+            "created_ns": self.created_ns,
+            "updated_ns": self.updated_ns,
+            "last_seen_ns": self.last_seen_ns,
+        }
+
+    @classmethod
+    def from_record(cls, record: Record) -> "Entity":
+        """Return the entity that `to_dict` wrote.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If a value is missing, of the wrong type or out of range.
+        """
+        return cls(
+            id=record.text("id"),
+            status=record.one_of("status", STATUSES),
+            existence_probability=record.probability("existence_probability"),
+            hidden_probability=record.probability("hidden_probability"),
+            classification=tuple(
+                Classification(item.text("label"), item.probability("probability"))
+                for item in record.records("classification")
+            ),
+            moving=record.flag("moving"),
+            direction=record.maybe("direction", record.text),
+            azimuth_rad=record.number("azimuth_rad"),
+            azimuth_std_rad=record.number("azimuth_std_rad"),
+            azimuth_rate_rad_s=record.maybe("azimuth_rate_rad_s", record.number),
+            range_m=record.maybe("range_m", record.number),
+            position_m=record.maybe("position_m", record.vector),
+            velocity_mps=record.maybe("velocity_mps", record.vector),
+            inverse_tta_hz=record.maybe("inverse_tta_hz", record.number),
+            inverse_tta_std_hz=record.maybe("inverse_tta_std_hz", record.number),
+            tta_s=record.maybe("tta_s", record.number),
+            visibility=_visibility(record.record("visibility")),
+            sources=record.texts("sources"),
+            created_ns=record.integer("created_ns"),
+            updated_ns=record.integer("updated_ns"),
+            last_seen_ns=record.maybe("last_seen_ns", record.integer),
+        )
+
+
+def _listed(vector: Vector | None) -> list[float] | None:
+    return None if vector is None else list(vector)
+
+
+def _visibility(record: Record) -> Visibility:
+    return Visibility(record.one_of("answer", ANSWERS), record.maybe("miss_rate", record.probability))

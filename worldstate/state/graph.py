@@ -1,0 +1,40 @@
+"""The scene graph of a snapshot, for those who query relations."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from .context import Context
+from .entity import Entity
+from .relation import EGO, Relation
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+
+def scene_graph(
+    entities: Iterable[Entity], relations: Iterable[Relation], context: Context
+) -> "nx.MultiDiGraph[str]":
+    """Return a networkx MultiDiGraph, nodes keyed by id, edges by the kind of relation.
+
+    A node carries ``type`` (``"ego"``, ``"occluder"`` or ``"entity"``) and the object as ``value``; an edge
+    carries ``probability`` and ``stamp_ns``.
+
+    Examples
+    --------
+    >>> graph = scene_graph([], [Relation("corner_left", EGO, "left_of", 1.0, 0)], Context())
+    >>> graph.edges["corner_left", "ego", "left_of"]["probability"]
+    1.0
+    """
+    # Imported here: whoever never asks for a graph does not wait for networkx.
+    import networkx as nx
+
+    graph = nx.MultiDiGraph()
+    graph.add_node(EGO, type="ego", value=context)
+    for occluder in context.occluders:
+        graph.add_node(occluder.id, type="occluder", value=occluder)
+    for entity in entities:
+        graph.add_node(entity.id, type="entity", value=entity)
+    for edge in relations:
+        attributes = {"probability": edge.probability, "stamp_ns": edge.stamp_ns}
+        graph.add_edge(edge.src, edge.dst, key=edge.kind, **attributes)
+    return graph

@@ -1,0 +1,139 @@
+"""The snapshot S_t: what an embedder reads."""
+
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from worldstate.errors import InvalidArgumentError
+
+from .context import Context
+from .cue import RiskCue
+from .entity import Entity
+from .graph import scene_graph
+from .reading import Record, check_schema, decode_json
+from .relation import Relation
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+SCHEMA_NAME = "worldstate.Snapshot"
+SCHEMA_VERSION = "1.0.0"
+
+
+@dataclass(frozen=True, slots=True)
+class WorldState:
+    """S_t = {entities, relations, context, cues}, immutable and in canonical order.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Time of the state, ns on `clock`.
+    seq : int
+        Measurements taken in so far.
+    entities : tuple of Entity
+        Kept in order of birth.
+    relations : tuple of Relation
+        Kept in order of their ends and kind.
+    context : Context
+        With the predicted explanation priors.
+    cues : tuple of RiskCue
+        One per direction, none before the first measurement; kept in order of direction.
+    frame_id : str
+        Axes of all quantities: x forward, y left, z up.
+    clock : {"media", "unix", "monotonic"}
+        What `stamp_ns` counts from.
+
+    Examples
+    --------
+    >>> state = WorldState(stamp_ns=0, seq=0)
+    >>> state.risk, WorldState.from_json(state.to_json()) == state
+    (0.0, True)
+    """
+
+    stamp_ns: int
+    seq: int
+    entities: tuple[Entity, ...] = ()
+    relations: tuple[Relation, ...] = ()
+    context: Context = field(default_factory=Context)
+    cues: tuple[RiskCue, ...] = ()
+    frame_id: str = "base_link"
+    clock: str = "media"
+
+    def __post_init__(self) -> None:
+        # Order carries no meaning, so it must not make two equal states differ.
+        entities = sorted(self.entities, key=lambda entity: (entity.created_ns, entity.id))
+        relations = sorted(self.relations, key=lambda edge: (edge.src, edge.dst, edge.kind, edge.stamp_ns))
+        object.__setattr__(self, "entities", tuple(entities))
+        object.__setattr__(self, "relations", tuple(relations))
+        object.__setattr__(self, "cues", tuple(sorted(self.cues, key=lambda cue: cue.direction)))
+
+    @property
+    def risk(self) -> float:
+        """Largest risk of all directions, 0 before anything was measured."""
+        return max((cue.risk for cue in self.cues), default=0.0)
+
+    def graph(self) -> "nx.MultiDiGraph[str]":
+        """Return the scene graph: nodes are the ego vehicle, entities and occluders, edges the relations.
+
+        Examples
+        --------
+        >>> sorted(WorldState(0, 0).graph().nodes)
+        ['corner_left', 'corner_right', 'ego']
+        """
+        return scene_graph(self.entities, self.relations, self.context)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the snapshot as JSON-able values; unknown is None."""
+        return {
+            "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
+            "stamp_ns": self.stamp_ns,
+            "clock": self.clock,
+            "seq": self.seq,
+            "frame_id": self.frame_id,
+            "entities": [entity.to_dict() for entity in self.entities],
+            "relations": [relation.to_dict() for relation in self.relations],
+            "context": self.context.to_dict(),
+            "cues": [cue.to_dict() for cue in self.cues],
+        }
+
+    def to_json(self) -> str:
+        """Return the snapshot as one line of strict JSON.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If a number is NaN or infinite, which JSON cannot say.
+        """
+        try:
+            return json.dumps(self.to_dict(), allow_nan=False, separators=(",", ":"))
+        except ValueError as error:
+            raise InvalidArgumentError(f"snapshot: expected finite numbers ({error})") from error
+
+    @classmethod
+    def from_dict(cls, value: object) -> "WorldState":
+        """Return the snapshot that `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        SchemaVersionError
+            On another schema or another major version.
+        InvalidArgumentError
+            If a value is missing, of the wrong type or out of range; the message says where.
+        """
+        record = Record(value, "snapshot")
+        check_schema(record, SCHEMA_NAME, SCHEMA_VERSION)
+        return cls(
+            stamp_ns=record.integer("stamp_ns"),
+            seq=record.integer("seq"),
+            entities=tuple(Entity.from_record(item) for item in record.records("entities")),
+            relations=tuple(Relation.from_record(item) for item in record.records("relations")),
+            context=Context.from_record(record.record("context")),
+            cues=tuple(RiskCue.from_record(item) for item in record.records("cues")),
+            frame_id=record.text("frame_id"),
+            clock=record.text("clock"),
+        )
+
+    @classmethod
+    def from_json(cls, text: str) -> "WorldState":
+        """Return the snapshot that `to_json` wrote; errors are those of `from_dict`."""
+        return cls.from_dict(decode_json(text, "snapshot"))
