@@ -1,0 +1,334 @@
+r"""Cramer-Rao bounds of everything the front-end estimates: the variance no unbiased estimator can beat.
+
+All follow from one line, :math:`\mathrm{var} \ge J^{-1}` with J the Fisher information. Signal-to-noise
+ratios are power ratios, not decibels.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+from .geometry import SPEED_OF_SOUND_M_S, direction_vectors
+
+# Information below this share of its largest possible value is called none.
+NEGLIGIBLE = 1e-12
+
+
+def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: float) -> float:
+    r"""Bound on the variance of the delay between two microphones, eq. (crbtau).
+
+    .. math:: \mathrm{var}(\hat\tau) \ge \Big[2T \int_0^\infty (2\pi f)^2 \frac{C(f)}{1 - C(f)}\,df\Big]^{-1}
+
+    Ego-noise, wind and reverberation enter as a loss of coherence. The integral is taken by the trapezoidal
+    rule.
+
+    Parameters
+    ----------
+    frequencies_hz : (bins,) float
+        Ascending, >= 0, Hz.
+    coherence : (bins,) float
+        Magnitude-squared coherence C, in [0, 1).
+    duration_s : float
+        Observation time T, seconds, > 0.
+
+    Returns
+    -------
+    float
+        Seconds squared; infinite where nothing is coherent.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On wrong shapes or values out of range.
+
+    Notes
+    -----
+    Small-error bound: below a threshold SNR the peak jumps to another lobe and the variance is far larger.
+    Source: Knapp and Carter 1976; G. C. Carter, "Coherence and time delay estimation", Proc. IEEE 75, 1987.
+
+    Examples
+    --------
+    >>> f = np.linspace(300.0, 1800.0, 151)
+    >>> f"{delay_crb_s2(f, np.full(151, 0.5), duration_s=1.0) ** 0.5 * 1e6:.2f} microseconds"
+    '2.56 microseconds'
+    """
+    frequencies = finite_array("frequencies_hz", frequencies_hz, (None,))
+    C = finite_array("coherence", coherence, frequencies.shape)
+    if len(frequencies) < 2 or frequencies[0] < 0 or np.any(np.diff(frequencies) <= 0):
+        raise InvalidArgumentError("frequencies_hz: expected at least two ascending frequencies >= 0")
+    if C.min() < 0 or C.max() >= 1:
+        raise InvalidArgumentError(f"coherence: expected numbers in [0, 1), got {C.min()} .. {C.max()}")
+    duration = in_range("duration_s", duration_s, 0.0, np.inf, open_low=True)
+    integral = np.trapezoid((2 * np.pi * frequencies) ** 2 * C / (1 - C), frequencies)
+    return _inverse(2.0 * duration * float(integral))
+
+
+def bearing_crb_rad2(
+    positions_m: ArrayLike,
+    azimuth_rad: float,
+    frequencies_hz: ArrayLike,
+    snr: ArrayLike,
+    snapshots: int,
+    *,
+    elevation_rad: float = 0.0,
+    elevation_known: bool = True,
+    random_signal: bool = False,
+    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+) -> float:
+    r"""Bound on the variance of an azimuth, eq. (crbtheta) for any array.
+
+    With u the unit vector to the source and :math:`S = \sum_m (p_m - \bar p)(p_m - \bar p)^T`,
+
+    .. math::
+        \mathrm{var}(\hat\theta) \ge \Big[\frac{8\pi^2 N}{c^2}\, S(\theta) \sum_b
+        f_b^2\,\mathrm{SNR}_b\Big]^{-1}, \qquad S(\theta) = \dot u_\theta^T S\, \dot u_\theta.
+
+    For an array in the y-z plane this is the paper's: :math:`S(\theta) = S_{xx} \cos^2\theta`. With S_xx =
+    3.027 m^2, 1 kHz and c = 343 m/s it gives 1.80 deg / sqrt(2 N SNR) at broadside.
+
+    Parameters
+    ----------
+    positions_m : (M, 3) float
+        Microphones in `base_link` axes, metres.
+    azimuth_rad : float
+        Of the source, left positive.
+    frequencies_hz : float or (bins,) float
+        Narrowband frequency, or several bins whose information adds.
+    snr : float or (bins,) float
+        Per microphone and snapshot, power ratio, spatially white noise.
+    snapshots : int
+        Number N of independent snapshots per bin.
+    elevation_rad : float
+        Of the source.
+    elevation_known : bool
+        False: the elevation is estimated with the azimuth, which never lowers the bound.
+    random_signal : bool
+        True: the unconditional bound, for a Gaussian signal, larger by 1 + 1 / (M SNR). False: the paper's.
+    speed_of_sound_m_s : float
+        c.
+
+    Returns
+    -------
+    float
+        Radians squared; infinite at endfire of a planar array.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On wrong shapes or values out of range.
+
+    Notes
+    -----
+    Sources: H. L. Van Trees, *Optimum Array Processing*, 2002, section 8.4; P. Stoica and A. Nehorai,
+    "Performance study of conditional and unconditional direction-of-arrival estimation", IEEE Trans. ASSP 38,
+    1990.
+
+    Examples
+    --------
+    >>> y = np.linspace(-0.4, 0.4, 56) * np.sqrt(3.027 / (56 * 0.16 * 57 / 165))
+    >>> plate = np.column_stack([0 * y, y, 0 * y])
+    >>> print(round(np.rad2deg(np.sqrt(2 * bearing_crb_rad2(plate, 0.0, 1000.0, 1.0, 1))), 2))
+    1.8
+    """
+    J = bearing_information(
+        positions_m, azimuth_rad, frequencies_hz, snr, snapshots,
+        elevation_rad=elevation_rad, random_signal=random_signal, speed_of_sound_m_s=speed_of_sound_m_s,
+    )  # fmt: skip
+    azimuth, cross, elevation = J[0, 0], J[0, 1], J[1, 1]
+    if elevation_known or elevation <= NEGLIGIBLE * J.trace():
+        return _inverse(azimuth)
+    remaining = azimuth - cross**2 / elevation
+    return _inverse(remaining if remaining > NEGLIGIBLE * azimuth else 0.0)
+
+
+def bearing_information(
+    positions_m: ArrayLike,
+    azimuth_rad: float,
+    frequencies_hz: ArrayLike,
+    snr: ArrayLike,
+    snapshots: int,
+    *,
+    elevation_rad: float = 0.0,
+    random_signal: bool = False,
+    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+) -> NDArray[np.float64]:
+    r"""Fisher information of (azimuth, elevation) from an array, planar or not.
+
+    .. math:: J = \frac{8\pi^2 N}{c^2} \Big(\sum_b f_b^2\,\mathrm{SNR}_b\Big)\, D^T S D,
+              \qquad D = [\dot u_\theta\ \dot u_\phi]
+
+    Parameters
+    ----------
+    positions_m, azimuth_rad, frequencies_hz, snr, snapshots, elevation_rad, random_signal, speed_of_sound_m_s
+        As for `bearing_crb_rad2`.
+
+    Returns
+    -------
+    (2, 2) float
+        Per radian squared.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On wrong shapes or values out of range.
+
+    Examples
+    --------
+    >>> bearing_information(0.1 * np.eye(3), 0.0, 1000.0, 10.0, 1).round(1)
+    array([[ 44.7, -22.4],
+           [-22.4,  44.7]])
+    """
+    positions = finite_array("positions_m", positions_m, (None, 3))
+    frequencies, ratio = np.broadcast_arrays(
+        finite_array("frequencies_hz", np.atleast_1d(frequencies_hz), (None,)),
+        finite_array("snr", np.atleast_1d(snr), (None,)),
+    )
+    if len(positions) < 2 or snapshots < 1 or ratio.min() < 0 or frequencies.min() < 0:
+        raise InvalidArgumentError("expected at least 2 microphones and 1 snapshot, frequencies and snr >= 0")
+    if random_signal:
+        ratio = ratio * (len(positions) * ratio / (1.0 + len(positions) * ratio))
+    lever = (positions - positions.mean(axis=0)) @ _direction_slopes(azimuth_rad, elevation_rad)
+    weight = 8 * np.pi**2 * snapshots / speed_of_sound_m_s**2 * np.sum(frequencies**2 * ratio)
+    return np.asarray(weight * lever.T @ lever)
+
+
+def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> NDArray[np.float64]:
+    r"""Bearing information relative to the array's best direction: the lateral corollary.
+
+    .. math:: \frac{J(\theta)}{\max_\theta J(\theta)} = \frac{\dot u^T S \dot u}{\lambda_{max}(S_{xy})}
+
+    It is :math:`\cos^2\theta` for an array across the vehicle, and vanishes at endfire. The information on
+    presence and on the radial speed does not depend on the bearing: what remains of a laterally approaching
+    source is that it is there, how fast it comes and its coarse side.
+
+    Parameters
+    ----------
+    positions_m : (M, 3) float
+        Microphones in `base_link` axes, metres.
+    azimuths_rad : (...) float
+        Directions asked for, at elevation 0.
+
+    Returns
+    -------
+    (...) float
+        In [0, 1].
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the microphones have no horizontal extent.
+
+    Examples
+    --------
+    >>> across = [[0, -0.4, 0], [0, 0.0, 0.1], [0, 0.4, 0]]
+    >>> endfire_information(across, np.deg2rad([0, 60, 90])).round(3)
+    array([1.  , 0.25, 0.  ])
+    """
+    positions = finite_array("positions_m", positions_m, (None, 3))
+    horizontal = (positions - positions.mean(axis=0))[:, :2]
+    best = float(np.linalg.eigvalsh(horizontal.T @ horizontal)[-1])
+    if best <= 0:
+        raise InvalidArgumentError("positions_m: expected a horizontal extent, got none")
+    azimuth = np.asarray(azimuths_rad, dtype=np.float64)
+    slope = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
+    return np.asarray(((slope @ horizontal.T) ** 2).sum(axis=-1) / best)
+
+
+def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
+    r"""Bound on the variance of a single tone's frequency, amplitude and phase unknown.
+
+    .. math:: \mathrm{var}(\hat f) \ge \frac{12}{(2\pi)^2\,\eta\,N_s (N_s^2 - 1)\,T_s^2}
+
+    Parameters
+    ----------
+    snr : float
+        :math:`\eta`, a power ratio. A real tone :math:`A\cos` in white noise of variance :math:`\sigma^2` has
+        :math:`\eta = A^2 / 2\sigma^2`. A complex one :math:`A e^{j\cdot}` has :math:`\eta = A^2 / \sigma^2`
+        with
+        :math:`\sigma^2` the variance of the real and of the imaginary part each (of Rife and Boorstyn), i.e.
+        twice its power over that of the noise.
+    samples : int
+        N_s >= 2.
+    sample_rate_hz : float
+        1 / T_s.
+
+    Returns
+    -------
+    float
+        Hz squared.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If an argument is out of range.
+
+    Notes
+    -----
+    For a real tone it holds away from 0 and half the sample rate, by a few times 1 / (N_s T_s). Source: D. C.
+    Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations", IEEE Trans.
+    IT 20, 1974.
+
+    Examples
+    --------
+    >>> print(f"{tone_crb_hz2(snr=10.0, samples=4800, sample_rate_hz=48_000.0) ** 0.5:.4f}")
+    0.0252
+    """
+    eta = in_range("snr", snr, 0.0, np.inf, open_low=True)
+    N = in_range("samples", samples, 2, np.inf)
+    rate = in_range("sample_rate_hz", sample_rate_hz, 0.0, np.inf, open_low=True)
+    return float(12.0 * rate**2 / ((2 * np.pi) ** 2 * eta * N * (N**2 - 1.0)))
+
+
+def radial_speed_crb_m2_s2(
+    frequency_variance_hz2: float, rest_frequency_hz: float, *, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
+) -> float:
+    r"""Variance of a radial speed read from a tone whose frequency at rest is known.
+
+    .. math:: \mathrm{var}(\hat v_r) = (c / f_0)^2\, \mathrm{var}(\hat f)
+
+    Parameters
+    ----------
+    frequency_variance_hz2 : float
+        Of the received tone, Hz squared, for example `tone_crb_hz2`.
+    rest_frequency_hz : float
+        f_0 > 0.
+    speed_of_sound_m_s : float
+        c.
+
+    Returns
+    -------
+    float
+        (m/s) squared, to first order in v_r / c.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If an argument is out of range.
+
+    Notes
+    -----
+    The tone's own stability, not this bound, limits what one sees in a street. Source: the paper, section IV.
+
+    Examples
+    --------
+    >>> print(round(radial_speed_crb_m2_s2(tone_crb_hz2(10.0, 4800, 48e3), 100.0) ** 0.5, 4))
+    0.0863
+    """
+    variance = in_range("frequency_variance_hz2", frequency_variance_hz2, 0.0, np.inf)
+    rest = in_range("rest_frequency_hz", rest_frequency_hz, 0.0, np.inf, open_low=True)
+    return float((speed_of_sound_m_s / rest) ** 2 * variance)
+
+
+def _direction_slopes(azimuth_rad: float, elevation_rad: float) -> NDArray[np.float64]:
+    """Derive the unit vector by azimuth and elevation, columns of (3, 2)."""
+    azimuth = in_range("azimuth_rad", azimuth_rad, -np.inf, np.inf)
+    elevation = in_range("elevation_rad", elevation_rad, -np.pi / 2, np.pi / 2)
+    by_azimuth = np.cos(elevation) * direction_vectors(azimuth + np.pi / 2)
+    by_elevation = direction_vectors(azimuth, elevation + np.pi / 2)
+    return np.stack([by_azimuth, by_elevation], axis=1)
+
+
+def _inverse(information: float) -> float:
+    return float(1.0 / information) if information > 0 else float("inf")

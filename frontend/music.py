@@ -1,0 +1,233 @@
+r"""Wideband MUSIC on any steering set.
+
+In each bin the covariance of the microphones is split into k signal eigenvectors E_s and the rest; a
+direction is scored by how little of its steering vector a falls outside the signal subspace,
+
+.. math::
+    P_b(\theta) = \frac{1}{a_b^H (I - E_s E_s^H) a_b}, \qquad
+    P(\theta) = \frac1B \sum_b w_b P_b(\theta),
+
+with w_b = 1, or 1 / max P_b so that every bin counts alike. Source: R. O. Schmidt, "Multiple emitter location
+and signal parameter estimation", IEEE Trans. AP 34, 1986.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.errors import InvalidArgumentError
+
+from .spectra import ComplexArray, finite_complex
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Subspace:
+    """Signal subspace of every bin.
+
+    Parameters
+    ----------
+    vectors : (bins, M, k) complex
+        Orthonormal columns, strongest last.
+    eigenvalues : (bins, k) float
+        Power along them, ascending.
+    """
+
+    vectors: ComplexArray
+    eigenvalues: FloatArray
+
+
+def covariance(spectra: ArrayLike) -> ComplexArray:
+    r"""Average the spatial covariance over frames: :math:`R_b = \langle x_b x_b^H \rangle`.
+
+    Parameters
+    ----------
+    spectra : (frames, bins, M) complex
+        STFT of the microphones.
+
+    Returns
+    -------
+    (bins, M, M) complex
+        Hermitian, single precision if the spectra are.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On a wrong shape, no frames or non-finite values.
+
+    Examples
+    --------
+    >>> covariance([[[1, 1j]], [[1, 1j]]]).tolist()
+    [[[(1+0j), -1j], [1j, (1+0j)]]]
+    """
+    X = _checked_spectra(spectra)
+    by_bin = np.ascontiguousarray(X.transpose(1, 2, 0))
+    return (by_bin @ by_bin.conj().transpose(0, 2, 1)) / np.float32(X.shape[0])
+
+
+def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
+    r"""Signal subspace straight from frames, by the smaller of two eigenproblems.
+
+    With fewer frames T than microphones M the non-zero eigenvalues of :math:`X X^H / T` (M x M) are those of
+    the Gram matrix :math:`X^H X / T` (T x T), and :math:`E_s = X V \Lambda^{-1/2} / \sqrt T`: exact, and (M /
+    T)^3 cheaper.
+
+    Parameters
+    ----------
+    spectra : (frames, bins, M) complex
+        STFT of the microphones.
+    sources : int
+        Dimension k of the subspace, 1 <= k < M and k <= frames.
+
+    Returns
+    -------
+    Subspace
+        Of the sample covariance.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On a wrong shape, non-finite values or a dimension out of range.
+
+    Examples
+    --------
+    >>> subspace = signal_subspace([[[2, 2j]], [[2, 2j]]], sources=1)
+    >>> float(subspace.eigenvalues[0, 0].round(6))
+    8.0
+    """
+    X = _checked_spectra(spectra)
+    frames, _, microphones = X.shape
+    if not 1 <= sources < microphones or sources > frames:
+        raise InvalidArgumentError(
+            f"sources: expected 1 .. {min(microphones - 1, frames)} for {frames} frames of {microphones} "
+            f"microphones, got {sources}"
+        )
+    if frames >= microphones:
+        return _leading(covariance(X), sources)
+    by_bin = X.transpose(1, 2, 0)
+    gram = (by_bin.conj().transpose(0, 2, 1) @ by_bin) / np.float32(frames)
+    inner = _leading(gram, sources)
+    vectors = by_bin @ inner.vectors
+    norm = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return Subspace(vectors / np.maximum(norm, np.finfo(norm.dtype).tiny), inner.eigenvalues)
+
+
+def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
+    """Signal subspace of given covariances by a full eigendecomposition.
+
+    Parameters
+    ----------
+    covariance_matrix : (bins, M, M) complex
+        Hermitian.
+    sources : int
+        Dimension k, 1 <= k < M.
+
+    Returns
+    -------
+    Subspace
+        The k strongest eigenpairs of each bin.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On a wrong shape, non-finite values or a dimension out of range.
+
+    Examples
+    --------
+    >>> covariance_subspace([np.diag([1.0, 5.0])], 1).eigenvalues.tolist()
+    [[5.0]]
+    """
+    R = checked_covariance(covariance_matrix, sources)
+    return _leading(R, sources)
+
+
+def music_spectrum(
+    subspace: Subspace, steering: ArrayLike, *, normalised: bool = False
+) -> NDArray[np.float64]:
+    r"""Score every direction of a steering set, combined over bins.
+
+    .. math:: P(\theta) = \frac1B \sum_b \frac{w_b}{\|a_b\|^2 - \|E_s^H a_b\|^2}
+
+    Parameters
+    ----------
+    subspace : Subspace
+        Of the same bins and microphones.
+    steering : (bins, M, D) complex
+        :math:`a_{bm}(\theta) = e^{+j 2\pi f_b\, u(\theta) \cdot p_m / c}` for a plane wave from direction u,
+        so that X = S a with the STFT convention e^{-j 2 pi f t}. Any other response will do.
+    normalised : bool
+        False: bins are averaged as they are, so that the sharpest dominate. True: each bin is divided by its
+        own maximum first. Both as pyroomacoustics does (its `frequency_normalization`, off by default).
+
+    Returns
+    -------
+    (D,) float
+        > 0; at most 1 if normalised.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the steering set does not fit the subspace or is not finite.
+
+    Examples
+    --------
+    >>> steering = np.exp(1j * np.outer([-1.0, 1.0], np.linspace(-1, 1, 5)))[None]
+    >>> heard = signal_subspace(np.tile(steering[..., 3], (2, 1, 1)), sources=1)
+    >>> int(np.argmax(music_spectrum(heard, steering)))
+    3
+    """
+    E = subspace.vectors
+    A = finite_complex("steering", steering, (E.shape[0], E.shape[1], None))
+    return _spectrum(E, A, _power(A, axis=1), normalised)
+
+
+def _spectrum(E: ComplexArray, A: ComplexArray, norm: FloatArray, normalised: bool) -> NDArray[np.float64]:
+    outside = norm - _power(E.conj().transpose(0, 2, 1) @ A, axis=1)
+    # Rounding may leave a tiny or negative remainder where the steering vector lies in the subspace.
+    floor = np.finfo(outside.dtype).eps * norm
+    score = 1.0 / np.maximum(outside, floor).astype(np.float64)
+    if normalised:
+        score /= score.max(axis=1, keepdims=True)
+    mean: NDArray[np.float64] = score.mean(axis=0)
+    return mean
+
+
+def _power(values: ComplexArray, axis: int) -> FloatArray:
+    power: FloatArray = (values.real**2 + values.imag**2).sum(axis=axis)
+    return power
+
+
+def _leading(R: ComplexArray, count: int) -> Subspace:
+    values, vectors = np.linalg.eigh(R)
+    return Subspace(vectors[..., -count:], values[..., -count:])
+
+
+def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
+    X = finite_complex("spectra", spectra, (None, None, None))
+    if 0 in X.shape:
+        raise InvalidArgumentError(f"spectra: expected at least one frame, bin and microphone, got {X.shape}")
+    return X
+
+
+def checked_covariance(covariance_matrix: ArrayLike, sources: int) -> ComplexArray:
+    """Return covariances (bins, M, M) that are finite and large enough for a subspace of this dimension.
+
+    Raises
+    ------
+    InvalidArgumentError
+        Otherwise.
+
+    Examples
+    --------
+    >>> checked_covariance(np.eye(3)[None], sources=2).shape
+    (1, 3, 3)
+    """
+    R = finite_complex("covariance", covariance_matrix, (None, None, None))
+    if R.shape[1] != R.shape[2]:
+        raise InvalidArgumentError(f"covariance: expected shape (bins, M, M), got {R.shape}")
+    if not 1 <= sources < R.shape[1]:
+        raise InvalidArgumentError(f"sources: expected 1 .. {R.shape[1] - 1}, got {sources}")
+    return R

@@ -1,0 +1,44 @@
+"""The one check that complex spectra need at the public boundary."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import check_shape
+from worldstate.errors import InvalidArgumentError
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+
+
+def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ComplexArray:
+    """Return `value` as finite complex numbers of the given shape, keeping single precision as it is.
+
+    Parameters
+    ----------
+    name : str
+        What the message calls the argument.
+    value : array_like
+        Real or complex numbers.
+    shape : sequence of int or None
+        Expected shape; `None` leaves an axis free.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, a type that is no number, NaN or infinity.
+
+    Examples
+    --------
+    >>> finite_complex("spectra", [[1, 1j]], (None, 2)).shape
+    (1, 2)
+    """
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufc":
+        raise InvalidArgumentError(f"{name}: expected numbers, got {array.dtype}")
+    check_shape(name, array.shape, shape)
+    if not np.isfinite(array).all():
+        raise InvalidArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
+    single = array.dtype in (np.complex64, np.float32)
+    return array.astype(np.complex64 if single else np.complex128, copy=False)
