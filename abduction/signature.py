@@ -61,7 +61,7 @@ class SignatureModel:
     Examples
     --------
     >>> pairs = np.zeros(6)
-    >>> model = SignatureModel(np.zeros(2), np.ones(2), np.zeros((6, 2)), pairs, pairs, pairs, np.full(4, 0.25))
+    >>> model = SignatureModel(np.zeros(2), np.ones(2), np.zeros((6, 2)), *[pairs] * 3, np.full(4, 0.25))
     >>> model.predict_proba([[0.3, 0.1]])
     array([[0.25, 0.25, 0.25, 0.25]])
     """

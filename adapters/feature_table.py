@@ -1,0 +1,175 @@
+"""Tables of labelled feature windows, as released with OVAD: one row a window, 60 features and its origin.
+
+Columns: ``feat0`` to ``feat59``, ``Class`` (front, left, none, right), ``ID``, ``Environment`` (S.. standing
+ego, D.. moving ego), ``T0`` (frame number, may be empty) and ``Recording ID``. Azimuths run from -90 to 90
+degrees and grow to the right, as in the released data and in `frontend.feature`.
+"""
+
+import csv
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.signature import CLASSES
+from worldstate.errors import InputFileError, InvalidArgumentError
+
+N_FEATURES = 60
+MAX_BYTES = 256 * 1024 * 1024
+FEATURE_COLUMNS = tuple(f"feat{i}" for i in range(N_FEATURES))
+LABEL_COLUMNS = ("Class", "ID", "Environment", "T0", "Recording ID")
+
+Group = Literal["static", "dynamic", "all"]
+GROUPS: tuple[Group, ...] = ("static", "dynamic", "all")
+_PREFIX = {"static": "S", "dynamic": "D", "all": ""}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureTable:
+    """Windows with their labels, row by row.
+
+    Parameters
+    ----------
+    features : ndarray, shape (n, 60)
+        2 segments x 30 azimuths.
+    labels, ids, environments, recordings : ndarray of str, shape (n,)
+        Class, window ID, junction and recording of each window. A recording may hold a hazard window and a
+        front window: splits go by recording.
+    t0_frames : tuple of int or None
+        Line-of-sight entry, frame number at 10 a second; None where unknown.
+
+    Examples
+    --------
+    >>> words = np.array(["none", "left"])
+    >>> where, which = np.array(["SA1", "DB1"]), np.array(["0", "1"])
+    >>> table = FeatureTable(np.zeros((2, 60)), words, words, where, which, (None, 70))
+    >>> len(table), table.group("dynamic").recording_keys
+    (2, array(['DB1/1'], dtype='<U5'))
+    """
+
+    features: NDArray[np.float64]
+    labels: NDArray[np.str_]
+    ids: NDArray[np.str_]
+    environments: NDArray[np.str_]
+    recordings: NDArray[np.str_]
+    t0_frames: tuple[int | None, ...]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def recording_keys(self) -> NDArray[np.str_]:
+        """Environment and recording of each window, as ``SA1/34``: what splits and overlaps go by."""
+        return np.char.add(np.char.add(self.environments, "/"), self.recordings)
+
+    @property
+    def hazards(self) -> NDArray[np.bool_]:
+        """Where a window is labelled left or right."""
+        return np.isin(self.labels, ("left", "right"))
+
+    @property
+    def hazard_free(self) -> NDArray[np.bool_]:
+        """Where a window is labelled none."""
+        return np.asarray(self.labels == "none")
+
+    def select(self, chosen: NDArray[np.bool_]) -> "FeatureTable":
+        """Return the rows where `chosen` is true."""
+        kept = np.flatnonzero(chosen)
+        return FeatureTable(
+            self.features[kept],
+            self.labels[kept],
+            self.ids[kept],
+            self.environments[kept],
+            self.recordings[kept],
+            tuple(self.t0_frames[i] for i in kept),
+        )
+
+    def group(self, group: Group) -> "FeatureTable":
+        """Return the windows of a standing ego (static), a moving one (dynamic) or all.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If there are none.
+        """
+        found = self.select(np.char.startswith(self.environments, _PREFIX[group]))
+        if len(found) == 0:
+            raise InvalidArgumentError(f"group: expected windows of group {group}, found none")
+        return found
+
+    def of_recordings(self, ids: Collection[str]) -> NDArray[np.bool_]:
+        """Return where a window belongs to a recording that holds a window of one of these IDs."""
+        keys = self.recording_keys
+        return np.isin(keys, keys[np.isin(self.ids, list(ids))])
+
+
+def read_features(path: str | Path) -> FeatureTable:
+    """Read a table of windows.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing or too large, a column is missing, or a line does not hold 60 finite numbers, a
+        known class and an environment that begins with S or D; the message names file and line.
+    """
+    windows = [_window(path, line, row) for line, row in _rows(path, FEATURE_COLUMNS + LABEL_COLUMNS)]
+    if not windows:
+        raise InputFileError(path, "expected at least one window below the header")
+    features, labels, t0_frames = zip(*windows, strict=True)
+    classes, ids, environments, recordings = (np.array(column) for column in zip(*labels, strict=True))
+    return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames)
+
+
+def read_ids(path: str | Path) -> frozenset[str]:
+    """Read a list of window IDs: a CSV file with a column ``ID``.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing or too large, or has no such column or no rows.
+    """
+    ids = frozenset(row["ID"].strip() for _, row in _rows(path, ("ID",)))
+    if not ids:
+        raise InputFileError(path, "expected at least one ID below the header")
+    return ids
+
+
+def _rows(path: str | Path, columns: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield line number and cells; every named column is there and filled in."""
+    try:
+        if Path(path).stat().st_size > MAX_BYTES:
+            raise InputFileError(path, f"expected at most {MAX_BYTES // 1024**2} MiB")
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            missing = [column for column in columns if column not in (reader.fieldnames or ())]
+            if missing:
+                raise InputFileError(path, f"line 1: expected columns {', '.join(missing[:5])}")
+            for row in reader:
+                if None in row or any(row[column] is None for column in columns):
+                    raise InputFileError(path, f"line {reader.line_num}: expected one cell for each column")
+                yield reader.line_num, row
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputFileError(path, f"expected a readable CSV file: {error}") from error
+
+
+def _window(
+    path: str | Path, line: int, row: dict[str, str]
+) -> tuple[list[float], tuple[str, ...], int | None]:
+    labels = tuple(row[column].strip() for column in ("Class", "ID", "Environment", "Recording ID"))
+    if labels[0] not in CLASSES:
+        raise InputFileError(path, f"line {line}: expected a class {CLASSES}, got {labels[0][:40]!r}")
+    if labels[2][:1] not in ("S", "D"):
+        raise InputFileError(path, f"line {line}: expected an environment S.. or D.., got {labels[2][:40]!r}")
+    if not labels[3]:
+        raise InputFileError(path, f"line {line}: expected a Recording ID")
+    try:
+        features = [float(row[column]) for column in FEATURE_COLUMNS]
+        t0_frame = int(row["T0"]) if row["T0"].strip() else None
+    except ValueError as error:
+        raise InputFileError(path, f"line {line}: {error}") from error
+    if not np.isfinite(features).all():
+        raise InputFileError(path, f"line {line}: expected finite features, got NaN or infinity")
+    return features, labels, t0_frame

@@ -1,0 +1,131 @@
+"""Evaluation of a signature classifier and its cueing on labelled feature windows.
+
+Everything that is scored was predicted by a classifier, a threshold and a risk map that saw no window of the
+recording (protocol ``cv``) or junction (``lojo``): threshold and map come from inner out-of-fold scores.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.signature import CLASSES
+from worldstate.abduction.signature_training import Classifier
+from worldstate.adapters.feature_table import FeatureTable
+
+from .calibration import MISS_RATES, WindowCalibration, calibrate_windows
+from .splits import Folds, Split
+
+Numbers = NDArray[np.float64]
+MakeClassifier = Callable[[np.random.Generator], Classifier]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predictions:
+    """What was predicted of every window of one table, each once.
+
+    Parameters
+    ----------
+    folds : ndarray of str, shape (n,)
+        Fold in which each window was held out.
+    probabilities : ndarray, shape (n, 4)
+        Posteriors of front, left, none, right.
+    score, risk : ndarray, shape (n,)
+        Statistic and calibrated risk.
+    decision : ndarray of bool, shape (n,)
+        Whether the statistic reached the threshold.
+    """
+
+    folds: Folds
+    probabilities: Numbers
+    score: Numbers
+    risk: Numbers
+    decision: NDArray[np.bool_]
+
+    @classmethod
+    def blank(cls, folds: Folds) -> "Predictions":
+        """Return arrays to be filled in, fold by fold."""
+        n = len(folds)
+        return cls(folds, np.empty((n, len(CLASSES))), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_))
+
+    def fill(self, rows: NDArray[np.bool_], probabilities: Numbers, calibration: WindowCalibration) -> None:
+        """Write what a calibration makes of the posteriors of some rows."""
+        self.probabilities[rows] = probabilities
+        self.score[rows], self.risk[rows], self.decision[rows] = calibration.apply(probabilities)
+
+    @property
+    def classes(self) -> NDArray[np.str_]:
+        """Most probable class of each window: the published rule."""
+        most_probable: NDArray[np.str_] = np.array(CLASSES)[self.probabilities.argmax(axis=1)]
+        return most_probable
+
+
+def cross_validate(
+    table: FeatureTable,
+    split: Split,
+    make: MakeClassifier,
+    rng: np.random.Generator,
+    *,
+    alpha: float,
+    on_fold: Callable[[], None] = lambda: None,
+) -> dict[float, Predictions]:
+    """Predict every window once, by classifier, threshold and map that never saw its fold.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows.
+    split : callable
+        Folds of a table; used for the outer folds and again inside each training set.
+    make : callable
+        Makes an untrained classifier.
+    rng : numpy.random.Generator
+        Draws folds and whatever the classifier draws.
+    alpha : float
+        Budget of the threshold.
+    on_fold : callable
+        Called after each outer fold, for progress.
+
+    Returns
+    -------
+    dict of float to Predictions
+        For each beta: 1, the published statistic, and 0, with the visible explanation removed.
+    """
+    folds = split(table, rng)
+    predictions = {beta: Predictions.blank(folds) for beta in MISS_RATES}
+    for fold in np.unique(folds):
+        held_out = folds == fold
+        train = table.select(~held_out)
+        probabilities = _trained(make, train, rng).predict_proba(table.features[held_out])
+        inner = out_of_fold(train, split(train, rng), make, rng)
+        for beta, prediction in predictions.items():
+            calibration = calibrate_windows(
+                inner, train.hazards, train.hazard_free, alpha=alpha, miss_rate=beta
+            )
+            prediction.fill(held_out, probabilities, calibration)
+        on_fold()
+    return predictions
+
+
+def out_of_fold(
+    table: FeatureTable, folds: Folds, make: MakeClassifier, rng: np.random.Generator
+) -> Numbers:
+    """Return posteriors of each window from a classifier trained on the other folds, shape (n, 4)."""
+    probabilities = np.empty((len(table), len(CLASSES)))
+    for fold in np.unique(folds):
+        held_out = folds == fold
+        classifier = _trained(make, table.select(~held_out), rng)
+        probabilities[held_out] = classifier.predict_proba(table.features[held_out])
+    return probabilities
+
+
+def predict_with(table: FeatureTable, probabilities: Numbers, calibration: WindowCalibration) -> Predictions:
+    """Return the predictions of a finished model, as one fold named ``model``."""
+    predictions = Predictions.blank(np.full(len(table), "model"))
+    predictions.fill(np.ones(len(table), dtype=np.bool_), probabilities, calibration)
+    return predictions
+
+
+def _trained(make: MakeClassifier, table: FeatureTable, rng: np.random.Generator) -> Classifier:
+    return make(rng).fit(table.features, table.labels)

@@ -1,0 +1,90 @@
+"""Areas under the ROC curve and rates at a threshold."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import rankdata
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+
+def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
+    r"""Return the area under the ROC curve, None where a label is missing altogether.
+
+    .. math:: P(s^+ > s^-) + P(s^+ = s^-) / 2
+
+    Parameters
+    ----------
+    scores : array_like, shape (n,)
+        Larger for positives, one hopes.
+    positive : array_like of bool, shape (n,)
+        Labels.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the shapes differ or a score is not finite.
+
+    Examples
+    --------
+    >>> auroc([0.1, 0.4, 0.4, 0.8], [False, True, False, True])
+    0.875
+    """
+    values = finite_array("scores", scores, (None,))
+    labels = finite_array("positive", positive, values.shape) > 0.5
+    n_positive, n_negative = int(labels.sum()), int((~labels).sum())
+    if not n_positive or not n_negative:
+        return None
+    rank_sum = float(rankdata(values)[labels].sum())
+    return (rank_sum - n_positive * (n_positive + 1) / 2) / (n_positive * n_negative)
+
+
+def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:
+    """Return the area of each group that has both labels, in the order of their names.
+
+    Parameters
+    ----------
+    scores, positive : array_like, shape (n,)
+        As for `auroc`.
+    groups : array_like of str, shape (n,)
+        For example the junction of each window.
+
+    Examples
+    --------
+    >>> auroc_by_group([0.1, 0.9, 0.8, 0.2], [False, True, False, True], ["SA1", "SA1", "SB1", "SB1"])
+    {'SA1': 1.0, 'SB1': 0.0}
+    """
+    values, labels, names = np.asarray(scores), np.asarray(positive), np.asarray(groups)
+    areas = {str(name): auroc(values[names == name], labels[names == name]) for name in np.unique(names)}
+    return {name: area for name, area in areas.items() if area is not None}
+
+
+def macro(by_group: Mapping[str, float]) -> float:
+    """Return the mean over groups.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no group.
+
+    Examples
+    --------
+    >>> macro({"SA1": 1.0, "SB1": 0.5})
+    0.75
+    """
+    if not by_group:
+        raise InvalidArgumentError("groups: expected at least one with hazard and hazard-free windows")
+    return float(np.mean(list(by_group.values())))
+
+
+def rate(decisions: NDArray[np.bool_], among: NDArray[np.bool_]) -> float | None:
+    """Return the share of decisions among the chosen rows, None where there are none.
+
+    Examples
+    --------
+    >>> rate(np.array([True, False, True]), np.array([True, True, False]))
+    0.5
+    """
+    return float(decisions[among].mean()) if among.any() else None

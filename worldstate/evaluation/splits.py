@@ -1,0 +1,93 @@
+"""Who is tested by whom: folds that never part a recording."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.feature_table import FeatureTable
+from worldstate.errors import InvalidArgumentError
+
+Protocol = Literal["cv", "lojo"]
+PROTOCOLS: tuple[Protocol, ...] = ("cv", "lojo")
+N_FOLDS = 5
+
+Folds = NDArray[np.str_]
+Split = Callable[[FeatureTable, np.random.Generator], Folds]
+
+
+def recording_labels(table: FeatureTable) -> dict[str, str]:
+    """Return the label of each recording: that of its hazard window where it has one besides ``front``.
+
+    Examples
+    --------
+    >>> words = np.array(["front", "left", "none"])
+    >>> here = np.array(["SA1"] * 3)
+    >>> table = FeatureTable(np.zeros((3, 60)), words, words, here, np.array(["34", "34", "0"]), (None,) * 3)
+    >>> recording_labels(table)
+    {'SA1/34': 'left', 'SA1/0': 'none'}
+    """
+    labels: dict[str, str] = {}
+    for key, label in zip(table.recording_keys.tolist(), table.labels.tolist(), strict=True):
+        if key not in labels or label != "front":
+            labels[key] = label
+    return labels
+
+
+def recording_folds(table: FeatureTable, rng: np.random.Generator, n_folds: int = N_FOLDS) -> Folds:
+    """Deal recordings to folds so that each holds its share of every label at every junction.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows.
+    rng : numpy.random.Generator
+        Shuffles the recordings.
+    n_folds : int
+        At least 2.
+
+    Returns
+    -------
+    ndarray of str, shape (n,)
+        Fold of each window, "0" to "4".
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are fewer recordings than folds.
+    """
+    labels = recording_labels(table)
+    if len(labels) < n_folds:
+        raise InvalidArgumentError(f"expected at least {n_folds} recordings to split, got {len(labels)}")
+    strata: dict[tuple[str, str], list[str]] = {}
+    for key, label in labels.items():
+        strata.setdefault((key.split("/")[0], label), []).append(key)
+    # Dealing goes on where the last stratum stopped, or the first folds would collect every remainder.
+    dealt = [key for stratum in sorted(strata) for key in rng.permutation(sorted(strata[stratum])).tolist()]
+    fold_of = {key: str(position % n_folds) for position, key in enumerate(dealt)}
+    return np.array([fold_of[key] for key in table.recording_keys.tolist()])
+
+
+def junction_folds(table: FeatureTable, rng: np.random.Generator | None = None) -> Folds:
+    """Return the junction of each window: leave one junction out; nothing is drawn.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is only one junction.
+    """
+    if len(np.unique(table.environments)) < 2:
+        raise InvalidArgumentError("expected at least two junctions to leave one out")
+    return table.environments
+
+
+def split_for(protocol: Protocol) -> Split:
+    """Return the way a protocol splits, outside and inside: the inner folds are like the outer ones.
+
+    Examples
+    --------
+    >>> split_for("lojo") is junction_folds
+    True
+    """
+    return recording_folds if protocol == "cv" else junction_folds
