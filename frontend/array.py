@@ -12,8 +12,9 @@ from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vector
 
 MAX_MICROPHONES = 1024
 
-# Our own placing of 56 microphones: 7 staggered rows of 8, every place moved off its row by a low-discrepancy
-# sequence (against grating lobes), then the columns pulled in by a power. The constants were searched for once; the tests hold the result.
+# Our own placing of 56 microphones: 7 staggered rows of 8, every place moved off its row by a
+# low-discrepancy sequence (against grating lobes), then the columns pulled in by a power. The constants
+# were searched for once; the tests hold the result.
 _COLUMNS, _ROWS = 8, 7
 _WIDTH_M, _HEIGHT_M = 0.78, 0.65
 _JITTER = 0.57
@@ -61,7 +62,9 @@ class MicrophoneArray:
         spacings = nearest_spacings_m(positions)
         if spacings.min() == 0.0:
             twins = np.flatnonzero(spacings == 0.0).tolist()
-            raise InvalidArgumentError(f"positions_m: expected different places, got microphones {twins} in one")
+            raise InvalidArgumentError(
+                f"positions_m: expected different places, got microphones {twins} in one"
+            )
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)
 
@@ -82,7 +85,7 @@ class MicrophoneArray:
 
     @property
     def horizontal_moment_m2(self) -> float:
-        """S_xx = sum of (p_m - mean p)^2 over the horizontal coordinates p = y, square metres: eq. (crbtheta)."""
+        """S_xx of eq. (crbtheta): sum of (p_m - mean p)^2 over the coordinates p = y, square metres."""
         return float(np.sum(self.centred_m[:, 1] ** 2))
 
     @property
@@ -131,8 +134,8 @@ class MicrophoneArray:
 def roof_array_56() -> MicrophoneArray:
     """Build our own roof array: 56 microphones in the y-z plane, across the vehicle, centred at the origin.
 
-    It has the dimensions of the array in the paper (section IV): aperture 0.78 m x 0.65 m, S_xx = 3.03 m^2, mean
-    nearest spacing 8.8 cm, hence alias-free to about 1.9 kHz. The places themselves are ours.
+    It has the dimensions of the array in the paper (section IV): aperture 0.78 m x 0.65 m, S_xx = 3.03 m^2,
+    mean nearest spacing 8.8 cm, hence alias-free to about 1.9 kHz. The places themselves are ours.
 
     Examples
     --------

@@ -17,7 +17,7 @@ _ALONG_AXIS = 0.985
 
 
 def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> NDArray[np.float64]:
-    r"""Unit vectors that point towards far-field sources.
+    r"""Give unit vectors that point towards far-field sources.
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
 

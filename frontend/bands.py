@@ -1,0 +1,98 @@
+"""Band levels: log-energy in a handful of bands."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.errors import InvalidArgumentError
+
+# Mean square that stands for silence, far below 24-bit quantisation; keeps the logarithm finite.
+SILENCE = 1e-20
+
+
+def band_edges(bins: range, n_bands: int) -> NDArray[np.int64]:
+    """Edges of bands that grow by an equal ratio, at least one bin wide each.
+
+    Parameters
+    ----------
+    bins : range
+        First bin (>= 1) and end.
+    n_bands : int
+        Number of bands, not more than there are bins.
+
+    Returns
+    -------
+    ndarray of int, shape (n_bands + 1,)
+        Band b covers bins edges[b] .. edges[b + 1] - 1.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are fewer bins than bands.
+
+    Examples
+    --------
+    50 Hz to 8 kHz in bins of 93.75 Hz:
+
+    >>> band_edges(range(1, 85), 16)
+    array([ 1,  2,  3,  4,  5,  6,  8, 10, 13, 16, 20, 25, 32, 41, 52, 66, 85])
+    """
+    if not 1 <= n_bands <= len(bins) or bins.start < 1:
+        raise InvalidArgumentError(f"n_bands: expected 1 to {len(bins)} bands within {bins}, got {n_bands}")
+    edges = [bins.start]
+    for remaining in range(n_bands, 0, -1):
+        ratio = (bins.stop / edges[-1]) ** (1.0 / remaining)
+        edges.append(max(edges[-1] + 1, round(edges[-1] * ratio)))
+    return np.asarray(edges)
+
+
+def mean_square_per_bin(powers: NDArray[np.float32], nfft: int) -> NDArray[np.float64]:
+    r"""Mean square of the sound per bin, averaged over frames and channels.
+
+    .. math:: \overline{x^2}[k] = \frac{2 \langle |X[k]|^2 \rangle}{N \sum_n w[n]^2},
+              \qquad \sum_n w^2 = 3 N / 8
+
+    Parameters
+    ----------
+    powers : ndarray, shape (frames, bins, M)
+        |X|^2 of Hann-windowed frames; at least one frame.
+    nfft : int
+        Frame length N.
+
+    Returns
+    -------
+    ndarray of float64, shape (bins,), in squared units of the samples
+
+    Examples
+    --------
+    >>> mean_square_per_bin(np.full((2, 1, 3), 48.0, np.float32), nfft=16)
+    array([1.])
+    """
+    mean = powers.mean(axis=(0, 2), dtype=np.float64)
+    return np.asarray(mean * (2.0 / (nfft * 0.375 * nfft)))
+
+
+def log_band_energy(
+    mean_square: NDArray[np.float64], edges: NDArray[np.int64], first: int
+) -> NDArray[np.float64]:
+    """Natural logarithm of the mean square in each band; silence is floored at 1e-20.
+
+    Parameters
+    ----------
+    mean_square : ndarray, shape (bins,)
+        Per bin, the first being bin number `first`.
+    edges : ndarray of int, shape (bands + 1,)
+        From `band_edges`.
+    first : int
+        Number of the first bin.
+
+    Returns
+    -------
+    ndarray of float64, shape (bands,), nats re one squared unit of the samples
+
+    Examples
+    --------
+    >>> log_band_energy(np.array([1.0, 1.0, 0.0]), np.array([1, 3, 4]), first=1).round(2)
+    array([  0.69, -46.05])
+    """
+    sums = np.add.reduceat(mean_square, edges[:-1] - first)
+    return np.asarray(np.log(np.maximum(sums, SILENCE)))

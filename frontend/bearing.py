@@ -1,0 +1,102 @@
+"""The bearing of the strongest source, with a standard deviation and the prominence it was read with."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .peaks import find_peaks
+
+# Prominence less one at which noise doubles the variance of a bearing.
+_PROMINENCE_KNEE = 0.15
+# Beyond 78 degrees from broadside the law 1/cos is cut: it has no meaning within a beamwidth of endfire.
+_MIN_COSINE = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class AcousticBearing:
+    """Peak of a spatial spectrum as a measurement.
+
+    Parameters
+    ----------
+    azimuth_rad : float
+        Left positive.
+    std_rad : float
+        Standard deviation.
+    prominence : float
+        Peak-to-median ratio, >= 1; 1 in silence.
+
+    Examples
+    --------
+    >>> AcousticBearing(0.3, 0.06, 1.4).std_rad
+    0.06
+    """
+
+    azimuth_rad: float
+    std_rad: float
+    prominence: float
+
+
+def bearing_std_rad(
+    azimuth_rad: float, prominence: float, broadside_std_rad: float, span_rad: float
+) -> float:
+    r"""Model the standard deviation of a peak bearing.
+
+    .. math:: \sigma = \min\Big( \frac{\sigma_0}{\max(\cos\theta, 0.2)}
+              \sqrt{1 + \Big(\frac{0.15}{\rho - 1}\Big)^2},\; \frac{\Delta}{\sqrt{12}} \Big)
+
+    sigma_0 is what a prominent line-of-sight source shows on the road; the cosine is the geometry of eq.
+    (crbtheta); the root lets the prominence rho fade into ignorance, which is uniform over the searched
+    span Delta. An empirical model, not a bound.
+
+    Parameters
+    ----------
+    azimuth_rad : float
+        From broadside of an array that faces forward.
+    prominence : float
+        rho, peak-to-median ratio.
+    broadside_std_rad, span_rad : float
+        sigma_0 and Delta.
+
+    Examples
+    --------
+    >>> cases = ((0, 3.0), (60, 3.0), (0, 1.05))
+    >>> sigma = [bearing_std_rad(np.radians(a), p, np.radians(3.4), np.pi) for a, p in cases]
+    >>> np.degrees(sigma).round(1)
+    array([ 3.4,  6.8, 10.8])
+    """
+    uniform = span_rad / np.sqrt(12.0)
+    excess = prominence - 1.0
+    if excess <= 0.0:
+        return float(uniform)
+    spread = broadside_std_rad / max(np.cos(azimuth_rad), _MIN_COSINE)
+    return float(min(spread * np.hypot(1.0, _PROMINENCE_KNEE / excess), uniform))
+
+
+def strongest_bearing(
+    spectrum: NDArray[np.float64], azimuths_rad: NDArray[np.float64], broadside_std_rad: float
+) -> AcousticBearing:
+    """Read the highest peak of a spatial spectrum; in silence the middle, with the span's uncertainty.
+
+    Parameters
+    ----------
+    spectrum, azimuths_rad : ndarray, shape (A,)
+        Azimuths ascending and evenly spaced.
+    broadside_std_rad : float
+        sigma_0 of `bearing_std_rad`.
+
+    Examples
+    --------
+    >>> grid = np.radians(np.arange(-90.0, 91.0))
+    >>> strongest_bearing(np.exp(-((grid - 0.3) ** 2)), grid, 0.06).azimuth_rad.__round__(2)
+    0.3
+    >>> strongest_bearing(np.zeros(181), grid, 0.06).prominence
+    1.0
+    """
+    span = float(azimuths_rad[-1] - azimuths_rad[0])
+    peaks = find_peaks(spectrum, azimuths_rad, max_peaks=1)
+    if not peaks:
+        middle = float(0.5 * (azimuths_rad[0] + azimuths_rad[-1]))
+        return AcousticBearing(middle, bearing_std_rad(middle, 1.0, broadside_std_rad, span), 1.0)
+    azimuth, prominence = peaks[0].azimuth_rad, peaks[0].prominence
+    return AcousticBearing(azimuth, bearing_std_rad(azimuth, prominence, broadside_std_rad, span), prominence)

@@ -1,0 +1,50 @@
+"""Which DFT bins a frequency band covers."""
+
+import numpy as np
+
+from worldstate.errors import InvalidArgumentError
+
+
+def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
+    """Bins of a band by pyroomacoustics' rule: round(f / fs * nfft), upper end excluded.
+
+    Parameters
+    ----------
+    band_hz : (float, float)
+        Lower and upper frequency, Hz.
+    sample_rate_hz : float
+        Samples per second.
+    nfft : int
+        Frame length, samples.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the band is empty at this resolution or reaches beyond half the sample rate.
+
+    Examples
+    --------
+    >>> band_bins((50, 1500), 47_998, 512), band_bins((300, 1800), 47_998, 512)
+    (range(1, 16), range(3, 19))
+    """
+    low, high = (int(np.round(frequency / sample_rate_hz * nfft)) for frequency in band_hz)
+    if not 0 <= low < high:
+        raise InvalidArgumentError(
+            f"band_hz: expected a band of at least one bin of {nfft}, got {band_hz} Hz"
+        )
+    if high > nfft // 2:
+        raise InvalidArgumentError(
+            f"band_hz: expected less than half the sample rate of {sample_rate_hz} Hz, got {band_hz} Hz"
+        )
+    return range(low, high)
+
+
+def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
+    """Centre frequencies of the bins, Hz, shape (bins,).
+
+    Examples
+    --------
+    >>> bin_frequencies_hz(range(1, 4), 48_000, 512)
+    array([ 93.75, 187.5 , 281.25])
+    """
+    return np.arange(bins.start, bins.stop) * (sample_rate_hz / nfft)

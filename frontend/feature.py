@@ -1,0 +1,147 @@
+r"""The published 60-value feature: phase-transformed pair sums in two segments and thirty azimuths.
+
+.. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
+          \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta) \Big|,
+          \qquad Z = X / |X|
+
+over the T_s frames of segment s, K bins of 50-1500 Hz and the P = M (M - 1) / 2 pairs: the modulus of a
+complex sum, the diagonal left out, between 0 and 1. The released features of Schulz et al. were made in
+this form; later releases of the same library return another scale. The sum is not real, so that its modulus
+depends (by about one per cent) on the order of the microphones, which is the order of the array file.
+
+Azimuths run from -90 to 90 degrees counted to the RIGHT, as in that data: index 0 of each segment is the
+far left, +90 degrees in this library's own convention.
+
+References
+----------
+Y. Schulz, A. Mattar, T. Hehn and J. Kooij, Hearing what you cannot see: acoustic vehicle detection around
+corners, IEEE Robotics and Automation Letters, 2021.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import scipy.signal
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+from .array import MicrophoneArray
+from .bins import band_bins, bin_frequencies_hz
+from .geometry import SPEED_OF_SOUND_M_S
+from .phat import whiten
+from .steering import Steering, cross_spectra
+
+FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
+"""The published azimuths in this library's convention (left positive), in the published order."""
+FEATURE_AZIMUTHS_RAD.flags.writeable = False
+
+FEATURE_BAND_HZ = (50.0, 1500.0)
+FEATURE_NFFT = 512
+FEATURE_SEGMENTS = 2
+
+
+def feature_steering(
+    array: MicrophoneArray,
+    bins: range,
+    sample_rate_hz: float,
+    nfft: int = FEATURE_NFFT,
+    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+) -> Steering:
+    """Beams at the thirty published azimuths.
+
+    Examples
+    --------
+    >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).n_directions
+    30
+    """
+    frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)
+    return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD, speed_of_sound_m_s=speed_of_sound_m_s)
+
+
+def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
+    """Complex sum over frames, bins and microphone pairs i < j: what running sums are made of.
+
+    Parameters
+    ----------
+    whitened : ndarray of complex64, shape (frames, bins, M)
+    steering : Steering
+        For the same bins.
+
+    Returns
+    -------
+    ndarray of complex128, shape (directions,)
+    """
+    matrices = cross_spectra(whitened.transpose(1, 0, 2))
+    matrices *= _pairs_mask(whitened.shape[2])
+    return steering.quadratic_form(steering.compress(matrices))
+
+
+def segment_feature(
+    sums: Sequence[NDArray[np.complex128]], n_frames: int, n_bins: int, n_microphones: int
+) -> NDArray[np.float64]:
+    """Modulus of summed pair sums, per frame, bin and pair.
+
+    Examples
+    --------
+    >>> segment_feature([np.array([3.0 + 0j]), np.array([4j])], n_frames=2, n_bins=1, n_microphones=2)
+    array([2.5])
+    """
+    pairs = n_microphones * (n_microphones - 1) / 2
+    return np.asarray(np.abs(np.sum(sums, axis=0)) / (n_frames * n_bins * pairs))
+
+
+def published_feature(
+    window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float
+) -> NDArray[np.float64]:
+    """Compute the feature of one whole window in the published way, its zero-padded edge frames included.
+
+    Parameters
+    ----------
+    window : array_like, shape (n, M)
+        About one second of sound, any unit; n >= 512.
+    array : MicrophoneArray
+        In the order of the channels.
+    sample_rate_hz : float
+        Samples per second.
+
+    Returns
+    -------
+    ndarray of float64, shape (60,)
+        Segment 1 at thirty azimuths from left to right, then segment 2. A last odd frame is left out.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, a window shorter than a frame, NaN or infinity.
+
+    Examples
+    --------
+    >>> array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
+    >>> noise = np.random.default_rng(0).standard_normal(47_998)
+    >>> feature = published_feature(np.stack([noise, noise], axis=1), array, 47_998)
+    >>> feature.shape, bool(abs(feature[14] - feature[15]) < 1e-3)
+    ((60,), True)
+    """
+    samples = finite_array("window", window, (None, array.n_microphones))
+    rate = in_range("sample_rate_hz", sample_rate_hz, 0.0, np.inf, open_low=True, open_high=True)
+    if len(samples) < FEATURE_NFFT:
+        raise InvalidArgumentError(f"window: expected at least {FEATURE_NFFT} samples, got {len(samples)}")
+    bins = band_bins(FEATURE_BAND_HZ, rate, FEATURE_NFFT)
+    spectra = scipy.signal.stft(samples, nperseg=FEATURE_NFFT, axis=0)[2][bins.start : bins.stop]
+    whitened = whiten(np.ascontiguousarray(spectra.transpose(2, 0, 1), np.complex64))
+    steering = feature_steering(array, bins, rate)
+    length = len(whitened) // FEATURE_SEGMENTS
+    segments = [whitened[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
+    return np.concatenate(
+        [segment_feature([pair_sum(s, steering)], length, len(bins), array.n_microphones) for s in segments]
+    )
+
+
+@lru_cache(maxsize=8)
+def _pairs_mask(n_microphones: int) -> NDArray[np.float32]:
+    mask = np.triu(np.ones((n_microphones, n_microphones), np.float32), 1)
+    mask.flags.writeable = False
+    return mask

@@ -1,0 +1,48 @@
+"""What the front-end says every hop."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.values import NotUsable
+
+from .looming import Looming
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AcousticFrame:
+    """Everything the front-end reads from the sound up to one instant.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        End of the window, nanoseconds on the stream's clock.
+    sample_index : int
+        Number of samples up to there.
+    azimuths_rad : ndarray, shape (A,)
+        Grid of `srp`, ascending from right (negative) to left.
+    srp : ndarray of float64, shape (A,)
+        SRP-PHAT of the decision window, 0..1.
+    bearing_rad, bearing_std_rad : float
+        Strongest peak over the last `bearing_hops` hops: it refers to half that interval before `stamp_ns`.
+    prominence : float
+        Peak-to-median ratio of the spectrum that the bearing was read from.
+    band_log_energy : ndarray of float64, shape (16,)
+        ln mean square of the last hop per band.
+    looming : Looming or NotUsable
+        Approach rate at the end of the window.
+    feature : ndarray of float64, shape (60,)
+        The published feature of the decision window: two halves x thirty azimuths, from left to right.
+    """
+
+    stamp_ns: int
+    sample_index: int
+    azimuths_rad: NDArray[np.float64]
+    srp: NDArray[np.float64]
+    bearing_rad: float
+    bearing_std_rad: float
+    prominence: float
+    band_log_energy: NDArray[np.float64]
+    looming: Looming | NotUsable
+    feature: NDArray[np.float64]

@@ -1,0 +1,88 @@
+"""Cutting a stream of samples into hops that do not drift."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
+    """Sample at which hop `index` (from 1) ends: floor(index * rate / hops a second + 1/2).
+
+    Examples
+    --------
+    >>> [hop_end(k, 47_998, 10) for k in (0, 1, 2, 10)]
+    [0, 4800, 9600, 47998]
+    """
+    return math.floor(index * sample_rate_hz / hop_rate_hz + 0.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hop:
+    """The samples of one hop.
+
+    Parameters
+    ----------
+    index : int
+        From 1.
+    end : int
+        Number of samples from the start of the stream to the end of this hop.
+    samples : ndarray of float32, shape (n, M)
+        Valid until the next hop is asked for.
+    """
+
+    index: int
+    end: int
+    samples: NDArray[np.float32]
+
+
+class HopCutter:
+    """Collect blocks of any length and give whole hops, in time proportional to the samples.
+
+    Parameters
+    ----------
+    n_channels : int
+        Number of channels M.
+    sample_rate_hz, hop_rate_hz : float
+        Samples and hops per second.
+
+    Examples
+    --------
+    >>> cutter = HopCutter(n_channels=1, sample_rate_hz=25, hop_rate_hz=10)
+    >>> blocks = (np.zeros((n, 1), np.float32) for n in (2, 4, 1))
+    >>> [[(hop.index, len(hop.samples)) for hop in cutter.cut(block)] for block in blocks]
+    [[], [(1, 3), (2, 2)], []]
+    """
+
+    def __init__(self, n_channels: int, sample_rate_hz: float, hop_rate_hz: float) -> None:
+        self._rates = sample_rate_hz, hop_rate_hz
+        self._index = 1
+        self._start, self._end = 0, hop_end(1, *self._rates)
+        self._filled = 0
+        self._buffer = np.empty((math.ceil(sample_rate_hz / hop_rate_hz) + 1, n_channels), np.float32)
+
+    def cut(self, block: NDArray[np.float32]) -> Iterator[Hop]:
+        """Take a block (n, M), give the hops that it completes; read the iterator to its end."""
+        while len(block):
+            taken = min(len(block), self._length - self._filled)
+            whole = taken == self._length
+            if not whole:
+                self._buffer[self._filled : self._filled + taken] = block[:taken]
+            self._filled += taken
+            if self._filled == self._length:
+                samples = block[:taken] if whole else self._buffer[: self._length]
+                hop = Hop(self._index, self._end, samples)
+                self._advance()
+                yield hop
+            block = block[taken:]
+
+    @property
+    def _length(self) -> int:
+        return self._end - self._start
+
+    def _advance(self) -> None:
+        self._index += 1
+        self._start, self._end = self._end, hop_end(self._index, *self._rates)
+        self._filled = 0

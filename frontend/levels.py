@@ -1,0 +1,49 @@
+"""Band levels of a stream, from a few of its microphones."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bands import band_edges, log_band_energy, mean_square_per_bin
+from .bins import band_bins
+from .phat import power
+from .settings import FrontEndSettings
+from .stft import StreamingStft
+
+# Highest frequency that the anti-aliasing filters of usual converters leave alone, as a share of the sample
+# rate.
+_HIGHEST = 0.45
+
+
+class LevelMeter:
+    """Log-energy per band and hop: microphones hear the same sound, so that a few say what all would.
+
+    Parameters
+    ----------
+    n_channels : int
+        Channels of the stream.
+    sample_rate_hz : float
+        Samples per second.
+    settings : FrontEndSettings
+        Band, number of bands and of microphones.
+
+    Examples
+    --------
+    >>> meter = LevelMeter(n_channels=2, sample_rate_hz=16_000, settings=FrontEndSettings())
+    >>> meter.push(np.zeros((1600, 2), np.float32)).shape
+    (16,)
+    """
+
+    def __init__(self, n_channels: int, sample_rate_hz: float, settings: FrontEndSettings) -> None:
+        low, high = settings.level_band_hz
+        bins = band_bins((low, min(high, _HIGHEST * sample_rate_hz)), sample_rate_hz, settings.nfft)
+        self._bins = range(max(bins.start, 1), bins.stop)
+        self._edges = band_edges(self._bins, settings.level_bands)
+        self._nfft = settings.nfft
+        step = -(-n_channels // settings.level_channels)
+        self._channels = slice(None, None, step)
+        self._stft = StreamingStft(-(-n_channels // step), settings.nfft, self._bins)
+
+    def push(self, samples: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame."""
+        spectra = self._stft.push(np.ascontiguousarray(samples[:, self._channels]))
+        return log_band_energy(mean_square_per_bin(power(spectra), self._nfft), self._edges, self._bins.start)

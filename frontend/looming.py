@@ -1,0 +1,138 @@
+r"""Acoustic looming: the rate at which a sound grows gives the reciprocal time-to-arrival.
+
+For a point source at range d the band energy E goes as 1/d^2, eq. (looming):
+
+.. math:: \frac{d}{dt} \log E = -2 \frac{\dot d}{d} = \frac{2}{\mathrm{TTA}}
+
+Neither source level, distance nor a constant attenuation matters. Two readings of one window:
+
+* the slope of log E over the window, which is 2 / TTA somewhere near its middle;
+* the straight line through E^(-1/2), which is proportional to d itself: exact at constant speed, and read
+  at the END of the window.
+
+Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise that does not come from the
+source, and diffraction round a corner, bias either of them: what is measured then is the approach of the
+sound, not of the vehicle.
+
+References
+----------
+D. Lee, A theory of visual control of braking based on information about time-to-collision, Perception, 1976.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.values import NotUsable
+
+MIN_POINTS = 4
+# Scatter of log E about the fit, nats (3 dB), beyond which energy is not that of one approaching source.
+MAX_LOG_STD = 0.7
+# The range at the end of the window must be this many standard deviations from zero.
+_MIN_RANGE_SIGMA = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Looming:
+    """Approach rate read from growing sound.
+
+    Parameters
+    ----------
+    inverse_tta_hz : float
+        1/TTA = -d_dot / d at the end of the window from the line through E^(-1/2), 1/s, positive while
+        closing.
+    std_hz : float
+        Its standard error, 1/s, > 0.
+    log_slope_hz : float
+        Slope of log E over the window, 1/s: 2 / TTA near its middle.
+    log_slope_std_hz : float
+        Its standard error, 1/s.
+
+    Examples
+    --------
+    >>> Looming(0.5, 0.05, 0.8, 0.1).inverse_tta_hz
+    0.5
+    """
+
+    inverse_tta_hz: float
+    std_hz: float
+    log_slope_hz: float
+    log_slope_std_hz: float
+
+
+def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Looming | NotUsable:
+    r"""Fit both readings to one window of band energies.
+
+    The line d(t) = a + b t through :math:`E^{-1/2}` is weighted by the square of the exponential fit, for
+    log E scatters evenly and E^(-1/2) in proportion to itself; then 1/TTA = -b/a at t = 0.
+
+    Parameters
+    ----------
+    times_s : array_like, shape (n,)
+        Centre of each energy's interval relative to the END of the window, ascending, seconds; n >= 4.
+    log_energy : array_like, shape (n,)
+        Natural logarithm of the band energy.
+    floor_std : float
+        Scatter of `log_energy` that chance alone explains, 1 / sqrt(bandwidth x interval) for noise-like
+        sound: the standard errors assume no less than this, > 0.
+
+    Returns
+    -------
+    Looming or NotUsable
+        Not usable when the energies scatter by more than 3 dB about the fit, or when the line reaches range
+        zero within the error of the window.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On fewer than four points, another shape, unsorted times or numbers that are not finite.
+
+    Examples
+    --------
+    A source 20 m away at the end of the window, closing at 10 m/s:
+
+    >>> times_s = np.arange(-0.95, 0.0, 0.1)
+    >>> found = looming(times_s, -2 * np.log(20 - 10 * times_s), floor_std=0.01)
+    >>> round(found.inverse_tta_hz, 3), round(found.log_slope_hz / 2, 3)
+    (0.5, 0.403)
+    """
+    times = finite_array("times_s", times_s, (None,))
+    energies = finite_array("log_energy", log_energy, times.shape)
+    floor = in_range("floor_std", floor_std, 0.0, np.inf, open_low=True, open_high=True)
+    if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0):
+        raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, got {times}")
+    centred = energies - energies.mean()
+    slope, intercept, slope_scatter = _line(times, centred, np.ones_like(times))
+    # The exponential fit is a smooth stand-in for E^(-1/2): its scatter may not weight itself.
+    model = np.exp(-0.5 * (intercept + slope * times))
+    rate, level, range_scatter = _line(times, np.exp(-0.5 * centred), model)
+    scatter = 2.0 * range_scatter
+    if min(slope_scatter, scatter) > MAX_LOG_STD:
+        return NotUsable("energy scatters by more than 3 dB about the fit")
+    covariance = (0.5 * max(scatter, floor)) ** 2 * _line_covariance(times, model)
+    if level < _MIN_RANGE_SIGMA * np.sqrt(covariance[1, 1]):
+        return NotUsable("range reaches zero within the error of the window")
+    gradient = np.array([-1.0, rate / level]) / level
+    variance = float(gradient @ covariance @ gradient)
+    slope_variance = max(slope_scatter, floor) ** 2 * _line_covariance(times, np.ones_like(times))[0, 0]
+    return Looming(-rate / level, float(np.sqrt(variance)), slope, float(np.sqrt(slope_variance)))
+
+
+def _line(
+    times: NDArray[np.float64], values: NDArray[np.float64], scale: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Slope, intercept and relative scatter of a line, errors in proportion to `scale`."""
+    design = np.stack([times, np.ones_like(times)], axis=1) / scale[:, None]
+    solution = np.linalg.lstsq(design, values / scale, rcond=None)[0]
+    residual = values / scale - design @ solution
+    scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
+    return float(solution[0]), float(solution[1]), scatter
+
+
+def _line_covariance(times: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance of (slope, intercept) for relative errors of unit variance."""
+    design = np.stack([times, np.ones_like(times)], axis=1) / scale[:, None]
+    return np.asarray(np.linalg.inv(design.T @ design))

@@ -1,0 +1,95 @@
+"""Peaks of a spatial spectrum: where, how high, how far above the rest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A local maximum of a spatial spectrum.
+
+    Parameters
+    ----------
+    azimuth_rad : float
+        Left positive.
+    value : float
+        Height at the interpolated vertex, in the unit of the spectrum.
+    prominence : float
+        Peak-to-median ratio, >= 1 for the highest peak.
+
+    Examples
+    --------
+    >>> Peak(0.3, 0.5, 1.4).prominence
+    1.4
+    """
+
+    azimuth_rad: float
+    value: float
+    prominence: float
+
+
+def find_peaks(
+    spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int = 4, min_prominence: float = 1.0
+) -> tuple[Peak, ...]:
+    """Find the highest local maxima, interpolated by a parabola through three grid points.
+
+    A spectrum without any height (silence) has no peak. A maximum at an end of the grid stays there.
+
+    Parameters
+    ----------
+    spectrum : array_like, shape (A,)
+        Non-negative.
+    azimuths_rad : array_like, shape (A,)
+        Ascending, evenly spaced; A >= 3.
+    max_peaks : int
+        At most so many, highest first.
+    min_prominence : float
+        Smallest peak-to-median ratio.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, fewer than three points, NaN or infinity.
+
+    Examples
+    --------
+    >>> grid = np.radians(np.arange(-90.0, 91.0))
+    >>> beam = 0.1 + np.exp(-((grid - 0.30) ** 2) / 0.02) + 0.5 * np.exp(-((grid + 0.60) ** 2) / 0.02)
+    >>> [(round(p.azimuth_rad, 3), round(p.value, 3)) for p in find_peaks(beam, grid)]
+    [(0.3, 1.1), (-0.6, 0.6)]
+    """
+    azimuths = finite_array("azimuths_rad", azimuths_rad, (None,))
+    values = finite_array("spectrum", spectrum, azimuths.shape)
+    if len(values) < 3:
+        raise InvalidArgumentError(f"azimuths_rad: expected at least three points, got {len(values)}")
+    if values.max() <= 0.0:
+        return ()
+    median = max(float(np.median(values)), np.finfo(np.float64).tiny)
+    candidates = _local_maxima(values)
+    highest = candidates[np.argsort(-values[candidates], kind="stable")][:max_peaks]
+    peaks = (_interpolate(values, azimuths, int(index), median) for index in highest)
+    return tuple(peak for peak in peaks if peak.prominence >= min_prominence)
+
+
+def _local_maxima(values: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Find the points that rise from the left and do not rise to the right; of a plateau the first."""
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    return np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+
+
+def _interpolate(
+    values: NDArray[np.float64], azimuths: NDArray[np.float64], index: int, median: float
+) -> Peak:
+    height, shift = float(values[index]), 0.0
+    if 0 < index < len(values) - 1:
+        left, right = float(values[index - 1]), float(values[index + 1])
+        bend = left - 2.0 * height + right
+        shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+        height -= 0.25 * (left - right) * shift
+    azimuth = azimuths[index] + shift * (azimuths[1] - azimuths[0])
+    return Peak(float(azimuth), height, height / median)

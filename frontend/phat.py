@@ -1,0 +1,49 @@
+"""The phase transform: keep phases, forget magnitudes."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Smallest power of a bin that still counts as sound; far below 24-bit quantisation, far above float32
+# underflow.
+_POWER_FLOOR = np.float32(1e-30)
+
+
+def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Squared magnitude without the square root, same shape.
+
+    Examples
+    --------
+    >>> power(np.array([3 + 4j], np.complex64))
+    array([25.], dtype=float32)
+    """
+    squared = np.square(spectra.real)
+    squared += np.square(spectra.imag)
+    return squared
+
+
+def whiten(
+    spectra: NDArray[np.complex64], powers: NDArray[np.float32] | None = None
+) -> NDArray[np.complex64]:
+    r"""Phase transform :math:`X / |X|`; bins without sound stay zero.
+
+    Parameters
+    ----------
+    spectra : ndarray of complex64, any shape
+    powers : ndarray of float32, same shape, optional
+        ``power(spectra)`` if it is at hand already.
+
+    Examples
+    --------
+    >>> whiten(np.array([3 + 4j, 0], np.complex64))
+    array([0.6+0.8j, 0. +0.j ], dtype=complex64)
+
+    References
+    ----------
+    C. Knapp and G. Carter, The generalized correlation method for estimation of time delay, IEEE Trans.
+    ASSP, 1976.
+    """
+    squared = power(spectra) if powers is None else powers
+    weights = np.maximum(squared, _POWER_FLOOR)
+    np.sqrt(weights, out=weights)
+    np.reciprocal(weights, out=weights)
+    return np.asarray(spectra * weights)

@@ -1,0 +1,107 @@
+"""What a user may set of the front-end, with the values of the paper."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+from .feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_SEGMENTS
+from .geometry import SPEED_OF_SOUND_M_S
+
+Band = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class FrontEndSettings:
+    """Settings of `FrontEnd`.
+
+    Parameters
+    ----------
+    nfft : int
+        Frame length, samples, even; frames overlap by half.
+    hop_rate_hz : float
+        Decisions per second.
+    window_hops : int
+        Hops in the decision window of `srp` and `feature`, even: the feature has two segments.
+    bearing_hops : int
+        Hops behind `bearing_rad`, at most `window_hops`: fewer follow a moving source, more suppress noise.
+    azimuth_span_deg : (float, float)
+        First and last azimuth searched, left positive.
+    azimuth_step_deg : float
+        Step of that grid; it must divide the span.
+    srp_band_hz, feature_band_hz, looming_band_hz, level_band_hz : (float, float)
+        Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
+    level_bands : int
+        Number of bands of `band_log_energy`.
+    level_channels : int
+        Band levels are averaged over at most so many microphones, evenly picked.
+    looming_hops : int
+        Hops in the window of the looming fit, >= 4.
+    bearing_std_rad : float
+        Standard deviation of a prominent bearing at broadside.
+    speed_of_sound_m_s : float
+        Speed of sound.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or a band is empty.
+
+    Examples
+    --------
+    >>> FrontEndSettings(azimuth_step_deg=2.0).azimuths_rad().shape
+    (91,)
+    """
+
+    nfft: int = FEATURE_NFFT
+    hop_rate_hz: float = 10.0
+    window_hops: int = 10
+    bearing_hops: int = 3
+    azimuth_span_deg: tuple[float, float] = (-90.0, 90.0)
+    azimuth_step_deg: float = 1.0
+    srp_band_hz: Band = (300.0, 1800.0)
+    feature_band_hz: Band = FEATURE_BAND_HZ
+    looming_band_hz: Band = (300.0, 1800.0)
+    level_band_hz: Band = (50.0, 8000.0)
+    level_bands: int = 16
+    level_channels: int = 8
+    looming_hops: int = 10
+    bearing_std_rad: float = float(np.radians(3.4))
+    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
+
+    def __post_init__(self) -> None:
+        _even("nfft", self.nfft, 4, 65536)
+        _even("window_hops", self.window_hops, FEATURE_SEGMENTS, 1000)
+        in_range("bearing_hops", self.bearing_hops, 1, self.window_hops)
+        in_range("looming_hops", self.looming_hops, 4, 1000)
+        in_range("hop_rate_hz", self.hop_rate_hz, 0.1, 1000.0)
+        in_range("level_bands", self.level_bands, 1, self.nfft // 2)
+        in_range("level_channels", self.level_channels, 1, np.inf)
+        in_range("bearing_std_rad", self.bearing_std_rad, 0.0, np.pi, open_low=True)
+        in_range("speed_of_sound_m_s", self.speed_of_sound_m_s, 100.0, 10_000.0)
+        self._check_grid()
+        for name in ("srp_band_hz", "feature_band_hz", "looming_band_hz", "level_band_hz"):
+            low, high = getattr(self, name)
+            in_range(f"{name}: lower end", low, 0.0, np.inf)
+            in_range(f"{name}: upper end", high, low, np.inf, open_low=True, open_high=True)
+
+    def _check_grid(self) -> None:
+        first, last = self.azimuth_span_deg
+        in_range("azimuth_span_deg: first", first, -180.0, 180.0)
+        in_range("azimuth_span_deg: last", last, first, 180.0, open_low=True)
+        step = in_range("azimuth_step_deg", self.azimuth_step_deg, 0.01, (last - first) / 2)
+        if abs((last - first) / step - round((last - first) / step)) > 1e-9:
+            raise InvalidArgumentError(f"azimuth_step_deg: expected a divisor of {last - first}, got {step}")
+
+    def azimuths_rad(self) -> NDArray[np.float64]:
+        """Grid of azimuths, ascending from right to left, radians, shape (A,)."""
+        first, last = self.azimuth_span_deg
+        return np.radians(np.linspace(first, last, round((last - first) / self.azimuth_step_deg) + 1))
+
+
+def _even(name: str, value: int, low: int, high: int) -> None:
+    if value != int(value) or value % 2 or not low <= value <= high:
+        raise InvalidArgumentError(f"{name}: expected an even whole number in [{low}, {high}], got {value}")

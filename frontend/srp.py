@@ -1,0 +1,83 @@
+r"""Steered response power with the phase transform (SRP-PHAT).
+
+.. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}
+          \Big| \sum_m \overline{a_{k,m}(\theta)}\, \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2
+
+over T frames, K bins and M microphones: 1 for a lone plane wave from theta, 1/M for noise that is
+independent between microphones. pyroomacoustics' SRP is M^2 / pairs = 2 M / (M - 1) times as large.
+
+References
+----------
+J. DiBiase, H. Silverman and M. Brandstein, Robust localization in reverberant rooms, in: Microphone Arrays,
+2001.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import check_shape
+
+from .phat import whiten
+from .steering import Steering
+
+
+def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
+    """Sum of beam powers over frames and bins: what running sums are made of.
+
+    Parameters
+    ----------
+    whitened : ndarray of complex64, shape (frames, bins, M)
+    steering : Steering
+        For the same bins.
+
+    Returns
+    -------
+    ndarray of float64, shape (directions,)
+    """
+    return np.asarray(steering.quadratic_form(steering.covariance(whitened)).real)
+
+
+def normalised(
+    total: NDArray[np.float64], n_frames: int, n_bins: int, n_microphones: int
+) -> NDArray[np.float64]:
+    """Scale a sum of beam powers to 0..1; rounding below zero is cut.
+
+    Examples
+    --------
+    >>> normalised(np.array([8.0, 4.0]), n_frames=1, n_bins=2, n_microphones=2)
+    array([1. , 0.5])
+    """
+    return np.asarray(np.maximum(total, 0.0) / (n_frames * n_bins * n_microphones**2))
+
+
+def srp_phat(spectra: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
+    """SRP-PHAT of a set of frames, on the scale above.
+
+    Parameters
+    ----------
+    spectra : ndarray of complex64, shape (frames, bins, M)
+        At least one frame.
+    steering : Steering
+        For the same bins.
+
+    Returns
+    -------
+    ndarray of float64, shape (directions,)
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the spectra have other axes or another number of bins.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
+    >>> steering = Steering.towards(array, [500.0], [-0.5, 0.0, 0.5])
+    >>> plane_wave = array.steering(500.0, 0.5).transpose(2, 0, 1).astype(np.complex64)
+    >>> srp_phat(plane_wave, steering).round(3)
+    array([0.408, 0.819, 1.   ])
+    """
+    check_shape("spectra", spectra.shape, (None, len(steering.weights), None))
+    n_frames, n_bins, n_microphones = spectra.shape
+    return normalised(steered_power(whiten(spectra), steering), n_frames, n_bins, n_microphones)

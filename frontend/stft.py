@@ -1,0 +1,114 @@
+"""Short-time Fourier transform of a stream, only the bins that somebody reads."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.errors import InvalidArgumentError
+
+
+class StreamingStft:
+    r"""Hann-windowed frames of `nfft` samples, half overlapped, exact in blocks of any length.
+
+    .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N},
+              \qquad w[n] = \tfrac12 - \tfrac12 \cos(2 \pi n / N)
+
+    The first frame starts at the first sample; nothing is padded. Instead of a full FFT, every half frame
+    is multiplied once by the wanted rows of the DFT matrix. Two neighbouring halves make a frame, the
+    second with sign (-1)^k, and the Hann window is the three-tap filter (-1/4, 1/2, -1/4) across bins.
+
+    Parameters
+    ----------
+    n_channels : int
+        Number of channels M.
+    nfft : int
+        Frame length N, even.
+    bins : range
+        Wanted bins, step 1, within 0 .. N/2.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If N is odd or the bins are outside.
+
+    Examples
+    --------
+    >>> stft = StreamingStft(n_channels=1, nfft=8, bins=range(1, 3))
+    >>> tone = np.cos(2 * np.pi * np.arange(12) / 8, dtype=np.float32)[:, None]
+    >>> stft.push(tone[:7]).shape, stft.push(tone[7:])[..., 0].round(3).real + 0.0
+    ((0, 2, 1), array([[ 2., -1.],
+                       [-2.,  1.]], dtype=float32))
+    """
+
+    def __init__(self, n_channels: int, nfft: int, bins: range) -> None:
+        if nfft < 4 or nfft % 2:
+            raise InvalidArgumentError(f"nfft: expected an even number >= 4, got {nfft}")
+        if bins.step != 1 or not 0 <= bins.start < bins.stop <= nfft // 2 + 1:
+            raise InvalidArgumentError(f"bins: expected a range within 0..{nfft // 2}, got {bins}")
+        self.bins = bins
+        # One bin more on either side, for the window's taps.
+        wider = np.arange(bins.start - 1, bins.stop + 1)
+        self._half_dft = _half_dft(wider, nfft)
+        self._signs = ((-1.0) ** wider).astype(np.float32)[:, None]
+        self._head = np.empty((nfft // 2, n_channels), np.float32)
+        self._n_head = 0
+        self._previous: NDArray[np.float32] | None = None
+
+    def push(self, samples: NDArray[np.float32]) -> NDArray[np.complex64]:
+        """Take the next samples, give the frames that they complete.
+
+        Parameters
+        ----------
+        samples : ndarray of float32, shape (n, M)
+            Any n.
+
+        Returns
+        -------
+        ndarray of complex64, shape (frames, bins, M)
+        """
+        halves = self._halves(samples)
+        if halves is None:
+            return np.empty((0, len(self.bins), self._head.shape[1]), np.complex64)
+        first = 1 if self._previous is None else 0
+        if self._previous is not None:
+            halves[0] = self._previous
+        self._previous = halves[-1].copy()
+        return _frames(halves[first:], self._signs)
+
+    def _halves(self, samples: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Transform the half frames that are full now, (1 + n, 2, bins + 2, M); the caller fills the first."""
+        size, n_channels = self._head.shape
+        missing = size - self._n_head
+        if len(samples) < missing:
+            self._head[self._n_head : self._n_head + len(samples)] = samples
+            self._n_head += len(samples)
+            return None
+        self._head[self._n_head :] = samples[:missing]
+        n_rest = (len(samples) - missing) // size
+        rest = samples[missing : missing + n_rest * size].reshape(n_rest, size, n_channels)
+        halves = np.empty((2 + n_rest, 2, len(self._signs), n_channels), np.float32)
+        flat = halves.reshape(2 + n_rest, -1, n_channels)
+        np.matmul(self._half_dft, self._head, out=flat[1])
+        np.matmul(self._half_dft, rest, out=flat[2:])
+        tail = samples[missing + n_rest * size :]
+        self._head[: len(tail)] = tail
+        self._n_head = len(tail)
+        return halves
+
+
+def _half_dft(bins: NDArray[np.int64], nfft: int) -> NDArray[np.float32]:
+    """Real rows, then imaginary rows of the DFT over half a frame, (2 bins, nfft / 2)."""
+    phase = -2.0 * np.pi / nfft * np.outer(bins, np.arange(nfft // 2))
+    return np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
+
+
+def _frames(halves: NDArray[np.float32], signs: NDArray[np.float32]) -> NDArray[np.complex64]:
+    """Join neighbouring halves and apply the window, (n, 2, bins + 2, M) -> (n - 1, bins, M)."""
+    joined = halves[1:] * signs
+    joined += halves[:-1]
+    sides = joined[:, :, :-2] + joined[:, :, 2:]
+    sides *= np.float32(-0.25)
+    windowed = joined[:, :, 1:-1] * np.float32(0.5)
+    windowed += sides
+    spectra = np.empty((len(windowed), *windowed.shape[2:]), np.complex64)
+    spectra.real, spectra.imag = windowed[:, 0], windowed[:, 1]
+    return spectra

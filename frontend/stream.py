@@ -1,0 +1,173 @@
+"""The streaming acoustic front-end: samples in, one `AcousticFrame` a hop out."""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import check_shape, in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.values import NotUsable, nanoseconds
+
+from .array import MicrophoneArray
+from .bands import SILENCE
+from .bearing import strongest_bearing
+from .feature import FEATURE_SEGMENTS, segment_feature
+from .frame import AcousticFrame
+from .hops import Hop, HopCutter
+from .levels import LevelMeter
+from .listener import HopSums, Listener
+from .looming import Looming, looming
+from .settings import FrontEndSettings
+from .srp import normalised
+
+__all__ = ["AcousticFrame", "FrontEnd"]
+
+
+class FrontEnd:
+    """Bearing, approach rate and signature of the sound around an array, every tenth of a second.
+
+    A frame of the transform belongs to the hop in whose samples it ends. Hop k ends at sample floor(k fs /
+    10 + 1/2), so that a decision never drifts; the first falls on the end of the first full window. Sums
+    are kept per hop, so that a running second costs only its new frames, and hops are cut before anything
+    is computed, so that the same samples give the same frames in blocks of any length. Memory does not
+    grow.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        In the order of the channels. A planar array mounted across the vehicle hears sources behind it
+        mirrored to the front: see `MicrophoneArray.ambiguity`.
+    sample_rate_hz : float
+        Samples per second; more than twice the highest frequency of the bands.
+    settings : FrontEndSettings, optional
+        The paper's values by default.
+    start_ns : int
+        Time of the first sample, nanoseconds.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a band lies beyond half the sample rate, or a hop is shorter than a frame.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import roof_array_56
+    >>> front_end = FrontEnd(roof_array_56(), sample_rate_hz=16_000)
+    >>> sound = np.random.default_rng(0).standard_normal((17_600, 56), dtype=np.float32)
+    >>> frames = front_end.process(sound)
+    >>> [frame.sample_index for frame in frames], frames[0].srp.shape, frames[0].feature.shape
+    ([16000, 17600], (181,), (60,))
+    """
+
+    def __init__(
+        self,
+        array: MicrophoneArray,
+        sample_rate_hz: float,
+        settings: FrontEndSettings | None = None,
+        *,
+        start_ns: int = 0,
+    ) -> None:
+        self.array = array
+        self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
+        self.settings = settings = settings or FrontEndSettings()
+        if settings.nfft > self.sample_rate_hz / settings.hop_rate_hz:
+            hop = self.sample_rate_hz / settings.hop_rate_hz
+            raise InvalidArgumentError(
+                f"nfft: expected at most one hop of {hop:.0f} samples, got {settings.nfft}"
+            )
+        self._start_ns = start_ns
+        self._azimuths = settings.azimuths_rad()
+        self._azimuths.flags.writeable = False
+        self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
+        self._listener = Listener(array, self.sample_rate_hz, settings)
+        self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
+        self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
+
+    def process(self, block: ArrayLike) -> list[AcousticFrame]:
+        """Take the next samples, give one frame for every hop that they complete after the first window.
+
+        Parameters
+        ----------
+        block : array_like, shape (n, M)
+            Any n, from a single sample to a whole file; converted to float32.
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another number of channels, values that are no numbers, NaN or infinity; the stream is left
+            as it was.
+        """
+        frames = (self._hear(hop) for hop in self._cutter.cut(self._checked(block)))
+        return [frame for frame in frames if frame is not None]
+
+    def _checked(self, block: ArrayLike) -> NDArray[np.float32]:
+        try:
+            samples = np.ascontiguousarray(block, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise InvalidArgumentError(f"block: expected numbers, got {type(block).__name__}") from error
+        check_shape("block", samples.shape, (None, self.array.n_microphones))
+        # One pass of BLAS; only a suspicious block (or one of absurd level) is looked at number by number.
+        flat = samples.reshape(-1)
+        if not np.isfinite(np.dot(flat, flat)) and not np.isfinite(samples).all():
+            channels = np.flatnonzero(~np.isfinite(samples).all(axis=0)).tolist()
+            raise InvalidArgumentError(
+                f"block: expected finite numbers, got NaN or infinity in channels {channels}"
+            )
+        return samples
+
+    def _hear(self, hop: Hop) -> AcousticFrame | None:
+        self._hops.append(self._listener.push(hop.samples))
+        levels = self._meter.push(hop.samples)
+        return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
+
+    def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
+        settings = self.settings
+        bearing = strongest_bearing(
+            self._srp(settings.bearing_hops), self._azimuths, settings.bearing_std_rad
+        )
+        return AcousticFrame(
+            stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
+            sample_index=hop.end,
+            azimuths_rad=self._azimuths,
+            srp=self._srp(settings.window_hops),
+            bearing_rad=bearing.azimuth_rad,
+            bearing_std_rad=bearing.std_rad,
+            prominence=bearing.prominence,
+            band_log_energy=levels,
+            looming=self._looming(hop.end),
+            feature=self._feature(),
+        )
+
+    def _last(self, n_hops: int) -> list[HopSums]:
+        return list(self._hops)[-n_hops:]
+
+    def _srp(self, n_hops: int) -> NDArray[np.float64]:
+        hops = self._last(n_hops)
+        total = np.sum([hop.power for hop in hops], axis=0)
+        n_frames = sum(hop.n_frames for hop in hops)
+        return normalised(total, n_frames, len(self._listener.srp_bins), self.array.n_microphones)
+
+    def _feature(self) -> NDArray[np.float64]:
+        hops = self._last(self.settings.window_hops)
+        length = len(hops) // FEATURE_SEGMENTS
+        segments = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
+        n_bins, n_microphones = len(self._listener.feature_bins), self.array.n_microphones
+        return np.concatenate(
+            [
+                segment_feature([h.pairs for h in s], sum(h.n_frames for h in s), n_bins, n_microphones)
+                for s in segments
+            ]
+        )
+
+    def _looming(self, end: int) -> Looming | NotUsable:
+        settings = self.settings
+        hops = self._last(settings.looming_hops)
+        if len(hops) < settings.looming_hops:
+            return NotUsable(f"needs {settings.looming_hops} hops, heard {len(hops)}")
+        energies = np.array([hop.energy for hop in hops])
+        if energies.min() <= SILENCE:
+            return NotUsable("silence within the window")
+        times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz
+        low, high = settings.looming_band_hz
+        return looming(times, np.log(energies), floor_std=((high - low) / settings.hop_rate_hz) ** -0.5)
