@@ -1,0 +1,141 @@
+"""What an empty street sounds like: coherent anisotropic ambience, distant traffic, wind and noise."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+
+from .bands import REFERENCE_PA, level_curve
+from .presets import Preset
+from .scene import Site, site_generator
+from .static_field import add_static, plane_wave_delays
+
+Array = NDArray[np.float64]
+Signal = NDArray[np.float32]
+
+FLUCTUATION_STEP_S = 1.0
+LOBES = 3
+WIND_SLOPE = -2.2
+WIND_FLOOR_HZ = 20.0  # below, wind stays as it is there
+
+
+def add_background(
+    out: Signal,
+    site: Site,
+    preset: Preset,
+    positions_m: Array,
+    sample_rate_hz: float,
+    rng: np.random.Generator,
+) -> None:
+    """Add everything that a street without a vehicle sounds like.
+
+    Parameters
+    ----------
+    out : ndarray, shape (M, n)
+        Pa, added to in place.
+    site : Site
+        Its name decides from where the ambient sound comes.
+    preset : Preset
+        Levels.
+    positions_m : ndarray, shape (M, 3)
+        Microphones.
+    sample_rate_hz : float
+        Rate in Hz.
+    rng : numpy.random.Generator
+        Source of randomness.
+    """
+    offsets = positions_m - positions_m.mean(axis=0)
+    level_db = np.array(preset.ambient_octaves_db) + preset.ambient_spread_db * rng.standard_normal()
+    azimuth, power = ambient_directions(site, preset, rng)
+    waves = _ambient_waves(power, level_db, preset, out.shape[1], sample_rate_hz, rng)
+    add_static(out, waves, plane_wave_delays(unit_vectors(azimuth, rng), offsets), sample_rate_hz)
+    for _ in range(min(int(rng.poisson(preset.far_rate)), 2)):
+        _add_far_vehicle(out, level_db + preset.far_level_db, offsets, sample_rate_hz, rng)
+    _add_channel_noise(out, preset, sample_rate_hz, rng)
+
+
+def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Azimuths of the ambient waves and their shares of the power, shape (Q,) each.
+
+    A site has loud directions of its own; a recording shifts them a little.
+    """
+    azimuth = 2.0 * np.pi * (np.arange(preset.ambient_waves) + rng.random()) / preset.ambient_waves
+    fixed = site_generator(site.name, "ambient")
+    centres = fixed.uniform(-np.pi, np.pi, LOBES) + 0.1 * rng.standard_normal(LOBES)
+    weights = fixed.dirichlet(np.ones(LOBES))
+    lobes = np.exp(preset.lobe_concentration * (np.cos(azimuth[:, None] - centres) - 1.0))
+    shaped = (lobes / lobes.sum(axis=0)) @ weights
+    return azimuth, preset.lobe_share * shaped + (1.0 - preset.lobe_share) / preset.ambient_waves
+
+
+def unit_vectors(azimuth_rad: Array, rng: np.random.Generator) -> Array:
+    """Directions with a small random elevation, as traffic between buildings has, shape (Q, 3)."""
+    elevation = np.abs(rng.normal(0.0, 0.2, len(azimuth_rad)))
+    flat = np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation)], axis=1)
+
+
+def shaped_noise(density: Array, samples: int, rng: np.random.Generator, channels: int) -> Signal:
+    """Gaussian noise with a given power spectral density.
+
+    Parameters
+    ----------
+    density : ndarray, shape (n // 2 + 1,)
+        Pa^2 per cycle per sample at the bins of a transform of ``n = next_fast_len(samples)``.
+    samples, channels : int
+        Size of the result.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    ndarray, shape (channels, samples)
+    """
+    n = next_fast_len(samples, real=True)
+    shape = np.sqrt(density / 2.0).astype(np.float32)
+    noise = np.empty((channels, samples), np.float32)
+    for channel in noise:
+        white = rng.standard_normal(n, dtype=np.float32)
+        channel[:] = irfft(rfft(white) * shape, n)[:samples]
+    return noise
+
+
+def noise_frequencies(samples: int, sample_rate_hz: float) -> Array:
+    """Bins at which `shaped_noise` wants its density."""
+    return rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz)
+
+
+def _ambient_waves(
+    power: Array, level_db: Array, preset: Preset, samples: int, rate: float, rng: np.random.Generator
+) -> Signal:
+    density = level_curve(level_db, noise_frequencies(samples, rate)) * rate
+    waves = shaped_noise(density, samples, rng, len(power))
+    knots = np.arange(0.0, samples / rate + 2.0 * FLUCTUATION_STEP_S, FLUCTUATION_STEP_S)
+    time = np.arange(samples) / rate
+    for wave, share in zip(waves, power, strict=True):
+        wander_db = preset.wave_fluctuation_db * rng.standard_normal(len(knots))
+        wave *= np.interp(time, knots, np.sqrt(share) * 10.0 ** (wander_db / 20.0)).astype(np.float32)
+    return waves
+
+
+def _add_far_vehicle(
+    out: Signal, level_db: Array, offsets_m: Array, rate: float, rng: np.random.Generator
+) -> None:
+    """Add a vehicle some streets away: one direction, one facade reflection, gone in seconds."""
+    samples = out.shape[1]
+    noise = shaped_noise(level_curve(level_db, noise_frequencies(samples, rate)) * rate, samples, rng, 1)
+    time = np.arange(samples) / rate
+    centre, width = rng.uniform(0.0, time[-1] + 1.0 / rate), rng.uniform(1.5, 4.0)
+    noise *= np.exp(-0.5 * ((time - centre) / width) ** 2).astype(np.float32)
+    echo = np.roll(noise, int(rng.uniform(0.01, 0.05) * rate)) * np.float32(rng.uniform(0.3, 0.8))
+    directions = unit_vectors(rng.uniform(-np.pi, np.pi, 2), rng)
+    add_static(out, np.concatenate([noise, echo]), plane_wave_delays(directions, offsets_m), rate)
+
+
+def _add_channel_noise(out: Signal, preset: Preset, rate: float, rng: np.random.Generator) -> None:
+    """Add wind and electronic noise: every microphone by itself."""
+    frequencies = noise_frequencies(out.shape[1], rate)
+    wind_density = REFERENCE_PA**2 * 10.0 ** (preset.wind_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))
+    wind = wind_density * (np.maximum(frequencies, WIND_FLOOR_HZ) / 100.0) ** WIND_SLOPE
+    electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / (rate / 2.0)
+    for channel in out:
+        channel += shaped_noise((wind + electronic) * rate, out.shape[1], rng, 1)[0]

@@ -1,0 +1,237 @@
+"""Recordings on disk in the OVAD layout: D/<environment>/<class>/<ID> and D/DataLog.csv."""
+
+import csv
+import io
+import json
+import multiprocessing
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import soundfile
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+from worldstate.adapters.atomic import atomic_path, write_text
+from worldstate.checks import in_range
+from worldstate.errors import InputFileError
+
+from .detector import to_json
+from .recording import SimulatedRecording, simulate_recording
+from .scene import SITES
+from .settings import APPROACHES, draw_settings
+
+AUDIO_NAME = "out_multi.wav"
+DETECTIONS_NAME = "camera_baseline_results.json"
+TRUTH_NAME = "truth.json"
+LOG_NAME = "DataLog.csv"
+WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
+MAX_RECORDINGS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class LogRow:
+    """One line of `DataLog.csv`.
+
+    Parameters
+    ----------
+    recording_id : str
+        ``X_LL_NNNN``: class number (1 left, 2 none, 3 right), location number, running number.
+    environment : str
+        Site name.
+    approach : str
+        "left", "none" or "right".
+    t0_frame : int
+        Camera frame of line-of-sight entry.
+    """
+
+    recording_id: str
+    environment: str
+    approach: str
+    t0_frame: int
+
+    @property
+    def folder(self) -> Path:
+        """Where the recording lies below the root.
+
+        Examples
+        --------
+        >>> LogRow("1_00_0002", "SA1", "left", 70).folder.as_posix()
+        'SA1/left/1_00_0002'
+        """
+        return Path(self.environment, self.approach, self.recording_id)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What the recording number `number` of a data set is, before anything is drawn."""
+
+    number: int
+    environment: str
+    approach: str
+    seed: np.random.SeedSequence
+
+
+def plan_static(n_static: int, seed: int) -> list[Plan]:
+    """Plan a data set: every other recording an approach, left and right in turn, site after site.
+
+    Examples
+    --------
+    >>> [(p.environment, p.approach) for p in plan_static(4, 1)]
+    [('SA1', 'left'), ('SA1', 'none'), ('SA2', 'right'), ('SA2', 'none')]
+    """
+    in_range("n_static", n_static, 1, MAX_RECORDINGS)
+    in_range("seed", seed, 0, 2**63)
+    children = np.random.SeedSequence(seed).spawn(n_static)
+    return [Plan(i, SITES[(i // 2) % len(SITES)], _approach(i), child) for i, child in enumerate(children)]
+
+
+def _approach(number: int) -> str:
+    if number % 2:
+        return "none"
+    return "left" if number % 4 == 0 else "right"
+
+
+def write_dataset(
+    root: str | Path,
+    n_static: int,
+    seed: int = 1,
+    *,
+    jobs: int = 1,
+    duration_s: float = 10.0,
+    progress: Callable[[LogRow], None] | None = None,
+) -> list[LogRow]:
+    """Simulate a data set of recordings with a standing ego.
+
+    The same seed gives the same bytes, whatever the number of jobs: every recording has a seed of its own.
+
+    Parameters
+    ----------
+    root : str or Path
+        Folder to write to; made if it is not there. Simulated recordings of the same name are replaced.
+    n_static : int
+        Number of recordings; every other one is hazard-free.
+    seed : int
+        Of the whole data set.
+    jobs : int
+        Processes.
+    duration_s : float
+        Length of every recording.
+    progress : callable, optional
+        Called with every finished recording, in order.
+
+    Returns
+    -------
+    list of LogRow
+        The lines of `DataLog.csv`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+    InputFileError
+        If something that was not simulated stands where a recording would go.
+    """
+    in_range("jobs", jobs, 1, 256)
+    in_range("duration_s", duration_s, 0.5, 60.0)
+    plans = plan_static(n_static, seed)
+    folder = Path(root)
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for row in _each(partial(_simulate_one, folder, duration_s), plans, jobs):
+        rows.append(row)
+        if progress is not None:
+            progress(row)
+    write_text(folder / LOG_NAME, _log(rows))
+    return rows
+
+
+def write_recording(root: str | Path, recording: SimulatedRecording, number: int = 0) -> LogRow:
+    """Write one recording below `root`, whole or not at all.
+
+    Parameters
+    ----------
+    root : str or Path
+        Existing folder of the data set.
+    recording : SimulatedRecording
+        What to write; site and approach are in its truth.
+    number : int
+        Running number in the ID, 0..9999.
+
+    Returns
+    -------
+    LogRow
+        Its line in `DataLog.csv`; ``root / row.folder`` is where it lies.
+
+    Raises
+    ------
+    InputFileError
+        If something that was not simulated stands there.
+    """
+    in_range("number", number, 0, 9999)
+    row = _log_row(recording, number)
+    target = Path(root) / row.folder
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _clear(target)
+    with atomic_path(target) as temporary:
+        temporary.mkdir()
+        _write_audio(temporary / AUDIO_NAME, recording)
+        _write_json(temporary / DETECTIONS_NAME, to_json(list(recording.detections)))
+        _write_json(temporary / TRUTH_NAME, recording.truth)
+    return row
+
+
+def _simulate_one(root: Path, duration_s: float, plan: Plan) -> LogRow:
+    rng = np.random.default_rng(plan.seed)
+    settings = draw_settings(plan.environment, plan.approach, rng, duration_s)
+    with threadpool_limits(1):  # the number of BLAS threads would change the last bits
+        recording = simulate_recording(settings, rng)
+    return write_recording(root, recording, plan.number)
+
+
+def _each(work: Callable[[Plan], LogRow], plans: list[Plan], jobs: int) -> Iterator[LogRow]:
+    if jobs == 1 or len(plans) == 1:
+        yield from map(work, plans)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(plans)), mp_context=context) as pool:
+        yield from pool.map(work, plans)
+
+
+def _log_row(recording: SimulatedRecording, number: int) -> LogRow:
+    settings = recording.truth["settings"]
+    environment, approach = settings["site"]["name"], settings["approach"]
+    location = SITES.index(environment) if environment in SITES else 99
+    identity = f"{APPROACHES.index(approach) + 1}_{location:02d}_{number:04d}"
+    return LogRow(identity, environment, approach, recording.t0_frame)
+
+
+def _clear(target: Path) -> None:
+    if not target.exists():
+        return
+    if not (target / TRUTH_NAME).is_file():
+        raise InputFileError(target, "expected a free name or a simulated recording, found something else")
+    shutil.rmtree(target)
+
+
+def _write_audio(path: Path, recording: SimulatedRecording) -> None:
+    samples, channels = recording.audio.shape
+    kind = "RF64" if 3 * samples * channels > WAV_LIMIT_BYTES else "WAV"
+    rate = round(recording.sample_rate_hz)
+    soundfile.write(path, recording.audio, rate, subtype="PCM_24", format=kind)
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _log(rows: list[LogRow]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["ID", "Environment", "Class", "T0"])
+    writer.writerows([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
+    return text.getvalue()

@@ -1,0 +1,119 @@
+"""Levels and shapes of everything that is not geometry: named, versioned, frozen.
+
+They were set on level and shape statistics (mean, peak, prominence) of the published features of SA1, SB1 and
+SB2, in the open and never on a classifier's score. A change is a new name.
+"""
+
+from dataclasses import dataclass
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+LIMITS: dict[str, tuple[float, float]] = {
+    "ambient_spread_db": (0.0, 20.0),
+    "ambient_waves": (8, 512),
+    "lobe_concentration": (0.0, 50.0),
+    "lobe_share": (0.0, 1.0),
+    "wave_fluctuation_db": (0.0, 20.0),
+    "far_rate": (0.0, 10.0),
+    "far_level_db": (-60.0, 30.0),
+    "wind_100hz_db": (-20.0, 100.0),
+    "self_noise_db": (0.0, 80.0),
+    "gain_mismatch_db": (0.0, 10.0),
+    "delay_mismatch_s": (0.0, 1e-3),
+    "late_db": (-90.0, 0.0),
+    "late_decay_s": (0.05, 5.0),
+    "vehicle_spread_db": (0.0, 20.0),
+    "screen_cap_db": (5.0, 60.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """Background, late field and vehicle levels; dB re 20 uPa unless said otherwise.
+
+    Parameters
+    ----------
+    name : str
+        Name and version.
+    ambient_octaves_db : tuple of 8 float
+        Level of the ambient field per octave, 62.5 Hz .. 8 kHz.
+    ambient_spread_db : float
+        Standard deviation of the ambient level between recordings.
+    ambient_waves : int
+        Number of plane waves that make the ambient field.
+    lobe_concentration, lobe_share : float
+        Von Mises concentration of a site's loud directions and the share of energy that comes from them.
+    wave_fluctuation_db : float
+        Standard deviation of the slow wander of every single wave.
+    far_rate : float
+        Mean number of distant vehicles per recording (at most two are drawn).
+    far_level_db : float
+        Level of a distant vehicle at its loudest against the ambient level, dB.
+    wind_100hz_db : float
+        Wind noise on every microphone by itself, in the octave of 100 Hz; falls with f^-2.2.
+    self_noise_db : float
+        Electronic noise per microphone, whole band.
+    gain_mismatch_db, delay_mismatch_s : float
+        Standard deviation of the channels' gains and delays.
+    late_db : float
+        Late field of a vehicle at the mouth against its pressure at 1 m, dB.
+    late_decay_s : float
+        Reverberation time of the late field.
+    vehicle_spread_db : float
+        Standard deviation of the level of single vehicles.
+    screen_cap_db : float
+        Largest screen attenuation.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is outside `LIMITS`.
+    """
+
+    name: str
+    ambient_octaves_db: tuple[float, ...] = (52.0, 50.0, 48.0, 46.0, 44.0, 40.0, 35.0, 30.0)
+    ambient_spread_db: float = 1.5
+    ambient_waves: int = 72
+    lobe_concentration: float = 4.0
+    lobe_share: float = 0.5
+    wave_fluctuation_db: float = 2.0
+    far_rate: float = 0.4
+    far_level_db: float = -3.0
+    wind_100hz_db: float = 40.0
+    self_noise_db: float = 32.0
+    gain_mismatch_db: float = 0.5
+    delay_mismatch_s: float = 8e-6
+    late_db: float = -30.0
+    late_decay_s: float = 0.7
+    vehicle_spread_db: float = 1.5
+    screen_cap_db: float = 24.0
+
+    def __post_init__(self) -> None:
+        octaves = finite_array("ambient_octaves_db", self.ambient_octaves_db, (8,))
+        in_range("ambient_octaves_db", octaves.min(), -20.0, 100.0)
+        in_range("ambient_octaves_db", octaves.max(), -20.0, 100.0)
+        for name, (low, high) in LIMITS.items():
+            in_range(name, getattr(self, name), low, high)
+
+
+PRESETS = {preset.name: preset for preset in (Preset("street-0"),)}
+DEFAULT_PRESET = "street-0"
+
+
+def preset(name: str = DEFAULT_PRESET) -> Preset:
+    """Return a preset by its name.
+
+    Raises
+    ------
+    InvalidArgumentError
+        For an unknown name.
+
+    Examples
+    --------
+    >>> preset("street-0").ambient_waves
+    72
+    """
+    if name not in PRESETS:
+        raise InvalidArgumentError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
+    return PRESETS[name]

@@ -1,0 +1,155 @@
+"""The blind junction: two walled streets and the site's own measures.
+
+The ego stands at the origin in its own street, which runs along +x between two side walls and opens into the
+crossing street (along y) between two corners. Type A has a wall across the crossing street, type B none.
+"""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, in this order
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Plan of one junction, metres in `base_link`.
+
+    Parameters
+    ----------
+    name : str
+        Folder name in the OVAD layout.
+    corner_left_m, corner_right_m : float
+        Distance of the building corners to the left and right of the ego's axis, >= 1.
+    corner_ahead_m : float
+        How far ahead the corners stand.
+    opposite_wall_m : float or None
+        Distance ahead of the wall across the crossing street; None where there is none (type B).
+    side_wall_left_m, side_wall_right_m : float
+        Distance of the side walls of the ego's own street; not nearer than the corners.
+    street_width_m : float
+        Width of the crossing street; lanes are at a quarter and three quarters.
+    side_reflection, facade_reflection : float
+        Pressure reflection factors of the side walls and of the crossing street's facades, 0..1.
+    side_order, facade_order : int
+        Highest number of reflections followed in the ego's street and in the crossing street.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a measure is out of range or the vehicles' street has no room.
+
+    Examples
+    --------
+    >>> Site("SA1", 2.8, 2.8, 4.45, 9.9, 2.8, 2.8, 5.45).lanes_m
+    (5.8125, 8.537500000000001)
+    """
+
+    name: str
+    corner_left_m: float
+    corner_right_m: float
+    corner_ahead_m: float
+    opposite_wall_m: float | None
+    side_wall_left_m: float
+    side_wall_right_m: float
+    street_width_m: float
+    side_reflection: float = 0.8
+    facade_reflection: float = 0.8
+    side_order: int = 3
+    facade_order: int = 4
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        in_range("corner_left_m", self.corner_left_m, 1.0, 30.0)
+        in_range("corner_right_m", self.corner_right_m, 1.0, 30.0)
+        in_range("corner_ahead_m", self.corner_ahead_m, 1.0, 50.0)
+        in_range("side_wall_left_m", self.side_wall_left_m, self.corner_left_m, 60.0)
+        in_range("side_wall_right_m", self.side_wall_right_m, self.corner_right_m, 60.0)
+        in_range("street_width_m", self.street_width_m, 3.0, 40.0)
+        in_range("side_reflection", self.side_reflection, 0.0, 0.98)
+        in_range("facade_reflection", self.facade_reflection, 0.0, 0.98)
+        in_range("side_order", self.side_order, 0, 8)
+        in_range("facade_order", self.facade_order, 0, 8)
+        if self.opposite_wall_m is not None:
+            nearest = self.corner_ahead_m + self.street_width_m
+            in_range("opposite_wall_m", self.opposite_wall_m, nearest, 200.0)
+
+    @property
+    def lanes_m(self) -> tuple[float, float]:
+        """Distance ahead of the near lane (traffic from the left keeps right) and of the far lane."""
+        quarter = self.street_width_m / 4.0
+        return self.corner_ahead_m + quarter, self.corner_ahead_m + 3.0 * quarter
+
+    def sight_m(self, ahead_m: float, eye_m: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+        """Return the lateral limits (right, left) of what an eye sees between the corners, at a distance.
+
+        Examples
+        --------
+        >>> Site("SA1", 2.8, 2.8, 4.45, 9.9, 2.8, 2.8, 5.45).sight_m(8.9)
+        (-5.6, 5.6)
+        """
+        x, y = eye_m
+        reach = (ahead_m - x) / (self.corner_ahead_m - x)
+        return y + (-self.corner_right_m - y) * reach, y + (self.corner_left_m - y) * reach
+
+
+def _check_name(name: str) -> None:
+    if not name.isascii() or not name.isalnum():
+        raise InvalidArgumentError(f"name: expected letters and digits, got {name!r}")
+
+
+def site(name: str) -> Site:
+    """Return one of the five static sites: measured plans for SA1 and SB1, drawn variations for the others.
+
+    The two measured plans are those published for a type A and a type B junction (corners 2.8 m to the sides
+    and 4.45 m ahead, wall at 9.9 m; 2.78 m and 4.5 m, no wall). The rest of a site is drawn from a generator
+    seeded with its name, so that a site keeps its face from one recording to the next.
+
+    Raises
+    ------
+    InvalidArgumentError
+        For an unknown name.
+
+    Examples
+    --------
+    >>> site("SB1").opposite_wall_m is None, site("SA2") == site("SA2")
+    (True, True)
+    """
+    if name not in SITES:
+        raise InvalidArgumentError(f"site: expected one of {', '.join(SITES)}, got {name!r}")
+    rng = site_generator(name)
+    with_wall = name.startswith("SA")
+    width, ahead, street = (2.8, 4.45, 5.45) if with_wall else (2.78, 4.5, 6.0)
+    spread = 0.0 if name.endswith("1") else 0.25
+    left, right = width + spread * rng.uniform(-1.0, 1.0, 2)
+    ahead += spread * rng.uniform(-1.0, 1.0)
+    street += 2.0 * spread * rng.uniform(-1.0, 1.0)
+    set_back = rng.uniform(0.0, 0.4, 2)
+    return Site(
+        name=name,
+        corner_left_m=left,
+        corner_right_m=right,
+        corner_ahead_m=ahead,
+        opposite_wall_m=ahead + street if with_wall else None,
+        side_wall_left_m=left + set_back[0],
+        side_wall_right_m=right + set_back[1],
+        street_width_m=street,
+        side_reflection=rng.uniform(0.75, 0.9),
+        facade_reflection=rng.uniform(0.7, 0.85),
+    )
+
+
+def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:
+    """Return a generator that depends on the site alone: on the place, not on what happens there.
+
+    Examples
+    --------
+    >>> site_generator("SA1").random() == site_generator("SA1").random()
+    True
+    """
+    digest = hashlib.sha256(f"worldstate {name} {purpose}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "little"))

@@ -1,0 +1,87 @@
+"""Many sources that do not move, heard by all microphones at once.
+
+Delays across an array are a few milliseconds at most, so every source is a phase ramp per block of a weighted
+overlap-add; all sources reach all microphones in one batched matrix product.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, rfft
+
+from .diffraction import SPEED_OF_SOUND_MPS
+
+BLOCK = 4096
+HOP = BLOCK // 2
+BLOCKS_AT_ONCE = 16
+
+
+def plane_wave_delays(directions: NDArray[np.float64], offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Delay of plane waves at every microphone against the array's centre, shape (Q, M), s.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (Q, 3)
+        Unit vectors towards the sources.
+    offsets_m : ndarray, shape (M, 3)
+        Microphones from the array's centre.
+
+    Examples
+    --------
+    >>> plane_wave_delays(np.array([[1.0, 0, 0]]), np.array([[0.343, 0, 0]]))
+    array([[-0.001]])
+    """
+    return -(directions @ offsets_m.T) / SPEED_OF_SOUND_MPS
+
+
+def add_static(
+    out: NDArray[np.float32],
+    signals: NDArray[np.float32],
+    delays_s: NDArray[np.float64],
+    sample_rate_hz: float,
+    gains: NDArray[np.float64] | None = None,
+) -> None:
+    """Add delayed copies of `signals` to every microphone.
+
+    Parameters
+    ----------
+    out : ndarray, shape (M, n)
+        Added to in place.
+    signals : ndarray, shape (Q, n)
+        Source signals as they are at the array's centre.
+    delays_s : ndarray, shape (Q, M)
+        Relative delays; small against a block (0.08 s at 48 kHz).
+    sample_rate_hz : float
+        Rate in Hz.
+    gains : ndarray, shape (Q, M), optional
+        Amplitude factors; one if not given.
+    """
+    frequencies = np.fft.rfftfreq(BLOCK, 1.0 / sample_rate_hz)
+    steering = np.exp(-2j * np.pi * frequencies[:, None, None] * delays_s).astype(np.complex64)
+    if gains is not None:
+        steering *= gains.astype(np.float32)
+    padded = np.zeros((out.shape[0], _blocks(out.shape[1]) * HOP + HOP), np.float32)
+    for start, spectra in _analyse(signals):
+        heard = np.matmul(spectra, steering).transpose(1, 2, 0)  # (blocks, M, F)
+        for i, block in enumerate(irfft(heard, BLOCK)):
+            at = (start + i) * HOP
+            padded[:, at : at + BLOCK] += block
+    out += padded[:, HOP : HOP + out.shape[1]]
+
+
+def _blocks(samples: int) -> int:
+    """Blocks that cover `samples`, beginning one hop before the first."""
+    return -(-samples // HOP) + 1
+
+
+def _analyse(signals: NDArray[np.float32]) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+    """Spectra (F, blocks, Q) of Hann-windowed blocks, which sum to the signal, a few blocks at a time."""
+    window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(BLOCK) / BLOCK)).astype(np.float32)
+    blocks = _blocks(signals.shape[1])
+    padded = np.zeros((signals.shape[0], (blocks + 1) * HOP), np.float32)
+    padded[:, HOP : HOP + signals.shape[1]] = signals
+    for start in range(0, blocks, BLOCKS_AT_ONCE):
+        stop = min(start + BLOCKS_AT_ONCE, blocks)
+        cut = np.stack([padded[:, i * HOP : i * HOP + BLOCK] for i in range(start, stop)])
+        yield start, np.ascontiguousarray(rfft(cut * window, axis=-1).transpose(2, 0, 1))
