@@ -1,0 +1,77 @@
+r"""The Markov chain of explanations in continuous time.
+
+Its states are, in order: hidden in direction 1 .. K, in view having come from direction 1 .. K, in view from
+elsewhere, none. All visible states leave at the same rates, so the chain lumps exactly onto (hidden_1 ..
+hidden_K, visible, none) and, with equal rates for all directions, onto the three explanations. What the finer
+chain adds is the answer to "was that the one we heard before?".
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from worldstate.values import NANOSECONDS_PER_SECOND
+
+RatesHz = tuple[float, float, float, float, float, float]
+"""arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""
+
+# After that long the chain has forgotten everything; larger exponents would only cost digits.
+LONGEST_STEP_S = 1000.0
+
+
+@lru_cache(maxsize=64)
+def generator(rates_hz: RatesHz, directions: int) -> NDArray[np.float64]:
+    r"""Return Q, shape (2K + 2, 2K + 2), 1/s: row i holds the rates out of state i and sums to zero.
+
+    Examples
+    --------
+    >>> generator((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 1)
+    array([[-0.4 ,  0.3 ,  0.  ,  0.1 ],
+           [ 0.05, -0.35,  0.  ,  0.3 ],
+           [ 0.05,  0.  , -0.35,  0.3 ],
+           [ 0.05,  0.  ,  0.05, -0.1 ]])
+    """
+    arrival, emergence, departure, reocclusion, visible_arrival, visible_departure = rates_hz
+    hidden, emerged = np.arange(directions), np.arange(directions, 2 * directions)
+    elsewhere, none = 2 * directions, 2 * directions + 1
+    rate = np.zeros((none + 1, none + 1))
+    rate[hidden, emerged] = emergence
+    rate[hidden, none] = departure
+    rate[directions:none, :directions] = reocclusion / directions
+    rate[directions:none, none] = visible_departure
+    rate[none, hidden] = arrival
+    rate[none, elsewhere] = visible_arrival
+    np.fill_diagonal(rate, -rate.sum(axis=1))
+    rate.flags.writeable = False
+    return rate
+
+
+@lru_cache(maxsize=256)
+def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> NDArray[np.float64]:
+    r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only.
+
+    Examples
+    --------
+    >>> transition((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2, 100_000_000).sum(axis=1).round(12)
+    array([1., 1., 1., 1., 1., 1.])
+    """
+    step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
+    matrix: NDArray[np.float64] = np.maximum(expm(generator(rates_hz, directions) * step_s), 0.0)
+    matrix /= matrix.sum(axis=1, keepdims=True)
+    matrix.flags.writeable = False
+    return matrix
+
+
+@lru_cache(maxsize=64)
+def equilibrium(rates_hz: RatesHz, directions: int) -> NDArray[np.float64]:
+    """Return where the chain settles from "none", shape (2K + 2,).
+
+    Examples
+    --------
+    >>> equilibrium((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2).round(3)
+    array([0.088, 0.088, 0.076, 0.076, 0.084, 0.588])
+    """
+    settled: NDArray[np.float64] = transition(rates_hz, directions, 10**12)[-1]
+    return settled

@@ -1,0 +1,99 @@
+r"""Constant velocity seen from a standing ego, in modified polar coordinates.
+
+.. math:: x = (\theta,\; \dot\theta,\; \rho = \dot r / r = -1/\mathrm{TTA},\; \log r)
+
+Bearing and looming are linear in it, and the range, which neither of them tells, stands apart. From
+
+.. math:: \ddot\theta = -2\rho\dot\theta, \quad \dot\rho = \dot\theta^2 - \rho^2, \quad (\log r)^\cdot = \rho
+
+follows a closed form: in units of the first range the vehicle moves from (1, 0) to
+:math:`(a, b) = (1 + \rho t,\; \dot\theta t)`, and with :math:`q = a^2 + b^2`
+
+.. math::
+    \theta' = \theta + \operatorname{atan2}(b, a), \quad \dot\theta' = \dot\theta / q, \quad
+    \rho' = (a\rho + b\dot\theta) / q, \quad \log r' = \log r + \tfrac12 \log q.
+
+References
+----------
+Aidala and Hammel, "Utilization of modified polar coordinates for bearings-only tracking", 1983.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
+
+# The vehicle passes through the array itself at q = 0; nothing that drives comes that close.
+_LEAST_Q = 1e-3
+
+
+def propagate(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
+    """Return the state (theta, theta_dot, rho, log r) after `step_s`, shape (4,); theta is not wrapped.
+
+    Examples
+    --------
+    >>> propagate(np.array([0.0, 0.0, -0.5, np.log(20.0)]), 1.0).round(3)
+    array([ 0.   ,  0.   , -1.   ,  2.303])
+    """
+    theta, omega, rho, log_range = state.tolist()
+    a, b = 1.0 + rho * step_s, omega * step_s
+    q = max(a * a + b * b, _LEAST_Q)
+    return np.array(
+        [theta + math.atan2(b, a), omega / q, (a * rho + b * omega) / q, log_range + 0.5 * math.log(q)]
+    )
+
+
+def jacobian(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
+    """Return d propagate / d state, shape (4, 4).
+
+    Examples
+    --------
+    >>> jacobian(np.array([0.0, 0.0, 0.0, 3.0]), 0.1) + 0.0
+    array([[1. , 0.1, 0. , 0. ],
+           [0. , 1. , 0. , 0. ],
+           [0. , 0. , 1. , 0. ],
+           [0. , 0. , 0.1, 1. ]])
+    """
+    _, omega, rho, _ = state.tolist()
+    t = step_s
+    a, b = 1.0 + rho * t, omega * t
+    q = max(a * a + b * b, _LEAST_Q)
+    radial = a * rho + b * omega
+    u, v = a / q, b / q
+    return np.array(
+        [
+            [1.0, u * t, -v * t, 0.0],
+            [0.0, (1.0 - 2.0 * b * v) / q, -2.0 * omega * u * t / q, 0.0],
+            [0.0, 2.0 * (omega - radial * v) * t / q, (1.0 + 2.0 * (rho - radial * u) * t) / q, 0.0],
+            [0.0, v * t, u * t, 1.0],
+        ]
+    )
+
+
+def process_noise(acceleration_psd: float, range_m: float, step_s: float) -> NDArray[np.float64]:
+    r"""Return Q, shape (4, 4), of a white acceleration: at range r it turns and closes by a/r.
+
+    Parameters
+    ----------
+    acceleration_psd : float
+        Spectral density per axis, m^2/s^3.
+    range_m : float
+        Range that accelerations are divided by, m.
+    step_s : float
+        Time step, s.
+
+    Examples
+    --------
+    >>> process_noise(4.0, 20.0, 1.0).round(4)
+    array([[0.0033, 0.005 , 0.    , 0.    ],
+           [0.005 , 0.01  , 0.    , 0.    ],
+           [0.    , 0.    , 0.01  , 0.005 ],
+           [0.    , 0.    , 0.005 , 0.0033]])
+    """
+    q, t = acceleration_psd / range_m**2, step_s
+    twice, once, rate = q * t**3 / 3.0, q * t**2 / 2.0, q * t
+    return np.array(
+        [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
+    )

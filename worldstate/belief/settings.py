@@ -1,0 +1,124 @@
+"""The numbers of the filter, each with what it stands for."""
+
+from dataclasses import dataclass, fields
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+
+@dataclass(frozen=True, slots=True)
+class FilterSettings:
+    """How much to believe of what, and when to say that something is there.
+
+    Parameters
+    ----------
+    window_s : float
+        Length of the window that a signature is computed on. Windows that overlap repeat most of their
+        samples, so a signature weighs kappa = (time since the last one) / window, at most 1: 0.1 at a
+        0.1-s hop. Counted in full, one second of sound would be believed ten times over.
+    look_interval_s : float
+        Looks of the co-evidence channel closer in time than this repeat each other's misses (same object,
+        same light, same detector), so a look weighs (time since the last one) / interval, at most 1.
+    birth_probability, death_probability : float
+        A hidden entity is born when P(hidden on its side) reaches the first, or an advisory names its
+        side, and dropped when its existence falls below the second.
+    rearm_s : float
+        No birth on a side that long after a hand-over: the window still holds the sound from before it.
+    relaxation_s : float
+        Time in which a hidden entity without news returns to where hidden vehicles are.
+    acceleration_psd : float
+        White acceleration of a moving vehicle, m^2/s^3.
+    hidden_std : tuple of float
+        Prior standard deviations of a hidden entity's (theta_dot rad/s, rho 1/s, log r).
+    hidden_inverse_tta_hz, hidden_range_m : float
+        Prior means of 1/TTA and range of a hidden entity.
+    hidden_path_probability : float
+        P(a peak heard while hidden belongs to this side's direct or diffracted path). In real hidden
+        windows 21 % of the peaks stand near the corner and 36 % anywhere on the vehicle's side; the rest
+        are images in the walls of the ego's own street.
+    hidden_bearing_std_rad, hidden_bias_std_rad : float
+        Spread of such peaks about the apparent azimuth, and how far that one may be off for as long as it
+        hides: published with the azimuth, as no averaging removes it.
+    line_of_sight_path_probability : float
+        P(a peak belongs to the direct path) in line of sight.
+    gate_sigma, gate_rad : float
+        A sighting may belong to a visible entity within so many standard deviations and so many radians.
+    handover_gate_rad : float
+        A new sighting may be a hidden entity come into view within this of its occluder's edge.
+    handover_residual : float
+        Share of P(hidden) that a hand-over leaves: the sighting may have been of another vehicle.
+    sighting_existence : float
+        Existence of an object before its first sighting is counted.
+    clutter_rate : float
+        Probability of a spurious sighting where the co-evidence states none.
+    visible_life_s : float
+        Mean time for which an entity that nobody looks at still exists in its place.
+    delete_existence, lost_std_rad : float
+        A visible entity is dropped below this existence, or once its azimuth is this uncertain.
+    reocclusion_s : float
+        A moving entity out of sight for at most this long may be the one now heard hidden nearby; it has
+        to be out of sight for `reocclusion_after_s` at least.
+    stream : str
+        Name that entity ids are derived from: the same stream gives the same ids.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> FilterSettings(birth_probability=0.6).window_s
+    1.0
+    """
+
+    window_s: float = 1.0
+    look_interval_s: float = 0.3
+    birth_probability: float = 0.5
+    death_probability: float = 0.1
+    rearm_s: float = 1.0
+    relaxation_s: float = 3.0
+    acceleration_psd: float = 2.0
+    hidden_std: tuple[float, float, float] = (0.15, 0.25, 0.6)
+    hidden_inverse_tta_hz: float = 0.2
+    hidden_range_m: float = 25.0
+    hidden_path_probability: float = 0.25
+    hidden_bearing_std_rad: float = 0.25
+    hidden_bias_std_rad: float = 0.17
+    line_of_sight_path_probability: float = 0.8
+    gate_sigma: float = 4.0
+    gate_rad: float = 0.35
+    handover_gate_rad: float = 0.8
+    handover_residual: float = 0.02
+    sighting_existence: float = 0.5
+    clutter_rate: float = 0.01
+    visible_life_s: float = 10.0
+    delete_existence: float = 0.05
+    lost_std_rad: float = 0.8
+    reocclusion_after_s: float = 0.5
+    reocclusion_s: float = 3.0
+    stream: str = "worldstate"
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple):
+                for number in value:
+                    in_range(field.name, number, 0.0, 1e6, open_low=True)
+            elif not isinstance(value, str):
+                high = 1.0 if field.name in _PROBABILITIES else 1e6
+                in_range(field.name, value, 0.0, high, open_low=True)
+        if self.death_probability > self.birth_probability:
+            raise InvalidArgumentError("death_probability: expected at most birth_probability")
+
+
+_PROBABILITIES = {
+    "birth_probability",
+    "death_probability",
+    "hidden_path_probability",
+    "line_of_sight_path_probability",
+    "handover_residual",
+    "sighting_existence",
+    "clutter_rate",
+    "delete_existence",
+}

@@ -1,0 +1,51 @@
+"""An approach side as the beliefs need it: where hidden vehicles are, and where they come into view."""
+
+import math
+from dataclasses import dataclass
+
+from worldstate.values import wrap_angle
+
+from .motion import MotionBelief
+from .settings import FilterSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One approach side.
+
+    Parameters
+    ----------
+    label : str
+        Direction label of the signature model.
+    edge_azimuth_rad : float
+        Edge of the occluder.
+    azimuth_rad, std_rad : float
+        Where vehicles are while it hides them.
+
+    Examples
+    --------
+    >>> round(Side("left", 0.56, 0.96, 0.35).distance_rad(-0.2), 2)
+    0.76
+    """
+
+    label: str
+    edge_azimuth_rad: float
+    azimuth_rad: float
+    std_rad: float
+
+    def distance_rad(self, azimuth_rad: float) -> float:
+        """Angle between an azimuth and the occluder's edge, >= 0."""
+        return abs(wrap_angle(azimuth_rad - self.edge_azimuth_rad))
+
+    def prior(self, settings: FilterSettings) -> MotionBelief:
+        """Return what is known of a vehicle hidden here before anything is measured of its motion."""
+        log_range = math.log(settings.hidden_range_m)
+        return MotionBelief.around(
+            (self.azimuth_rad, 0.0, -settings.hidden_inverse_tta_hz, log_range),
+            (self.std_rad, *settings.hidden_std),
+        )
+
+
+def nearest_side(sides: tuple[Side, ...], azimuth_rad: float) -> int:
+    """Return the index of the side whose edge is nearest to an azimuth."""
+    return min(range(len(sides)), key=lambda k: sides[k].distance_rad(azimuth_rad))

@@ -1,0 +1,114 @@
+"""One entity as the filter carries it."""
+
+import math
+from dataclasses import dataclass, replace
+from uuid import UUID, uuid5
+
+from worldstate.measurement import Sighting
+
+from .existence import after_time
+from .motion import MotionBelief, predict, relax
+from .settings import FilterSettings
+from .side import Side
+
+_NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
+_LABEL_GAIN = 0.3
+_PARKED_ACCELERATION = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """What is believed of one entity.
+
+    Parameters
+    ----------
+    id : str
+        UUID for life.
+    side : int
+        Index of the approach side that it is hidden on, came from, or first appeared nearest to.
+    seen : bool
+        Whether vision has it; before that its existence is read from the explanation belief.
+    existence : float
+        Existence probability.
+    motion : MotionBelief
+        Azimuth, rates, log range.
+    labels : tuple of (str, float)
+        Class probabilities, sorted by label.
+    moving : bool
+        False for what vision holds for parked.
+    sources : tuple of str
+        Modalities that contributed, sorted.
+    created_ns, updated_ns : int
+        Birth and last measurement that moved it.
+    last_seen_ns : int or None
+        Last sighting.
+    answer : {"visible", "absent", "unqueried"}
+        Last answer of the co-evidence channel about it.
+    miss_rate : float or None
+        beta of that answer.
+    approach_heard : bool
+        Whether its approach rate was ever measured.
+    was_hidden : bool
+        Whether it was ever heard before it was seen, or lost from view and heard again.
+    """
+
+    id: str
+    side: int
+    seen: bool
+    existence: float
+    motion: MotionBelief
+    labels: tuple[tuple[str, float], ...]
+    moving: bool
+    sources: tuple[str, ...]
+    created_ns: int
+    updated_ns: int
+    last_seen_ns: int | None = None
+    answer: str = "unqueried"
+    miss_rate: float | None = None
+    approach_heard: bool = False
+    was_hidden: bool = False
+
+
+def entity_id(stream: str, kind: str, number: int) -> str:
+    """Return the UUID of the n-th entity of a kind in a stream: no randomness, so the same run names alike.
+
+    Examples
+    --------
+    >>> entity_id("drive", "left", 0) == entity_id("drive", "left", 0) != entity_id("drive", "left", 1)
+    True
+    """
+    return str(uuid5(_NAMESPACE, f"{stream}/{kind}/{number}"))
+
+
+def predict_track(
+    track: Track, sides: tuple[Side, ...], hidden_share: float, step_s: float, settings: FilterSettings
+) -> Track:
+    """Return the track after a time step.
+
+    `hidden_share` is P(hidden | exists): as far as it is hidden, it stays where hidden vehicles are.
+    """
+    acceleration = settings.acceleration_psd if track.moving else _PARKED_ACCELERATION
+    motion = predict(track.motion, step_s, acceleration)
+    if track.seen:
+        existence = after_time(track.existence, step_s, settings.visible_life_s)
+        return replace(track, motion=motion, existence=existence)
+    share = -math.expm1(-step_s * hidden_share / settings.relaxation_s)
+    return replace(track, motion=relax(motion, sides[track.side].prior(settings), share))
+
+
+def relabelled(labels: tuple[tuple[str, float], ...], sighting: Sighting) -> tuple[tuple[str, float], ...]:
+    """Return class probabilities drawn a step towards what a detector just said.
+
+    Examples
+    --------
+    >>> relabelled((("car", 0.9),), Sighting(0.0, 0.01, "truck", 0.8))
+    (('car', 0.63), ('truck', 0.24))
+    """
+    kept = {label: probability * (1.0 - _LABEL_GAIN) for label, probability in labels}
+    kept[sighting.label] = kept.get(sighting.label, 0.0) + _LABEL_GAIN * sighting.score
+    return tuple(sorted((label, round(p, 12)) for label, p in kept.items() if p > 1e-3))
+
+
+def merged(sources: tuple[str, ...], source: str) -> tuple[str, ...]:
+    """Return the sorted sources with one more."""
+    return sources if source in sources else tuple(sorted((*sources, source)))

@@ -1,0 +1,208 @@
+"""The filter: predict and update of the whole world-state."""
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from worldstate.abduction.cueing import CueingPolicy
+from worldstate.abduction.risk_map import PlattMap
+from worldstate.belief.explanation import ExplanationBelief
+from worldstate.belief.settings import FilterSettings
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.measurement import Measurement
+from worldstate.memory import Memory, first_memory, priors_of
+from worldstate.publishing import cues_of, entity_of, relations_of
+from worldstate.state import Context, WorldState
+from worldstate.step import Ground, advance, alarmed, alert, listen, renew, sides_of, watch, weights_of
+from worldstate.values import NotUsable, nanoseconds
+
+# A step and the stamp that it aims at may differ by the rounding of sample counts.
+STAMP_SLACK_NS = 5_000_000
+
+
+def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
+    """Return a policy for trying things out: no false-alarm budget was ever measured for it (alpha 0).
+
+    Examples
+    --------
+    >>> uncalibrated_policy().gamma
+    0.9
+    """
+    prior = (1.0 / (directions + 2),) * (directions + 2)
+    return CueingPolicy(0.9, 3, 0.0, prior, PlattMap(-1.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class WorldFilter:
+    """Keeps S_t: `predict` and `update` return a new filter, `state` is the snapshot.
+
+    Parameters
+    ----------
+    context : Context
+        Rates, occluders, ego motion.
+    policy : CueingPolicy
+        Threshold, sustained rule and risk map; a model file brings one.
+    settings : FilterSettings
+        Noise levels, gates, births and deaths.
+    start_ns : int
+        Time of the first belief, ns on the clock of the measurements.
+    memory : Memory, optional
+        What another filter carried; the first belief where not given.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the policy and the context speak of different numbers of directions.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.co_evidence import Absent
+    >>> from worldstate.abduction.evidence import SignatureEvidence
+    >>> world, heard = WorldFilter(), SignatureEvidence(("left", "right"), (4.0, 0.0), 2.0, 0.0)
+    >>> for hop in range(1, 11):
+    ...     look = Measurement(hop * 10**8, heard, Absent(0.04), NotUsable("-"), NotUsable("-"))
+    ...     world = world.predict(0.1).update(look)
+    >>> [(entity.status, entity.direction) for entity in world.state.entities]
+    [('hidden', 'left')]
+    >>> world.state.risk > 0.5
+    True
+    """
+
+    context: Context = field(default_factory=Context)
+    policy: CueingPolicy = field(default_factory=uncalibrated_policy)
+    settings: FilterSettings = field(default_factory=FilterSettings)
+    start_ns: int = 0
+    memory: Memory | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        expected = len(self.context.directions) + 2
+        if len(self.policy.reference_prior) != expected:
+            got = len(self.policy.reference_prior)
+            raise InvalidArgumentError(
+                f"policy: expected {expected} reference priors for {self.context.directions}, got {got}"
+            )
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the belief, ns."""
+        return self._memory.stamp_ns
+
+    @property
+    def explanation(self) -> ExplanationBelief:
+        """Filtered probabilities of the explanations."""
+        return self._memory.explanation
+
+    @property
+    def statistic(self) -> float | None:
+        """Statistic s of the last window, in [0, 1]; None before the first."""
+        instant = self._memory.instant
+        return None if instant is None else min(instant.hidden_total, 1.0)
+
+    @property
+    def log_lambda(self) -> float | None:
+        """Log Lambda of the last window, nats; None before the first."""
+        instant = self._memory.instant
+        return None if instant is None else instant.log_lambda
+
+    @property
+    def risk(self) -> float:
+        """Calibrated risk of a road user hidden in any direction."""
+        return float(self.policy.risk_map(min(self.explanation.hidden_total, 1.0)))
+
+    @cached_property
+    def state(self) -> WorldState:
+        """The snapshot S_t."""
+        memory, context, settings = self._memory, self.context, self.settings
+        return WorldState(
+            stamp_ns=memory.stamp_ns,
+            seq=memory.seq,
+            entities=tuple(
+                entity_of(track, memory.explanation, context, settings) for track in memory.tracks
+            ),
+            relations=tuple(
+                edge
+                for track in memory.tracks
+                for edge in relations_of(track, memory.explanation, context, memory.stamp_ns)
+            ),
+            context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
+            cues=cues_of(memory, self._ground, self.risk, alarmed(memory)),
+        )
+
+    def predict(self, dt_s: float) -> "WorldFilter":
+        """Return the filter `dt_s` seconds later, nothing having been measured.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the step is negative or not finite.
+        """
+        return self.predict_to(self.stamp_ns + nanoseconds(in_range("dt_s", dt_s, 0.0, 1e10)))
+
+    def predict_to(self, stamp_ns: int) -> "WorldFilter":
+        """Return the filter at a later time, ns.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If that time is earlier than the belief's.
+        """
+        if stamp_ns < self.stamp_ns - STAMP_SLACK_NS:
+            raise InvalidArgumentError(
+                f"stamp_ns: expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
+            )
+        if stamp_ns <= self.stamp_ns:
+            return self
+        return replace(self, memory=advance(self._memory, stamp_ns, self._ground))
+
+    def update(self, measurement: Measurement) -> "WorldFilter":
+        """Return the filter after a measurement, predicted to its time first where that was not done.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the time stamp is earlier than the belief's or than the source's last one, the directions are
+            not those of the context, or a number is not finite.
+        """
+        _check(measurement, self.context, dict(self._memory.last_ns))
+        world = self.predict_to(measurement.stamp_ns)
+        memory, ground = world._memory, world._ground
+        weights = weights_of(memory, measurement, self.start_ns, self.settings)
+        memory = listen(memory, measurement, weights, ground)
+        memory = watch(memory, measurement, weights, ground)
+        memory = alert(memory, measurement, ground)
+        return replace(world, memory=renew(memory, measurement, ground))
+
+    @cached_property
+    def _memory(self) -> Memory:
+        return self.memory or first_memory(self.context, self.policy, self.start_ns)
+
+    @cached_property
+    def _ground(self) -> Ground:
+        return Ground(self.context, self.policy, self.settings, sides_of(self.context))
+
+
+def _check(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> None:
+    """Refuse what would poison the belief: the engine takes NaN without a word."""
+    if measurement.signature.directions != context.directions:
+        raise InvalidArgumentError(
+            f"signature: expected the directions {context.directions}, got {measurement.signature.directions}"
+        )
+    before_ns = last_ns.get(measurement.source)
+    if before_ns is not None and measurement.stamp_ns < before_ns:
+        raise InvalidArgumentError(
+            f"stamp_ns: expected time stamps in order, got {measurement.stamp_ns} ns after {before_ns} ns"
+        )
+    if not isinstance(measurement.bearing, NotUsable):
+        _check_angle("bearing", measurement.bearing.azimuth_rad, measurement.bearing.std_rad)
+    if not isinstance(measurement.approach, NotUsable):
+        in_range("inverse_tta_hz", measurement.approach.inverse_tta_hz, -1e3, 1e3)
+        in_range("std_hz", measurement.approach.std_hz, 0.0, 1e6, open_low=True)
+    for i, sighting in enumerate(measurement.sightings):
+        _check_angle(f"sightings[{i}]", sighting.azimuth_rad, sighting.std_rad)
+        in_range(f"sightings[{i}].score", sighting.score, 0.0, 1.0)
+
+
+def _check_angle(name: str, azimuth_rad: float, std_rad: float) -> None:
+    in_range(f"{name}.azimuth_rad", azimuth_rad, -math.pi, math.pi)
+    in_range(f"{name}.std_rad", std_rad, 0.0, 1e3, open_low=True)

@@ -1,0 +1,126 @@
+"""From beliefs to the snapshot: what of them is said aloud, and how."""
+
+import math
+from collections.abc import Sequence
+
+from worldstate.belief.explanation import ExplanationBelief
+from worldstate.belief.hearing import hidden_share
+from worldstate.belief.motion import MotionBelief
+from worldstate.belief.polar import AZIMUTH_RATE, LOG_RANGE
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.track import Track
+from worldstate.memory import Memory, priors_of
+from worldstate.state import EGO, Classification, Context, Entity, Relation, RiskCue, Visibility
+from worldstate.step import Ground
+
+# A range whose logarithm is less certain than this was never measured, only assumed.
+_KNOWN_LOG_RANGE_STD = 0.25
+
+
+def entity_of(
+    track: Track, explanation: ExplanationBelief, context: Context, settings: FilterSettings
+) -> Entity:
+    """Return the public face of a track."""
+    share, existence = hidden_share(track, explanation), existence_of(track, explanation)
+    hidden, motion = share >= 0.5, track.motion
+    range_m = _range(motion, hidden)
+    return Entity(
+        id=track.id,
+        status="hidden" if hidden else "visible" if track.seen else "emerged",
+        existence_probability=existence,
+        hidden_probability=share * existence,
+        classification=tuple(Classification(label, probability) for label, probability in track.labels),
+        moving=track.moving,
+        direction=context.directions[track.side],
+        azimuth_rad=motion.azimuth_rad,
+        azimuth_std_rad=published_std(motion, hidden, settings),
+        azimuth_rate_rad_s=None if hidden else float(motion.mean[AZIMUTH_RATE]),
+        range_m=range_m,
+        position_m=None if range_m is None else _position(motion, range_m),
+        inverse_tta_hz=motion.inverse_tta_hz if track.approach_heard else None,
+        inverse_tta_std_hz=motion.inverse_tta_std_hz if track.approach_heard else None,
+        tta_s=time_to_arrival(track),
+        visibility=Visibility(track.answer, track.miss_rate),
+        sources=track.sources,
+        created_ns=track.created_ns,
+        updated_ns=track.updated_ns,
+        last_seen_ns=track.last_seen_ns,
+    )
+
+
+def existence_of(track: Track, explanation: ExplanationBelief) -> float:
+    """Return the existence of a track: its own once vision has it, before that what its side's sound says."""
+    if track.seen:
+        return track.existence
+    return min(explanation.hidden[track.side] + explanation.emerged[track.side], 1.0)
+
+
+def time_to_arrival(track: Track) -> float | None:
+    """Return TTA in seconds, where an approach was heard and is positive by more than one deviation."""
+    rate = track.motion.inverse_tta_hz
+    return 1.0 / rate if track.approach_heard and rate > track.motion.inverse_tta_std_hz else None
+
+
+def published_std(motion: MotionBelief, hidden: bool, settings: FilterSettings) -> float:
+    """Return the azimuth's standard deviation; while hidden, what is heard comes round the corner."""
+    if not hidden:
+        return motion.azimuth_std_rad
+    return math.hypot(motion.azimuth_std_rad, settings.hidden_bias_std_rad)
+
+
+def relations_of(
+    track: Track, explanation: ExplanationBelief, context: Context, stamp_ns: int
+) -> list[Relation]:
+    """Return the edges of one entity: to what hides it or hid it, and to the ego vehicle it approaches."""
+    occluder, edges = context.occluders[track.side].id, []
+    if not track.seen:
+        share = hidden_share(track, explanation)
+        edges.append(Relation(track.id, occluder, "occluded_by", share, stamp_ns))
+    elif track.was_hidden:
+        edges.append(Relation(track.id, occluder, "emerged_from", 1.0, stamp_ns))
+    if track.approach_heard:
+        deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
+        closing = 0.5 * math.erfc(-deviations / math.sqrt(2.0))
+        edges.append(Relation(track.id, EGO, "approaching", closing, stamp_ns))
+    return edges
+
+
+def cues_of(
+    memory: Memory, ground: Ground, hazard_risk: float, alarmed: Sequence[bool]
+) -> tuple[RiskCue, ...]:
+    """Return one risk cue per side, none before the first measurement."""
+    if memory.instant is None:
+        return ()
+    return tuple(_cue(k, memory, ground, hazard_risk, named) for k, named in enumerate(alarmed))
+
+
+def _cue(k: int, memory: Memory, ground: Ground, hazard_risk: float, named: bool) -> RiskCue:
+    explanation, side, instant = memory.explanation, ground.sides[k], memory.instant
+    assert instant is not None
+    track = next((t for t in memory.tracks if not t.seen and t.side == k), None)
+    motion = side.prior(ground.settings) if track is None else track.motion
+    share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
+    return RiskCue(
+        direction=side.label,
+        azimuth_rad=motion.azimuth_rad,
+        azimuth_std_rad=published_std(motion, True, ground.settings),
+        risk=hazard_risk * share,
+        confidence=share,
+        statistic=min(instant.hidden_total, 1.0),
+        log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
+        hypotheses=priors_of(explanation),
+        advisory=named,
+        alpha=ground.policy.alpha or None,
+        entity_id=None if track is None else track.id,
+        horizon_s=None if track is None else time_to_arrival(track),
+    )
+
+
+def _range(motion: MotionBelief, hidden: bool) -> float | None:
+    known = not hidden and math.sqrt(motion.covariance[LOG_RANGE, LOG_RANGE]) < _KNOWN_LOG_RANGE_STD
+    return math.exp(motion.mean[LOG_RANGE]) if known else None
+
+
+def _position(motion: MotionBelief, range_m: float) -> tuple[float, float, float]:
+    azimuth = motion.azimuth_rad
+    return range_m * math.cos(azimuth), range_m * math.sin(azimuth), 0.0

@@ -1,0 +1,150 @@
+"""One step of the filter as pure functions: listen, watch, alert, renew."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from worldstate.abduction.cueing import CueingPolicy
+from worldstate.abduction.posterior import abduce
+from worldstate.belief.hearing import hear, hidden_share
+from worldstate.belief.lifecycle import renew_hidden
+from worldstate.belief.seeing import log_co_evidence, look, surviving
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.side import Side
+from worldstate.belief.track import predict_track
+from worldstate.measurement import Measurement
+from worldstate.memory import Memory, priors_of
+from worldstate.state import Context
+from worldstate.values import NANOSECONDS_PER_SECOND, seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What does not change while the filter runs."""
+
+    context: Context
+    policy: CueingPolicy
+    settings: FilterSettings
+    sides: tuple[Side, ...]
+
+    @property
+    def view_half_angle_rad(self) -> float:
+        """Half the field of view of the co-evidence channel."""
+        return self.context.view_half_angle_rad
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """How much of a measurement is news: that of the sound, and that of the look, in [0, 1]."""
+
+    sound: float
+    look: float
+
+
+def sides_of(context: Context) -> tuple[Side, ...]:
+    """Return the approach sides of a context."""
+    return tuple(
+        Side(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
+        for o in context.occluders
+    )
+
+
+def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
+    """Return kappa of the sound and of the look, from the time since the source's last measurement."""
+    before_ns = dict(memory.last_ns).get(measurement.source, start_ns)
+    elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
+    return Weights(min(elapsed_s / settings.window_s, 1.0), min(elapsed_s / settings.look_interval_s, 1.0))
+
+
+def advance(memory: Memory, stamp_ns: int, ground: Ground) -> Memory:
+    """Return the memory at a later time, nothing having been measured."""
+    step_ns, explanation = stamp_ns - memory.stamp_ns, memory.explanation
+    tracks = tuple(
+        predict_track(
+            track, ground.sides, hidden_share(track, explanation), seconds(step_ns), ground.settings
+        )
+        for track in memory.tracks
+    )
+    return replace(
+        memory,
+        stamp_ns=stamp_ns,
+        explanation=explanation.predict(ground.context.rates.values_hz, step_ns),
+        tracks=surviving(tracks, ground.settings),
+    )
+
+
+def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:
+    """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
+    explanation, predicted = memory.explanation, priors_of(memory.explanation)
+    if weights.sound > 0.0:
+        answer = log_co_evidence(
+            measurement.co_evidence, memory.tracks, ground.sides, ground.view_half_angle_rad, weights.look
+        )
+        explanation = explanation.update(measurement.signature, weights.sound, answer)
+    tracks = hear(memory.tracks, measurement, explanation, weights.sound, ground.settings)
+    return replace(memory, explanation=explanation, tracks=tracks, predicted=predicted)
+
+
+def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:
+    """Return the memory after the sightings, the empty looks and the hand-overs they bring."""
+    seen = look(
+        memory.tracks,
+        memory.explanation,
+        measurement,
+        ground.sides,
+        ground.view_half_angle_rad,
+        weights.look,
+        memory.sighted,
+        ground.settings,
+    )
+    handover_ns = tuple(
+        measurement.stamp_ns if k in seen.handed_over else before_ns
+        for k, before_ns in enumerate(memory.handover_ns)
+    )
+    return replace(
+        memory,
+        tracks=surviving(seen.tracks, ground.settings),
+        explanation=seen.explanation,
+        handover_ns=handover_ns,
+        sighted=seen.born,
+    )
+
+
+def alert(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
+    """Return the memory after the sustained rule has taken in this window's statistic."""
+    log_prior = np.log(ground.policy.reference_prior)
+    instant = abduce(log_prior, measurement.signature, measurement.co_evidence)
+    rule = memory.rule.advance(ground.policy.exceeded(instant.hidden_total))
+    return replace(memory, instant=instant, rule=rule)
+
+
+def alarmed(memory: Memory) -> tuple[bool, ...]:
+    """Return for each side whether the advisory names it: the likeliest one while the rule is in alarm."""
+    hidden = memory.explanation.hidden
+    largest = max(hidden)
+    return tuple(memory.rule.alarm and p >= largest for p in hidden)
+
+
+def renew(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
+    """Return the memory after births and deaths of hidden entities, the measurement counted."""
+    rearm_ns = ground.settings.rearm_s * NANOSECONDS_PER_SECOND
+    hidden = renew_hidden(
+        memory.tracks,
+        memory.explanation,
+        memory.births,
+        alarmed(memory),
+        [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
+        ground.sides,
+        memory.stamp_ns,
+        measurement.source,
+        ground.settings,
+    )
+    last_ns = dict(memory.last_ns) | {measurement.source: measurement.stamp_ns}
+    return replace(
+        memory,
+        tracks=hidden.tracks,
+        explanation=hidden.explanation,
+        births=hidden.births,
+        seq=memory.seq + 1,
+        last_ns=tuple(sorted(last_ns.items())),
+    )
