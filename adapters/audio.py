@@ -65,7 +65,7 @@ class AudioSource:
         Raises
         ------
         InvalidArgumentError
-            If `frames` is below one.
+            If `frames` is below one or the recording is closed.
         InputFileError
             If a sample is NaN or infinite, or the data ends before the promised length.
         """
@@ -100,6 +100,8 @@ class AudioSource:
         return self._read(self.sample_rate_hz)
 
     def _seek(self, frame: int) -> None:
+        if self._file.closed:
+            raise InvalidArgumentError(f"{self.path}: expected an open recording, it is closed")
         try:
             self._file.seek(frame)
         except soundfile.SoundFileError as error:

@@ -93,9 +93,9 @@ def _w64_data(file: BinaryIO) -> DataSize | None:
         if len(header) < 24:
             return None
         name, size = struct.unpack("<4s12xQ", header)
-        if size < 24 or size >= 1 << 62:
-            return None
         if name == b"data":
             return DataSize(size - 24, _remaining(file))
+        if not 24 <= size <= _remaining(file) + 24:
+            return None
         file.seek(size - 24 + -size % 8, os.SEEK_CUR)
     return None
