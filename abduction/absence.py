@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.checks import finite_array, in_range
-from worldstate.errors import InputFileError, InvalidArgumentError, WorldstateError
+from worldstate.errors import InputFileError, InvalidArgumentError
 
-from .schema import check_schema
+from .schema import check_schema, read_numbers, read_rows, schema_stamp
 
 SCHEMA = "worldstate.MissRateTable"
 VERSION = "1.0.0"
@@ -82,8 +82,7 @@ class MissRateTable:
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values with the schema's name and version."""
         return {
-            "schema": SCHEMA,
-            "version": VERSION,
+            **schema_stamp(SCHEMA, VERSION),
             "azimuth_deg": list(self.azimuth_deg),
             "degradation": list(self.degradation),
             "beta": _lists(self.beta),
@@ -101,17 +100,19 @@ class MissRateTable:
         SchemaVersionError
             If the major version is another one.
         """
-        fields: Mapping[str, Any] = check_schema(data, SCHEMA, VERSION, source)
+        fields = check_schema(data, SCHEMA, VERSION, source)
+        classes = fields.get("per_class", {})
+        if not isinstance(classes, Mapping):
+            raise InputFileError(source, "per_class: expected an object")
         try:
-            per_class = {str(label): _rows(rows) for label, rows in dict(fields.get("per_class", {})).items()}
-            azimuth_deg, degradation = _numbers(fields["azimuth_deg"]), _numbers(fields["degradation"])
-            return cls(azimuth_deg, degradation, _rows(fields["beta"]), per_class)
-        except KeyError as error:
-            raise InputFileError(source, f"expected a key {error}") from error
-        except WorldstateError as error:
+            return cls(
+                read_numbers(fields.get("azimuth_deg"), "azimuth_deg"),
+                read_numbers(fields.get("degradation"), "degradation"),
+                read_rows(fields.get("beta"), "beta"),
+                {str(label): read_rows(rows, f"beta of {label}") for label, rows in classes.items()},
+            )
+        except InvalidArgumentError as error:
             raise InputFileError(source, str(error)) from error
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputFileError(source, f"expected a table of numbers: {error}") from error
 
 
 def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
@@ -150,14 +151,6 @@ def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
         raise InvalidArgumentError(f"{name}: expected miss rates in [0, 1]")
     if (np.diff(rates, axis=0) < 0).any() or (np.diff(rates, axis=1) < 0).any():
         raise InvalidArgumentError(f"{name}: expected miss rates that never fall with azimuth or degradation")
-
-
-def _numbers(values: Any) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
-
-
-def _rows(rows: Any) -> Rows:
-    return tuple(_numbers(row) for row in rows)
 
 
 def _lists(rows: Rows) -> list[list[float]]:

@@ -14,6 +14,7 @@ from worldstate.checks import finite_array, in_range
 from worldstate.errors import InvalidArgumentError
 
 from .risk_map import RiskMap, risk_map_from_dict
+from .schema import read_number, read_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,21 +121,23 @@ class CueingPolicy:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "CueingPolicy":
+    def from_dict(cls, data: object) -> "CueingPolicy":
         """Return the policy that `to_dict` wrote; unknown keys are ignored.
 
         Raises
         ------
         InvalidArgumentError
-            If a number is out of range; KeyError or TypeError where one is missing or none.
+            If something is missing, of the wrong type or out of range.
         """
+        if not isinstance(data, Mapping):
+            raise InvalidArgumentError("policy: expected an object")
         return cls(
-            gamma=float(data["gamma"]),
-            sustain_hops=data["sustain_hops"],
-            alpha=float(data["alpha"]),
-            reference_prior=tuple(float(p) for p in data["reference_prior"]),
-            risk_map=risk_map_from_dict(data["risk_map"]),
-            miss_rate=float(data["miss_rate"]),
+            gamma=read_number(data.get("gamma"), "gamma"),
+            sustain_hops=_check_sustain_hops(data.get("sustain_hops")),
+            alpha=read_number(data.get("alpha"), "alpha"),
+            reference_prior=read_numbers(data.get("reference_prior"), "reference_prior"),
+            risk_map=risk_map_from_dict(data.get("risk_map")),
+            miss_rate=read_number(data.get("miss_rate"), "miss_rate"),
         )
 
 
@@ -235,7 +238,7 @@ def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1
     return np.isin(finite_array("probabilities", probabilities, (None, None)).argmax(axis=1), hazard_columns)
 
 
-def _check_sustain_hops(sustain_hops: int) -> int:
+def _check_sustain_hops(sustain_hops: object) -> int:
     if not isinstance(sustain_hops, int | np.integer) or isinstance(sustain_hops, bool) or sustain_hops < 1:
-        raise InvalidArgumentError(f"sustain_hops: expected a whole number >= 1, got {sustain_hops!r}")
+        raise InvalidArgumentError(f"sustain_hops: expected a whole number >= 1, got {sustain_hops!r:.40}")
     return int(sustain_hops)

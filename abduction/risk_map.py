@@ -11,6 +11,7 @@ from worldstate.checks import finite_array
 from worldstate.errors import InvalidArgumentError
 
 from .platt import fit_sigmoid, sigmoid
+from .schema import read_number, read_numbers
 
 
 class RiskMap(Protocol):
@@ -171,7 +172,7 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
     return PlattMap(slope, offset)
 
 
-def risk_map_from_dict(data: Mapping[str, Any]) -> RiskMap:
+def risk_map_from_dict(data: object) -> RiskMap:
     """Return the map that `to_dict` wrote.
 
     Raises
@@ -184,11 +185,15 @@ def risk_map_from_dict(data: Mapping[str, Any]) -> RiskMap:
     >>> risk_map_from_dict({"kind": "platt", "slope": -1.0, "offset": 0.0})
     PlattMap(slope=-1.0, offset=0.0)
     """
-    if data["kind"] == "isotonic":
-        return IsotonicMap(tuple(map(float, data["statistics"])), tuple(map(float, data["risks"])))
-    if data["kind"] == "platt":
-        return PlattMap(float(data["slope"]), float(data["offset"]))
-    raise InvalidArgumentError(f"risk map: expected kind isotonic or platt, got {str(data['kind'])[:40]!r}")
+    if not isinstance(data, Mapping):
+        raise InvalidArgumentError("risk_map: expected an object")
+    kind = data.get("kind")
+    if kind == "isotonic":
+        knots = read_numbers(data.get("statistics"), "statistics")
+        return IsotonicMap(knots, read_numbers(data.get("risks"), "risks"))
+    if kind == "platt":
+        return PlattMap(read_number(data.get("slope"), "slope"), read_number(data.get("offset"), "offset"))
+    raise InvalidArgumentError("risk_map: expected kind isotonic or platt")
 
 
 def _logit(statistic: NDArray[np.float64]) -> NDArray[np.float64]:

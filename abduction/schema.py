@@ -1,19 +1,34 @@
-"""Names and versions of what is written down, checked when it is read back."""
+"""What is written down carries a name and a version; what is read back is checked, number by number."""
 
+import sys
 from collections.abc import Mapping
+from typing import Any
 
-from worldstate.errors import InputFileError, SchemaVersionError
+from worldstate.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+
+MOST_ITEMS = 100_000
 
 
-def check_schema(data: object, schema: str, version: str, source: object) -> Mapping[str, object]:
+def schema_stamp(name: str, version: str) -> dict[str, Any]:
+    """Return the entry that names schema and version.
+
+    Examples
+    --------
+    >>> schema_stamp("worldstate.MissRateTable", "1.0.0")
+    {'schema': {'name': 'worldstate.MissRateTable', 'version': '1.0.0'}}
+    """
+    return {"schema": {"name": name, "version": version}}
+
+
+def check_schema(data: object, name: str, version: str, source: object) -> Mapping[str, Any]:
     """Return `data` as a mapping if it says that it is of this schema and major version.
 
     Parameters
     ----------
     data : object
         What was read, for example from JSON.
-    schema, version : str
-        The name and the semantic version that the caller writes itself.
+    name, version : str
+        What the caller writes itself.
     source : object
         Where `data` comes from; errors begin with it.
 
@@ -26,21 +41,72 @@ def check_schema(data: object, schema: str, version: str, source: object) -> Map
 
     Examples
     --------
-    >>> sorted(check_schema({"schema": "a.B", "version": "1.7.0"}, "a.B", "1.0.0", "b.json"))
-    ['schema', 'version']
+    >>> list(check_schema(schema_stamp("a.B", "1.7.0"), "a.B", "1.0.0", "b.json"))
+    ['schema']
     """
-    if not isinstance(data, Mapping):
-        raise InputFileError(source, f"expected a JSON object of schema {schema}, got {type(data).__name__}")
-    if data.get("schema") != schema:
-        raise InputFileError(source, f"expected schema {schema}, got {_brief(data.get('schema'))}")
-    found = data.get("version")
+    stamp = data.get("schema") if isinstance(data, Mapping) else None
+    if not isinstance(data, Mapping) or not isinstance(stamp, Mapping) or stamp.get("name") != name:
+        raise InputFileError(source, f"expected a JSON object of schema {name}")
+    found, major = stamp.get("version"), version.split(".")[0]
     if not isinstance(found, str) or found.count(".") != 2:
-        raise InputFileError(source, f"expected a version such as {version}, got {_brief(found)}")
-    if found.split(".")[0] != version.split(".")[0]:
-        raise SchemaVersionError(source, f"expected {schema} {version.split('.')[0]}.x, got {_brief(found)}")
+        raise InputFileError(source, f"expected a schema version such as {version}")
+    if found.split(".")[0] != major:
+        raise SchemaVersionError(source, f"expected schema {name} {major}.x, got {found[:40]}")
     return data
 
 
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+def read_number(value: object, name: str) -> float:
+    """Return a finite number; text and booleans are none.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is none.
+
+    Examples
+    --------
+    >>> read_number(3, "slope")
+    3.0
+    """
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and abs(value) <= sys.float_info.max:  # type: ignore[arg-type]
+        return float(value)  # type: ignore[arg-type]
+    raise InvalidArgumentError(f"{name}: expected a finite number, got {type(value).__name__}")
+
+
+def read_numbers(value: object, name: str) -> tuple[float, ...]:
+    """Return a list of finite numbers.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is none, or longer than 100,000.
+
+    Examples
+    --------
+    >>> read_numbers([1, 2.5], "risks")
+    (1.0, 2.5)
+    """
+    return tuple(read_number(item, name) for item in _items(value, name))
+
+
+def read_rows(value: object, name: str) -> tuple[tuple[float, ...], ...]:
+    """Return a list of lists of finite numbers.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is none, or longer than 100,000.
+
+    Examples
+    --------
+    >>> read_rows([[1], [2]], "beta")
+    ((1.0,), (2.0,))
+    """
+    return tuple(read_numbers(row, name) for row in _items(value, name))
+
+
+def _items(value: object, name: str) -> list[object]:
+    if not isinstance(value, list | tuple) or len(value) > MOST_ITEMS:
+        raise InvalidArgumentError(f"{name}: expected a list of at most {MOST_ITEMS} items")
+    return list(value)

@@ -18,6 +18,7 @@ from worldstate.errors import InvalidArgumentError
 from .evidence import SignatureEvidence
 from .pairwise import class_pairs, couple
 from .platt import sigmoid
+from .schema import read_numbers, read_rows
 
 CLASSES = ("front", "left", "none", "right")
 DIRECTIONS = ("left", "right")
@@ -25,6 +26,7 @@ FRONT, LEFT, NONE, RIGHT = range(4)
 # Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
 EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
 PAIRS = len(class_pairs(len(CLASSES)))
+VECTORS = ("mean", "scale", "intercepts", "slopes", "offsets", "class_prior")
 
 Numbers = NDArray[np.float64]
 
@@ -158,29 +160,25 @@ class SignatureModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; reading them back gives the same model to the bit."""
-        names = ("mean", "scale", "coefficients", "intercepts", "slopes", "offsets", "class_prior")
-        return {"classes": list(CLASSES)} | {name: getattr(self, name).tolist() for name in names}
+        numbers = {name: getattr(self, name).tolist() for name in (*VECTORS, "coefficients")}
+        return {"classes": list(CLASSES)} | numbers
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "SignatureModel":
+    def from_dict(cls, data: object) -> "SignatureModel":
         """Return the model that `to_dict` wrote; unknown keys are ignored.
 
         Raises
         ------
         InvalidArgumentError
-            If the classes are others or the numbers do not fit; KeyError where one is missing.
+            If something is missing, of the wrong type or out of range.
         """
-        if tuple(data["classes"]) != CLASSES:
-            raise InvalidArgumentError(f"classes: expected {CLASSES}, got {str(data['classes'])[:80]}")
-        return cls(
-            mean=data["mean"],
-            scale=data["scale"],
-            coefficients=data["coefficients"],
-            intercepts=data["intercepts"],
-            slopes=data["slopes"],
-            offsets=data["offsets"],
-            class_prior=data["class_prior"],
-        )
+        if not isinstance(data, Mapping) or data.get("classes") != list(CLASSES):
+            raise InvalidArgumentError(f"signature: expected an object of classes {', '.join(CLASSES)}")
+        rows = read_rows(data.get("coefficients"), "coefficients")
+        if len({len(row) for row in rows}) != 1:
+            raise InvalidArgumentError("coefficients: expected rows of one length")
+        vectors = {name: np.array(read_numbers(data.get(name), name)) for name in VECTORS}
+        return cls(coefficients=np.array(rows), **vectors)
 
 
 def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Numbers:

@@ -5,8 +5,7 @@ ego, D.. moving ego), ``T0`` (frame number, may be empty) and ``Recording ID``. 
 degrees and grow to the right, as in the released data and in `frontend.feature`.
 """
 
-import csv
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.signature import CLASSES
+from worldstate.adapters.csv_rows import read_rows
 from worldstate.errors import InputFileError, InvalidArgumentError
 
 N_FEATURES = 60
-MAX_BYTES = 256 * 1024 * 1024
 FEATURE_COLUMNS = tuple(f"feat{i}" for i in range(N_FEATURES))
 LABEL_COLUMNS = ("Class", "ID", "Environment", "T0", "Recording ID")
 
@@ -100,8 +99,32 @@ class FeatureTable:
             raise InvalidArgumentError(f"group: expected windows of group {group}, found none")
         return found
 
-    def of_recordings(self, ids: Collection[str]) -> NDArray[np.bool_]:
-        """Return where a window belongs to a recording that holds a window of one of these IDs."""
+    def only(self, ids: Collection[str]) -> "FeatureTable":
+        """Return all windows of the recordings that hold a window of one of these IDs.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If there are none.
+        """
+        return self._not_empty(self._of_recordings(ids), "expected a window that is listed")
+
+    def without(self, ids: Collection[str]) -> "FeatureTable":
+        """Return all windows of the other recordings.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If none are left.
+        """
+        return self._not_empty(~self._of_recordings(ids), "expected a window that is not listed")
+
+    def _not_empty(self, chosen: NDArray[np.bool_], expected: str) -> "FeatureTable":
+        if not chosen.any():
+            raise InvalidArgumentError(f"ids: {expected}, found none")
+        return self.select(chosen)
+
+    def _of_recordings(self, ids: Collection[str]) -> NDArray[np.bool_]:
         keys = self.recording_keys
         return np.isin(keys, keys[np.isin(self.ids, list(ids))])
 
@@ -115,7 +138,8 @@ def read_features(path: str | Path) -> FeatureTable:
         If the file is missing or too large, a column is missing, or a line does not hold 60 finite numbers, a
         known class and an environment that begins with S or D; the message names file and line.
     """
-    windows = [_window(path, line, row) for line, row in _rows(path, FEATURE_COLUMNS + LABEL_COLUMNS)]
+    rows = read_rows(Path(path), FEATURE_COLUMNS + LABEL_COLUMNS)
+    windows = [_window(path, line, row) for line, row in rows]
     if not windows:
         raise InputFileError(path, "expected at least one window below the header")
     features, labels, t0_frames = zip(*windows, strict=True)
@@ -131,34 +155,16 @@ def read_ids(path: str | Path) -> frozenset[str]:
     InputFileError
         If the file is missing or too large, or has no such column or no rows.
     """
-    ids = frozenset(row["ID"].strip() for _, row in _rows(path, ("ID",)))
+    ids = frozenset(row["ID"] for _, row in read_rows(Path(path), ("ID",))) - {""}
     if not ids:
         raise InputFileError(path, "expected at least one ID below the header")
     return ids
 
 
-def _rows(path: str | Path, columns: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield line number and cells; every named column is there and filled in."""
-    try:
-        if Path(path).stat().st_size > MAX_BYTES:
-            raise InputFileError(path, f"expected at most {MAX_BYTES // 1024**2} MiB")
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [column for column in columns if column not in (reader.fieldnames or ())]
-            if missing:
-                raise InputFileError(path, f"line 1: expected columns {', '.join(missing[:5])}")
-            for row in reader:
-                if None in row or any(row[column] is None for column in columns):
-                    raise InputFileError(path, f"line {reader.line_num}: expected one cell for each column")
-                yield reader.line_num, row
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputFileError(path, f"expected a readable CSV file: {error}") from error
-
-
 def _window(
     path: str | Path, line: int, row: dict[str, str]
 ) -> tuple[list[float], tuple[str, ...], int | None]:
-    labels = tuple(row[column].strip() for column in ("Class", "ID", "Environment", "Recording ID"))
+    labels = tuple(row[column] for column in ("Class", "ID", "Environment", "Recording ID"))
     if labels[0] not in CLASSES:
         raise InputFileError(path, f"line {line}: expected a class {CLASSES}, got {labels[0][:40]!r}")
     if labels[2][:1] not in ("S", "D"):
@@ -167,7 +173,7 @@ def _window(
         raise InputFileError(path, f"line {line}: expected a Recording ID")
     try:
         features = [float(row[column]) for column in FEATURE_COLUMNS]
-        t0_frame = int(row["T0"]) if row["T0"].strip() else None
+        t0_frame = int(row["T0"]) if row["T0"] else None
     except ValueError as error:
         raise InputFileError(path, f"line {line}: {error}") from error
     if not np.isfinite(features).all():

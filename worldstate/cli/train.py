@@ -1,0 +1,79 @@
+"""`worldstate train`: a table of feature windows in, a model file out."""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.output import print_summary
+from worldstate.cli.progress import progress_bar
+
+DESCRIPTION = """\
+Train the published signature classifier (standardise, linear SVC, left/right mirroring) on labelled feature
+windows, and set its thresholds gamma(alpha) and risk maps on scores of windows that it was not trained on
+(5-fold cross-validation by recording). The model file is JSON: coefficients, no rows of the data."""
+
+EXAMPLE = """\
+example:
+  worldstate train features.csv --group static --exclude testset.csv --out model.json"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "train",
+        help="train a signature model on feature windows",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("table", type=Path, metavar="CSV", help="windows: feat0..feat59, Class, ID, ...")
+    parser.add_argument(
+        "--group",
+        choices=("static", "dynamic", "all"),
+        default="static",
+        help="standing ego, moving ego or both (default: %(default)s)",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    parser.add_argument(
+        "--exclude",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="IDS",
+        help="CSV files with a column ID: leave out the recordings of these windows",
+    )
+    parser.add_argument("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
+    parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    parser.add_argument("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    from worldstate.adapters.feature_table import read_features, read_ids
+    from worldstate.adapters.model_file import save_model
+    from worldstate.evaluation.training import TrainingSettings, train_model
+
+    table = read_features(arguments.table).group(arguments.group)
+    kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
+    settings = TrainingSettings(seed=arguments.seed, sustain_hops=arguments.sustain_hops)
+    with progress_bar("training", settings.steps) as bar:
+        model = train_model(
+            kept,
+            settings,
+            dataset=arguments.source or arguments.table.name,
+            group=arguments.group,
+            excluded_lists=[path.name for path in arguments.exclude],
+            on_step=bar.advance,
+        )
+    save_model(arguments.out, model)
+    summary = {
+        "out": str(arguments.out),
+        "n_windows": len(kept),
+        "n_recordings": len(model.provenance.training_recordings),
+        "n_excluded_windows": len(table) - len(kept),
+        **(model.provenance.figures or {}),
+    }
+    print_summary(summary, as_json=arguments.json)
+    return 0

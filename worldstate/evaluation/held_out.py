@@ -1,0 +1,45 @@
+"""Evaluation of a finished model, refused on recordings that it was trained on."""
+
+import numpy as np
+
+from worldstate.adapters.feature_table import FeatureTable
+from worldstate.adapters.model_file import Model
+from worldstate.errors import InvalidArgumentError
+
+from .calibration import MISS_RATES, WindowCalibration
+from .features import Predictions, predict_with
+
+
+def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[float, Predictions]:
+    """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a recording was in the training set, or the model was not calibrated for `alpha`.
+    """
+    check_unseen(model, table)
+    probabilities = model.signature.predict_proba(table.features)
+    predictions = {}
+    for miss_rate in MISS_RATES:
+        policy = model.policies.for_alpha(alpha, miss_rate)
+        calibration = WindowCalibration(miss_rate, policy.gamma, policy.risk_map)
+        predictions[miss_rate] = predict_with(table, probabilities, calibration)
+    return predictions
+
+
+def check_unseen(model: Model, table: FeatureTable) -> None:
+    """Refuse a table that shares recordings with the training set of a model.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If they overlap; the message says how many and how to keep them apart.
+    """
+    recordings = set(np.unique(table.recording_keys).tolist())
+    seen = recordings & set(model.provenance.training_recordings)
+    if seen:
+        raise InvalidArgumentError(
+            f"model: trained on {len(seen)} of these {len(recordings)} recordings; expected none. "
+            "Train with --exclude IDS and evaluate with --only IDS"
+        )
