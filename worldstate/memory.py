@@ -66,7 +66,8 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
 
 def priors_of(explanation: ExplanationBelief) -> Priors:
     """Return the three explanations of the paper."""
-    return Priors(explanation.hidden_total, explanation.visible, explanation.none)
+    values = (explanation.hidden_total, explanation.visible, explanation.none)
+    return Priors(*(min(value, 1.0) for value in values))
 
 
 def _first_explanation(context: Context) -> ExplanationBelief:

@@ -13,6 +13,7 @@ from .side import Side
 from .track import Track
 
 _NEVER = 1e6
+_CHANGED_MIND = 20.0
 
 
 def match_visible(
@@ -20,7 +21,8 @@ def match_visible(
 ) -> dict[int, int]:
     """Return {track index: sighting index} by global nearest neighbour in azimuth, within the gate.
 
-    The cost is the squared Mahalanobis distance; only tracks that vision has take part.
+    The cost is the squared Mahalanobis distance, plus a penalty where one is parked and the other moves, lest
+    a vehicle that drives past a parked one changes places with it. Only tracks that vision has take part.
     """
     candidates = [i for i, track in enumerate(tracks) if track.seen]
     if not candidates or not sightings:
@@ -62,7 +64,9 @@ def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> flo
     residual = wrap_angle(sighting.azimuth_rad - track.motion.azimuth_rad)
     variance = track.motion.azimuth_std_rad**2 + sighting.std_rad**2
     outside = abs(residual) > settings.gate_rad or residual**2 > settings.gate_sigma**2 * variance
-    return _NEVER if outside else residual**2 / variance
+    if outside:
+        return _NEVER
+    return residual**2 / variance + (0.0 if sighting.moving == track.moving else _CHANGED_MIND)
 
 
 def _may_emerge(

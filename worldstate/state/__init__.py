@@ -2,11 +2,13 @@
 
 from .context import Context, Occluder, Priors, Rates, blind_corner
 from .cue import RiskCue
-from .entity import Classification, Entity, Visibility
+from .entity import ANSWERS, Classification, Entity, Visibility
+from .reading import Record, check_schema
 from .relation import EGO, Relation
 from .world_state import SCHEMA_NAME, SCHEMA_VERSION, WorldState
 
 __all__ = [
+    "ANSWERS",
     "EGO",
     "SCHEMA_NAME",
     "SCHEMA_VERSION",
@@ -16,9 +18,11 @@ __all__ = [
     "Occluder",
     "Priors",
     "Rates",
+    "Record",
     "Relation",
     "RiskCue",
     "Visibility",
     "WorldState",
     "blind_corner",
+    "check_schema",
 ]

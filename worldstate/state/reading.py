@@ -37,9 +37,10 @@ class Record:
         self._value: dict[str, Any] = value
         self.where = where
 
-    def get(self, key: str) -> Any:
-        """Return the raw value, None where there is none."""
-        return self._value.get(key)
+    @property
+    def raw(self) -> dict[str, Any]:
+        """The decoded object itself."""
+        return self._value
 
     def maybe(self, key: str, read: Callable[[str], T]) -> T | None:
         """Return ``read(key)``, or None for null."""
