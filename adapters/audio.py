@@ -16,7 +16,8 @@ Samples = NDArray[np.float32]
 
 CONTAINERS = ("WAV", "WAVEX", "RF64", "W64", "FLAC")
 # Lossy codecs keep what the ear needs and lose the phase between microphones.
-ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE")
+FLOATING = ("FLOAT", "DOUBLE")
+ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", *FLOATING)
 SHORTEST_S = 1.0
 
 
@@ -39,6 +40,7 @@ class AudioSource:
 
     def __init__(self, path: Path, file: Any) -> None:
         self._file = file
+        self._floating = file.subtype in FLOATING
         self.path = path
         self.sample_rate_hz = int(file.samplerate)
         self.channels = int(file.channels)
@@ -74,7 +76,8 @@ class AudioSource:
         self._seek(0)
         for start in range(0, self.frames, frames):
             block = self._read(min(frames, self.frames - start))
-            _refuse_non_finite(self.path, block, start)
+            if self._floating:
+                _refuse_non_finite(self.path, block, start)
             yield block
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeGuard, get_args
+from typing import Literal, TypeGuard, final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ ENVIRONMENT = re.compile(r"(?P<ego>[SD])(?P<junction>[A-Z][0-9]{1,3})", re.ASCII
 IDENTIFIER = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 
 
+@final
 @dataclass(frozen=True, slots=True)
 class Recording:
     """One recording and what is known of it.

@@ -47,41 +47,48 @@ class ParkedRule:
         in_range("share", self.share, 0.0, 1.0, open_low=True)
 
 
-def parked(log: DetectionLog, frame: int, box_px: NDArray[np.float64], rule: ParkedRule) -> bool:
-    """Tell whether a box of `frame` has stood still, from that frame and earlier ones alone.
+def parked(
+    log: DetectionLog, frame: int, boxes_px: NDArray[np.float64], rule: ParkedRule
+) -> NDArray[np.bool_]:
+    """Tell which boxes of `frame` have stood still, from that frame and earlier ones alone.
 
     Parameters
     ----------
     log : DetectionLog
         All boxes, unfiltered: a parked car may be seen with a lower score for a moment.
     frame : int
-        Number of the frame that the box is in.
-    box_px : ndarray
-        Shape (4,).
+        Number of the frame that the boxes are in.
+    boxes_px : ndarray
+        Shape (n, 4).
     rule : ParkedRule
         How still and for how long.
 
     Returns
     -------
-    bool
-        False as long as the log does not reach back over the whole span: not known to be parked.
+    ndarray
+        Shape (n,). All False as long as the log does not reach back over the whole span: not known to be
+        parked.
 
     Examples
     --------
     >>> from worldstate.adapters.detections import DetectionFrame
     >>> still = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9]), ("car",))
     >>> log = DetectionLog.at_rate([still] * 20, frame_rate_hz=10.0)
-    >>> [parked(log, i, still.boxes_px[0], ParkedRule()) for i in (9, 10)]
-    [False, True]
+    >>> [parked(log, i, still.boxes_px, ParkedRule()).tolist() for i in (9, 10)]
+    [[False], [True]]
     """
     since_ns = int(log.stamps_ns[frame]) - nanoseconds(rule.span_s)
     first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
     past = log.frames[first:frame]
     if not past or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
-        return False
-    there = [_holds(earlier.boxes_px, box_px, rule.tolerance_px) for earlier in past]
-    return float(np.mean(there)) >= rule.share
+        return np.zeros(len(boxes_px), dtype=bool)
+    there = [_held(earlier.boxes_px, boxes_px, rule.tolerance_px) for earlier in past]
+    return np.asarray(np.mean(there, axis=0) >= rule.share)
 
 
-def _holds(boxes_px: NDArray[np.float64], box_px: NDArray[np.float64], tolerance_px: float) -> bool:
-    return bool((np.abs(boxes_px - box_px) <= tolerance_px).all(axis=1).any())
+def _held(
+    earlier_px: NDArray[np.float64], boxes_px: NDArray[np.float64], tolerance_px: float
+) -> NDArray[np.bool_]:
+    """Which of `boxes_px` (n, 4) some earlier box was at the place of, shape (n,)."""
+    distances = np.abs(boxes_px[:, None, :] - earlier_px[None, :, :])
+    return np.asarray(np.any(np.all(distances <= tolerance_px, axis=2), axis=1))

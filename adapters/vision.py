@@ -119,7 +119,8 @@ class VisionQuery:
     ) -> None:
         self.camera = camera
         self.detections = detections
-        self.miss_rate = miss_rate or default_miss_rates()
+        # What the camera does not see is cut off here, so the default table need not know where that begins.
+        self.miss_rate = miss_rate or default_miss_rates(half_view_deg=90.0)
         self.settings = settings or VisionSettings()
         self._degradation = degradation
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
@@ -183,14 +184,11 @@ class VisionQuery:
 
     def _look(self, log: DetectionLog, number: int) -> tuple[Sighting, ...]:
         frame = log.frames[number]
+        kept = frame.select(self.settings.keep)
+        still = parked(log, number, frame.boxes_px[kept], self.settings.still)
         return tuple(
-            self.camera.sighting(
-                frame.boxes_px[i],
-                frame.labels[i],
-                float(frame.scores[i]),
-                moving=not parked(log, number, frame.boxes_px[i], self.settings.still),
-            )
-            for i in frame.select(self.settings.keep)
+            self.camera.sighting(frame.boxes_px[i], frame.labels[i], float(frame.scores[i]), moving=not stood)
+            for i, stood in zip(kept, still.tolist(), strict=True)
         )
 
     def _sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:

@@ -1,4 +1,4 @@
-"""Bad input: each flaw has a typed error that names the file and what was expected; nothing is left behind."""
+"""Bad input: each flaw has a typed error that names the file and what was expected; nothing is left."""
 
 import json
 import struct
@@ -16,7 +16,8 @@ from worldstate.adapters.array_xml import read_array_xml, write_array_xml
 from worldstate.adapters.atomic import atomic_path, write_text
 from worldstate.adapters.audio import open_audio
 from worldstate.adapters.detections import read_detections
-from worldstate.errors import InputFileError, InvalidArgumentError, WorldstateError
+from worldstate.adapters.model_file import load_model, read_model, save_model
+from worldstate.errors import InputFileError, InvalidArgumentError, SchemaVersionError, WorldstateError
 from worldstate.frontend.array import MicrophoneArray
 
 RATE_HZ = 8000
@@ -163,7 +164,7 @@ def test_a_refused_file_is_closed_again(tmp_path: Path) -> None:
 
 POS = '<pos Name="Point {0}" x="0.{0}" y="0" z="0"/>'
 TWO = POS.format(1) + POS.format(2)
-BOMB = '<!DOCTYPE m [<!ENTITY a "1"><!ENTITY b "&a;&a;&a;">]><MicArray>{}<pos x="&b;" y="0" z="0"/></MicArray>'
+BOMB = '<!DOCTYPE m [<!ENTITY a "1"><!ENTITY b "&a;&a;">]><MicArray>{}<pos x="&b;" y="0" z="0"/></MicArray>'
 EXTERNAL = '<!DOCTYPE m [<!ENTITY a SYSTEM "file:///etc/hostname">]><MicArray>&a;{}</MicArray>'
 
 
@@ -283,6 +284,21 @@ def test_any_json_as_detections(tmp_path_factory: pytest.TempPathFactory, rows: 
         assert len(read_detections(name)) == len(rows)
     except InputFileError as error:
         assert str(error).startswith(f"{name}: ")
+
+
+# --- models ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", ["2.0.0", "0.9.0"])
+def test_a_model_of_another_major_version(tmp_path: Path, version: str) -> None:
+    save_model(tmp_path / "model.json", read_model())
+    document = json.loads((tmp_path / "model.json").read_text())
+    assert document["version"].startswith("1.")
+    name = tmp_path / "other.json"
+    name.write_text(json.dumps(document | {"version": version}))
+    with pytest.raises(SchemaVersionError, match=version) as raised:
+        load_model(name)
+    assert str(raised.value).startswith(f"{name}: ")
 
 
 # --- nothing half-written --------------------------------------------------------------------------------
