@@ -105,34 +105,49 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
     if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0):
         raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, got {times}")
     centred = energies - energies.mean()
-    slope, intercept, slope_scatter = _line(times, centred, np.ones_like(times))
+    exponential = _fit_line(times, centred, np.ones_like(times))
     # The exponential fit is a smooth stand-in for E^(-1/2): its scatter may not weight itself.
-    model = np.exp(-0.5 * (intercept + slope * times))
-    rate, level, range_scatter = _line(times, np.exp(-0.5 * centred), model)
-    scatter = 2.0 * range_scatter
-    if min(slope_scatter, scatter) > MAX_LOG_STD:
+    model = np.exp(-0.5 * (exponential.level + exponential.slope * times))
+    straight = _fit_line(times, np.exp(-0.5 * centred), model)
+    scatter = 2.0 * straight.scatter
+    if min(exponential.scatter, scatter) > MAX_LOG_STD:
         return NotUsable("energy scatters by more than 3 dB about the fit")
-    covariance = (0.5 * max(scatter, floor)) ** 2 * _line_covariance(times, model)
-    if level < _MIN_RANGE_SIGMA * np.sqrt(covariance[1, 1]):
+    return _read(exponential, straight, max(exponential.scatter, floor), 0.5 * max(scatter, floor))
+
+
+def _read(exponential: "_Line", straight: "_Line", log_std: float, range_std: float) -> Looming | NotUsable:
+    level, slope = straight.level, straight.slope
+    if level < _MIN_RANGE_SIGMA * range_std * np.sqrt(straight.level_variance):
         return NotUsable("range reaches zero within the error of the window")
-    gradient = np.array([-1.0, rate / level]) / level
-    variance = float(gradient @ covariance @ gradient)
-    slope_variance = max(slope_scatter, floor) ** 2 * _line_covariance(times, np.ones_like(times))[0, 0]
-    return Looming(-rate / level, float(np.sqrt(variance)), slope, float(np.sqrt(slope_variance)))
+    rate = -slope / level
+    variance = straight.slope_variance + rate**2 * straight.level_variance + 2.0 * rate * straight.covariance
+    return Looming(
+        inverse_tta_hz=rate,
+        std_hz=float(range_std / level * np.sqrt(variance)),
+        log_slope_hz=exponential.slope,
+        log_slope_std_hz=float(log_std * np.sqrt(exponential.slope_variance)),
+    )
 
 
-def _line(
-    times: NDArray[np.float64], values: NDArray[np.float64], scale: NDArray[np.float64]
-) -> tuple[float, float, float]:
-    """Slope, intercept and relative scatter of a line, errors in proportion to `scale`."""
-    design = np.stack([times, np.ones_like(times)], axis=1) / scale[:, None]
-    solution = np.linalg.lstsq(design, values / scale, rcond=None)[0]
-    residual = values / scale - design @ solution
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Value = level + slope t; variances for relative errors of unit variance."""
+
+    slope: float
+    level: float
+    scatter: float
+    slope_variance: float
+    level_variance: float
+    covariance: float
+
+
+def _fit_line(times: NDArray[np.float64], values: NDArray[np.float64], scale: NDArray[np.float64]) -> _Line:
+    """Fit a line whose errors are in proportion to `scale`: closed form of weighted least squares."""
+    weights = scale**-2.0
+    s0, s1, s2 = float(weights.sum()), float(weights @ times), float(weights @ times**2)
+    v0, v1 = float(weights @ values), float((weights * times) @ values)
+    determinant = s0 * s2 - s1 * s1
+    slope, level = (s0 * v1 - s1 * v0) / determinant, (s2 * v0 - s1 * v1) / determinant
+    residual = (values - level - slope * times) / scale
     scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
-    return float(solution[0]), float(solution[1]), scatter
-
-
-def _line_covariance(times: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance of (slope, intercept) for relative errors of unit variance."""
-    design = np.stack([times, np.ones_like(times)], axis=1) / scale[:, None]
-    return np.asarray(np.linalg.inv(design.T @ design))
+    return _Line(slope, level, scatter, s0 / determinant, s2 / determinant, -s1 / determinant)

@@ -8,8 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from .array import MicrophoneArray
 from .geometry import SPEED_OF_SOUND_M_S
 
-# Singular values below this share of the largest are below single precision's resolution of the result.
-_RANK_TOLERANCE = 1e-6
+# Largest part of a steering vector, relative to its length, that the factors may miss: single precision's
+# own.
+_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,8 +21,8 @@ class Steering:
               \approx \big(x_{t,k}^T B_k\big)\, C_k(\theta)
 
     Beams across azimuth at one elevation, below the alias frequency, span few of the M dimensions (15 to 20
-    of 56), so that B (M x r) and C (r x directions) cost a third of W = B C. The rest is cut at 1e-6 of the
-    largest singular value: nothing that single precision would show.
+    of 56), so that B (M x r) and C (r x directions) cost a third of W = B C. The rest is cut where no
+    steering vector is missed by more than 1e-6 of its length: nothing that single precision would show.
 
     Parameters
     ----------
@@ -53,11 +54,8 @@ class Steering:
         """Build the beams of an array at the given frequencies and directions."""
         centred = MicrophoneArray(array.centred_m)
         weights = centred.steering(frequencies_hz, azimuths_rad, elevations_rad, speed_of_sound_m_s).conj()
-        left, values, right = np.linalg.svd(weights, full_matrices=False)
-        rank = int((values > _RANK_TOLERANCE * values[:, :1]).sum(axis=1).max())
-        if rank >= array.n_microphones // 2:
-            return cls._of(None, weights)
-        return cls._of(left[:, :, :rank], values[:, :rank, None] * right[:, :rank])
+        basis = _thin_basis(weights, max_rank=array.n_microphones // 2)
+        return cls._of(basis, weights if basis is None else basis.conj().transpose(0, 2, 1) @ weights)
 
     @classmethod
     def _of(cls, basis: NDArray[np.complex128] | None, weights: NDArray[np.complex128]) -> "Steering":
@@ -78,7 +76,7 @@ class Steering:
         return cross_spectra(projected)
 
     def compress(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        r"""Write matrices in coordinates of the basis, :math:`B^T R \overline{B}`: (bins, M, M) -> (bins, r, r)."""
+        r"""Write R as :math:`B^T R \overline{B}` in the basis: (bins, M, M) -> (bins, r, r)."""
         if self.basis is None:
             return matrices
         return np.asarray(self.basis.transpose(0, 2, 1) @ (matrices @ self.basis.conj()))
@@ -88,6 +86,29 @@ class Steering:
         products = matrices @ self.conjugate
         products *= self.weights
         return np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
+
+
+def _thin_basis(weights: NDArray[np.complex128], max_rank: int) -> NDArray[np.complex128] | None:
+    """Find orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance.
+
+    Gram-Schmidt with pivoting: the vector that is missed most is the next column. None if `max_rank` are
+    not enough.
+    """
+    missed = weights.copy()
+    columns: list[NDArray[np.complex128]] = []
+    limit = _TOLERANCE * np.sqrt(weights.shape[1])
+    for _ in range(max_rank):
+        lengths = np.linalg.norm(missed, axis=1)
+        worst = lengths.argmax(axis=1)[:, None]
+        length = np.take_along_axis(lengths, worst, axis=1)
+        if length.max() < limit:
+            return np.stack(columns, axis=2)
+        column = np.take_along_axis(missed, worst[:, None], axis=2)[:, :, 0]
+        # A bin that is spanned already gets a column of zeros.
+        column = np.where(length < limit, 0.0, column / np.maximum(length, limit))
+        columns.append(column)
+        missed -= column[:, :, None] * (column.conj()[:, None] @ missed)
+    return None
 
 
 def cross_spectra(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:

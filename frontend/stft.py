@@ -75,7 +75,7 @@ class StreamingStft:
         return _frames(halves[first:], self._signs)
 
     def _halves(self, samples: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """Transform the half frames that are full now, (1 + n, 2, bins + 2, M); the caller fills the first."""
+        """Transform the half frames that are full now, (1 + n, 2, bins + 2, M); the first is left open."""
         size, n_channels = self._head.shape
         missing = size - self._n_head
         if len(samples) < missing:
