@@ -1,0 +1,218 @@
+"""The streaming front-end: hops, laws, bad input."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.errors import InvalidArgumentError
+from worldstate.frontend.array import MicrophoneArray, roof_array_56
+from worldstate.frontend.looming import Looming
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.values import NotUsable
+
+SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
+RATE = 16_000
+
+
+def noise_from(
+    array: MicrophoneArray, azimuth_rad: float, rate: int, seconds: float, seed: int = 0, noise: float = 0.1
+) -> np.ndarray:
+    """A white plane wave with exact fractional delays in sensor noise, float32 (n, M)."""
+    rng, n = np.random.default_rng(seed), round(seconds * rate)
+    wave = np.fft.rfft(rng.standard_normal(n))[:, None]
+    wave = wave * array.steering(np.fft.rfftfreq(n, 1 / rate), azimuth_rad)[:, :, 0]
+    sensor = noise * rng.standard_normal((n, array.n_microphones))
+    return (np.fft.irfft(wave, n, axis=0) + sensor).astype(np.float32)
+
+
+def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: float = 1e-5) -> None:
+    assert [f.stamp_ns for f in ours] == [f.stamp_ns for f in theirs]
+    for a, b in zip(ours, theirs, strict=True):
+        for name in ("srp", "feature", "band_log_energy", "bearing_rad", "bearing_std_rad", "prominence"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=rtol, err_msg=name)
+        assert isinstance(a.looming, Looming) == isinstance(b.looming, Looming)
+        if isinstance(a.looming, Looming) and isinstance(b.looming, Looming):
+            assert a.looming.inverse_tta_hz == pytest.approx(b.looming.inverse_tta_hz, rel=rtol, abs=1e-7)
+            assert a.looming.std_hz == pytest.approx(b.looming.std_hz, rel=rtol)
+
+
+@settings(deadline=None, max_examples=15)
+@given(cuts=st.lists(st.integers(0, 20_000), max_size=12), rate=st.sampled_from([8_000, 15_999.7]))
+def test_block_size_does_not_matter(cuts: list[int], rate: float) -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.25)
+    whole = FrontEnd(SQUARE, rate).process(sound)
+    pieces = FrontEnd(SQUARE, rate)
+    blocks = np.split(sound, sorted(min(c, len(sound)) for c in cuts))
+    assert_same([frame for block in blocks for frame in pieces.process(block)], whole)
+    assert whole
+
+
+def test_sample_by_sample_is_the_same_too() -> None:
+    sound = noise_from(SQUARE, 0.5, 8_000, 1.15)
+    front_end = FrontEnd(SQUARE, 8_000)
+    frames = [frame for sample in sound for frame in front_end.process(sample[None])]
+    assert len(frames) == 2
+    assert_same(frames, FrontEnd(SQUARE, 8_000).process(sound))
+
+
+def test_hops_do_not_drift_at_the_recordings_odd_rate() -> None:
+    array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
+    sound = np.random.default_rng(0).standard_normal((47_998 * 4, 2))
+    frames = FrontEnd(array, 47_998, start_ns=5).process(sound)
+    assert [f.sample_index for f in frames] == [int(k * 4799.8 + 0.5) for k in range(10, 41)]
+    assert frames[10].stamp_ns == 5 + 2_000_000_000
+    assert abs(frames[3].stamp_ns - 1_300_000_005) < 1e9 / 47_998
+
+
+def test_nothing_before_the_first_full_second() -> None:
+    front_end = FrontEnd(SQUARE, RATE)
+    sound = noise_from(SQUARE, 0.2, RATE, 1.0)
+    assert front_end.process(sound[:-1]) == []
+    assert len(front_end.process(sound[-1:])) == 1
+
+
+@pytest.mark.parametrize("rate", [16_000, 48_000])
+@pytest.mark.parametrize("azimuth_deg", [-50.0, 0.0, 25.0])
+@pytest.mark.parametrize("layout", ["square", "line", "roof"])
+def test_bearing_of_a_plane_wave(layout: str, azimuth_deg: float, rate: int) -> None:
+    line = MicrophoneArray([[0, 0.08 * i, 0] for i in range(8)])
+    array = {"square": SQUARE, "line": line, "roof": roof_array_56()}[layout]
+    frame = FrontEnd(array, rate).process(noise_from(array, np.radians(azimuth_deg), rate, 1.0))[0]
+    assert np.degrees(frame.bearing_rad) == pytest.approx(azimuth_deg, abs=1.0)
+    assert frame.prominence > 1.1
+    assert frame.bearing_std_rad < np.radians(12)
+
+
+def test_the_square_frame_has_the_promised_shapes() -> None:
+    frame = FrontEnd(SQUARE, RATE).process(noise_from(SQUARE, 0.2, RATE, 1.0))[0]
+    assert frame.srp.shape == frame.azimuths_rad.shape == (181,)
+    assert frame.band_log_energy.shape == (16,)
+    assert frame.feature.shape == (60,)
+    assert frame.azimuths_rad[0] == -np.pi / 2
+    assert np.all(np.diff(frame.azimuths_rad) > 0)
+
+
+@settings(deadline=None, max_examples=10)
+@given(gain=st.floats(1e-3, 1e3), seed=st.integers(0, 1000))
+def test_a_gain_changes_neither_bearing_nor_looming(gain: float, seed: int) -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.0, seed)
+    plain, louder = (FrontEnd(SQUARE, RATE).process(s)[0] for s in (sound, sound * np.float32(gain)))
+    assert louder.bearing_rad == pytest.approx(plain.bearing_rad, abs=1e-5)
+    assert isinstance(plain.looming, Looming)
+    assert isinstance(louder.looming, Looming)
+    assert louder.looming.inverse_tta_hz == pytest.approx(plain.looming.inverse_tta_hz, abs=1e-5)
+    np.testing.assert_allclose(louder.band_log_energy - plain.band_log_energy, 2 * np.log(gain), atol=1e-4)
+
+
+def test_mirrored_world_and_array_mirror_the_frame() -> None:
+    array = roof_array_56()
+    mirrored = MicrophoneArray(array.positions_m * [1.0, -1.0, 1.0])
+    left = FrontEnd(array, 48_000).process(noise_from(array, 0.6, 48_000, 1.0))[0]
+    right = FrontEnd(mirrored, 48_000).process(noise_from(mirrored, -0.6, 48_000, 1.0))[0]
+    np.testing.assert_allclose(right.srp, left.srp[::-1], rtol=1e-4)
+    assert right.bearing_rad == pytest.approx(-left.bearing_rad, abs=1e-4)
+    mirrored_feature = right.feature.reshape(2, 30)[:, ::-1].ravel()
+    np.testing.assert_allclose(mirrored_feature, left.feature, rtol=1e-3)
+
+
+def test_looming_on_an_approaching_source_in_the_stream() -> None:
+    n = 2 * RATE
+    time_s = np.arange(n) / RATE
+    range_m = 30.0 - 10.0 * time_s
+    sound = noise_from(SQUARE, 0.0, RATE, 2.0, noise=0.0) / range_m[:, None].astype(np.float32)
+    frames = FrontEnd(SQUARE, RATE).process(sound)
+    errors = []
+    for frame in frames:
+        assert isinstance(frame.looming, Looming)
+        truth = 10.0 / (30.0 - 10.0 * frame.sample_index / RATE)
+        errors.append((frame.looming.inverse_tta_hz - truth) / frame.looming.std_hz)
+    assert np.abs(np.mean(errors)) < 1.5
+    assert np.abs(errors).max() < 3.0
+
+
+def test_band_levels_of_white_noise_and_a_tone() -> None:
+    rng = np.random.default_rng(0)
+    white = FrontEnd(SQUARE, RATE).process(rng.standard_normal((RATE, 4)))[0].band_log_energy
+    # The 16 bands cover bins 2..230 of 256: mean square 1 times that share.
+    assert np.exp(white).sum() == pytest.approx(228 / 256, rel=0.05)
+    tone = np.sin(2 * np.pi * 1000 * np.arange(RATE) / RATE)[:, None] * np.ones(4)
+    levels = FrontEnd(SQUARE, RATE).process(tone)[0].band_log_energy
+    assert np.exp(levels).max() == pytest.approx(0.5, rel=0.02)
+    assert np.sort(levels)[-3] < np.log(1e-6)
+
+
+def test_silence_says_so() -> None:
+    frame = FrontEnd(SQUARE, RATE).process(np.zeros((RATE, 4)))[0]
+    assert frame.looming == NotUsable("silence within the window")
+    assert frame.prominence == 1.0
+    assert frame.bearing_std_rad > 0.8
+    assert not frame.srp.any()
+    assert np.isfinite(frame.band_log_energy).all()
+
+
+def test_looming_waits_for_its_own_window() -> None:
+    sound = noise_from(SQUARE, 0.0, RATE, 1.5)
+    frames = FrontEnd(SQUARE, RATE, FrontEndSettings(looming_hops=15)).process(sound)
+    assert [isinstance(f.looming, NotUsable) for f in frames] == [True] * 5 + [False]
+
+
+def test_a_refused_block_leaves_the_stream_as_it_was() -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.0)
+    front_end = FrontEnd(SQUARE, RATE)
+    front_end.process(sound[:5000])
+    broken = sound[5000:].copy()
+    broken[100, 2] = np.nan
+    with pytest.raises(InvalidArgumentError, match=r"channels \[2\]"):
+        front_end.process(broken)
+    assert_same(front_end.process(sound[5000:]), FrontEnd(SQUARE, RATE).process(sound))
+
+
+@pytest.mark.parametrize(
+    "block",
+    [np.zeros((10, 3)), np.zeros(10), "sound", [[None] * 4], np.full((2, 4), np.inf), np.full((2, 4), 1e300)],
+)
+def test_bad_blocks_are_refused(block: object) -> None:
+    with pytest.raises(InvalidArgumentError, match="block"):
+        FrontEnd(SQUARE, RATE).process(block)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("scale", [2.0**31, 1e13])
+def test_loud_is_not_infinite(scale: float) -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.0)
+    frame = FrontEnd(SQUARE, RATE).process(sound * np.float32(scale))[0]
+    assert np.isfinite(frame.band_log_energy).all()
+    assert isinstance(frame.looming, Looming)
+
+
+@pytest.mark.parametrize(
+    ("rate", "settings_", "message"),
+    [
+        (3_500, {"nfft": 256}, "half the sample rate"),
+        (4_000, {}, "nfft"),
+        (0, {}, "sample_rate_hz"),
+        (48_000, {"nfft": 511}, "nfft"),
+        (48_000, {"window_hops": 5}, "window_hops"),
+        (48_000, {"azimuth_step_deg": 0.7}, "divisor"),
+        (48_000, {"bearing_hops": 11}, "bearing_hops"),
+        (48_000, {"srp_band_hz": (1800.0, 300.0)}, "srp_band_hz"),
+    ],
+)
+def test_bad_settings_are_refused(rate: float, settings_: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=message):
+        FrontEnd(SQUARE, rate, FrontEndSettings(**settings_))  # type: ignore[arg-type]
+
+
+def test_memory_does_not_grow() -> None:
+    import tracemalloc
+
+    front_end = FrontEnd(SQUARE, 8_000)
+    sound = noise_from(SQUARE, 0.5, 8_000, 2.0)
+    front_end.process(sound)
+    tracemalloc.start()
+    for _ in range(20):
+        front_end.process(sound)
+    grown = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert grown < 100_000
