@@ -13,7 +13,7 @@ from worldstate.errors import InvalidArgumentError
 
 _ITERATIONS = 100
 _SMALLEST_STEP = 1e-10
-_GRADIENT_TOLERANCE = 1e-5
+_GRADIENT_TOLERANCE = 1e-6
 _RIDGE = 1e-12
 
 
@@ -56,13 +56,17 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
         raise InvalidArgumentError("values: expected at least one decision value")
     n_positive, n_negative = int(label.sum()), int((~label).sum())
     target = np.where(label, (n_positive + 1) / (n_positive + 2), 1 / (n_negative + 2))
-    return _newton(decision, target, np.array([0.0, np.log((n_negative + 1) / (n_positive + 1))]))
+    # In units of the largest value, so that the tolerance means the same at every scale.
+    unit = float(np.abs(decision).max()) or 1.0
+    slope, offset = _newton(decision / unit, target, np.log((n_negative + 1) / (n_positive + 1)))
+    return slope / unit, offset
 
 
 def _newton(
-    decision: NDArray[np.float64], target: NDArray[np.float64], start: NDArray[np.float64]
+    decision: NDArray[np.float64], target: NDArray[np.float64], offset: float
 ) -> tuple[float, float]:
-    point, loss = start, _loss(decision, target, start)
+    point = np.array([0.0, offset])
+    loss = _loss(decision, target, point)
     for _ in range(_ITERATIONS):
         gradient, curvature = _derivatives(decision, target, point)
         if np.abs(gradient).max() < _GRADIENT_TOLERANCE:

@@ -1,0 +1,119 @@
+"""Golden runs on the released windows of OVAD: what the published pipeline reaches."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldstate.abduction.signature_training import PublishedClassifier
+from worldstate.adapters.feature_table import read_features, read_ids
+from worldstate.adapters.model_file import model_to_dict, read_model
+from worldstate.evaluation.feature_report import report
+from worldstate.evaluation.features import cross_validate
+from worldstate.evaluation.held_out import check_unseen, predict_held_out
+from worldstate.evaluation.splits import split_for
+from worldstate.evaluation.training import TrainingSettings, train_model
+
+CANDIDATES = (os.environ.get("OVAD_FEATURES"), Path(__file__).parents[2] / "shared" / "ovad")
+TABLE = "extracted_features.csv"
+LISTS = ("timeHorizonStaticTestset.csv", "timeHorizonDynamicTestset.csv")
+
+
+def find_folder():
+    for candidate in filter(None, CANDIDATES):
+        folder = Path(candidate)
+        folder = folder if folder.is_dir() else folder.parent
+        if (folder / TABLE).is_file():
+            return folder
+    return None
+
+
+FOLDER = find_folder()
+pytestmark = pytest.mark.skipif(
+    FOLDER is None, reason=f"{TABLE} neither where OVAD_FEATURES points nor in ../shared/ovad"
+)
+
+
+def evaluated(group, protocol, seeds):
+    table = read_features(FOLDER / TABLE).group(group)
+    split = split_for(protocol)
+    return report(
+        table,
+        [
+            cross_validate(table, split, PublishedClassifier, np.random.default_rng(seed), alpha=0.02)
+            for seed in range(seeds)
+        ],
+    )
+
+
+def test_the_table_is_what_was_counted():
+    table = read_features(FOLDER / TABLE)
+    assert len(table) == 909
+    assert len(np.unique(table.recording_keys)) == 601
+    assert (table.group("static").hazards.sum(), table.group("static").hazard_free.sum()) == (212, 199)
+    assert len(table.only(read_ids(FOLDER / LISTS[0]))) == 125
+
+
+def test_static_cross_validation_reaches_what_was_published():
+    figures = evaluated("static", "cv", seeds=2)
+    assert 0.91 <= figures["accuracy"] <= 0.93
+    assert figures["auroc_pooled"] == pytest.approx(0.976, abs=0.006)
+    assert figures["tpr"] == pytest.approx(0.74, abs=0.07)
+    # Law 4 promises the budget where gamma was set; out of fold it holds within what 199 windows can tell.
+    assert figures["fpr"] <= 0.05
+    assert figures["ece"] <= figures["ece_floor"] + 0.02
+    assert figures["auroc_pooled_absent"] > figures["auroc_pooled"]
+
+
+def test_an_unseen_junction_is_harder():
+    figures = evaluated("static", "lojo", seeds=1)
+    assert figures["accuracy"] == pytest.approx(0.807, abs=0.015)
+    assert figures["auroc_macro"] == pytest.approx(0.945, abs=0.01)
+    assert figures["auroc_pooled"] == pytest.approx(0.918, abs=0.01)
+    assert figures["auroc_macro_absent"] == pytest.approx(0.964, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_moving_ego_is_harder_still():
+    figures = evaluated("dynamic", "cv", seeds=5)
+    # .770 over five dynamic junctions, of which two are not in this copy.
+    assert figures["accuracy"] == pytest.approx(0.77, abs=0.03)
+
+
+def test_the_model_that_ships_is_the_one_that_the_command_trains():
+    table = read_features(FOLDER / TABLE).group("static")
+    excluded = [name for file in LISTS for name in read_ids(FOLDER / file)]
+    shipped = read_model()
+    origin = shipped.provenance
+    again = train_model(
+        table.without(excluded),
+        TrainingSettings(seed=origin.seed),
+        dataset=origin.dataset,
+        group="static",
+        excluded_lists=LISTS,
+    )
+    assert again.provenance.training_recordings == origin.training_recordings
+    check_unseen(shipped, table.only(read_ids(FOLDER / LISTS[0])))
+    probabilities = [model.signature.predict_proba(table.features) for model in (again, shipped)]
+    np.testing.assert_allclose(*probabilities, atol=1e-3)
+    ours, theirs = (model_to_dict(model)["policies"] for model in (again, shipped))
+    assert [p["alpha"] for p in ours] == [p["alpha"] for p in theirs]
+
+
+def test_the_model_that_ships_holds_on_the_official_test_recordings():
+    table = read_features(FOLDER / TABLE).group("static").only(read_ids(FOLDER / LISTS[0]))
+    figures = report(table, [predict_held_out(read_model(), table, alpha=0.02)])
+    # The authors' own classifier has .928 there, retrained from this table .920.
+    assert figures["accuracy"] == pytest.approx(0.92, abs=0.02)
+    assert figures["auroc_pooled"] > 0.96
+
+
+def test_no_row_of_the_data_ships():
+    table = read_features(FOLDER / TABLE)
+    numbers = set()
+    for row in np.atleast_2d(read_model().signature.coefficients):
+        numbers.update(np.round(row, 6).tolist())
+    numbers.update(np.round(read_model().signature.mean, 6).tolist())
+    for row in table.features:
+        assert len(numbers & set(np.round(row, 6).tolist())) < 10
