@@ -95,7 +95,7 @@ class FilterSettings:
     visible_life_s: float = 10.0
     delete_existence: float = 0.05
     lost_std_rad: float = 0.8
-    reocclusion_after_s: float = 0.5
+    reocclusion_after_s: float = 0.15
     reocclusion_s: float = 3.0
     stream: str = "worldstate"
 
