@@ -74,8 +74,8 @@ def estimate_tone(
     sample_rate_hz : float
         > 0.
     low_hz, high_hz : float, optional
-        Its SNR says whether to believe it: with :math:`\eta N` below about 15 dB the highest peak is noise.
-        rate / 2, where a real tone cannot be told from an offset.
+        Band searched. By default all of it; for real samples one resolution, rate / n, is left out at 0 and
+        at rate / 2, where a real tone cannot be told from an offset.
 
     Returns
     -------

@@ -1,0 +1,171 @@
+r"""The comb: which fundamental do the harmonics of each window speak for, and along which track.
+
+A candidate f in window k is scored by the evidence of its teeth over the noise floor,
+
+.. math:: Q_k(f) = \sum_h \big[\ln(1 + P_k(h f) / \nu_k(h f)) - q\big],
+
+where the price q per tooth keeps f / 2, half of whose teeth are empty, from winning over f. The track is the
+most evident one whose rate of change is limited.
+
+Source: A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum, the harmonic sum
+spectrum and a maximum likelihood estimate", 1969; the track by A. J. Viterbi's algorithm, 1967.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from worldstate.checks import in_range
+
+FloatArray = NDArray[np.float64]
+
+ZERO_PADDING = 4
+# Median of an exponential variable over its mean: from a median of powers to the noise power.
+MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
+
+
+@dataclass(frozen=True, slots=True)
+class HarmonicSettings:
+    """What fundamental to look for, and how finely.
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        Range of the fundamental; a firing frequency is 20 to 200 Hz.
+    band_high_hz : float
+        Highest tooth used.
+    max_harmonics : int
+        Most teeth used; 1 follows a single tone.
+    window_s, hop_s : float
+        Analysis window (Hann) and its step. The fundamental must be resolved: low_hz > 4 / window_s.
+    max_rate_hz : float
+        Largest relative change of the fundamental, |df/dt| / f, per second.
+    tooth_price : float
+        q, nats per tooth. An empty tooth has 0.6 nats of evidence on average: a lower price lets f / 2 win, a
+        much higher one 2 f where upper harmonics are missing.
+    floor_width_hz : float
+        Width of the running median that estimates the noise floor.
+    tooth_snr : float
+        Power over the floor from which a tooth enters the combined estimate.
+
+    Examples
+    --------
+    >>> HarmonicSettings(low_hz=40.0).low_hz
+    40.0
+    """
+
+    low_hz: float = 25.0
+    high_hz: float = 200.0
+    band_high_hz: float = 1200.0
+    max_harmonics: int = 20
+    window_s: float = 0.25
+    hop_s: float = 0.1
+    max_rate_hz: float = 0.4
+    tooth_price: float = 1.0
+    floor_width_hz: float = 250.0
+    tooth_snr: float = 15.0
+
+    def __post_init__(self) -> None:
+        in_range("low_hz", self.low_hz, 4.0 / self.window_s, np.inf)
+        in_range("high_hz", self.high_hz, self.low_hz, self.band_high_hz, open_low=True)
+        in_range("band_high_hz", self.band_high_hz, self.high_hz, np.inf)
+        in_range("max_harmonics", self.max_harmonics, 1, 1000)
+        in_range("window_s", self.window_s, 0.0, 10.0, open_low=True)
+        in_range("hop_s", self.hop_s, 0.0, self.window_s, open_low=True)
+        in_range("max_rate_hz", self.max_rate_hz, 0.0, 10.0, open_low=True)
+        in_range("tooth_price", self.tooth_price, 0.0, np.inf)
+        in_range("floor_width_hz", self.floor_width_hz, 4.0 / self.window_s, np.inf)
+        in_range("tooth_snr", self.tooth_snr, 1.0, np.inf)
+
+
+def spectrum_and_floor(
+    frames: FloatArray, rate: float, settings: HarmonicSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Powers of zero-padded windows and the noise under them, both (K, bins), up to the highest tooth.
+
+    Parameters
+    ----------
+    frames : (K, n) float
+        Windowed samples.
+    rate : float
+        Hz.
+    settings : HarmonicSettings
+        Band and width of the running median.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(0).normal(size=(2, 1000)) * np.hanning(1000)
+    >>> power, floor = spectrum_and_floor(noise, 4000.0, HarmonicSettings())
+    >>> bool(0.8 < power.mean() / floor.mean() < 1.3)
+    True
+    """
+    size = ZERO_PADDING * frames.shape[1]
+    keep = int(np.ceil(settings.band_high_hz * 1.02 * size / rate)) + 2
+    power = np.abs(np.fft.rfft(frames, size)[:, :keep]) ** 2
+    # The padded bins are interpolated: the median needs only every fourth.
+    width = round(settings.floor_width_hz * frames.shape[1] / rate) | 1
+    floor = ndimage.median_filter(power[:, ::ZERO_PADDING], size=(1, width), mode="nearest")
+    grid = np.arange(keep)
+    spread = np.stack([np.interp(grid, grid[::ZERO_PADDING], row) for row in floor])
+    least = np.finfo(float).tiny + 1e-12 * power.max()
+    return power, np.maximum(spread / MEDIAN_OF_EXPONENTIAL, least)
+
+
+def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> FloatArray:
+    """Most evident track of the fundamental on a logarithmic grid, (K,) in Hz.
+
+    Parameters
+    ----------
+    ratio : (K, bins) float
+        Power over noise floor.
+    bin_hz : float
+        Spacing of the bins.
+    settings : HarmonicSettings
+        Range, teeth and rate of change.
+
+    Examples
+    --------
+    >>> ratio = np.ones((5, 1300))
+    >>> ratio[:, 60::60] = 100.0
+    >>> bool(np.abs(best_path(ratio, 1.0, HarmonicSettings()) / 60.0 - 1).max() < 2e-3)
+    True
+    """
+    # Half a resolution at the highest tooth, so that no tooth falls between two candidates.
+    step = 0.5 / (settings.window_s * settings.band_high_hz)
+    count = int(np.log(settings.high_hz / settings.low_hz) / step) + 2
+    grid = np.geomspace(settings.low_hz, settings.high_hz, count)
+    evidence = _comb_evidence(ratio, grid, bin_hz, settings)
+    reach = max(1, int(np.ceil(settings.max_rate_hz * settings.hop_s / step)))
+    return np.asarray(grid[_viterbi(evidence, reach)])
+
+
+def _comb_evidence(
+    ratio: FloatArray, grid: FloatArray, bin_hz: float, settings: HarmonicSettings
+) -> FloatArray:
+    gain = np.log1p(ratio) - settings.tooth_price
+    evidence = np.zeros((len(ratio), len(grid)))
+    for h in range(1, settings.max_harmonics + 1):
+        inside = h * grid <= settings.band_high_hz
+        evidence[:, inside] += gain[:, np.round(h * grid[inside] / bin_hz).astype(np.intp)]
+    return evidence
+
+
+def _viterbi(evidence: FloatArray, reach: int) -> NDArray[np.intp]:
+    """Index of the best path whose steps are at most `reach`; a full step costs one nat."""
+    offsets = np.arange(-reach, reach + 1)
+    cost = (offsets / reach) ** 2
+    columns = np.arange(evidence.shape[1])
+    score, back = evidence[0], np.zeros(evidence.shape, dtype=np.intp)
+    for k in range(1, len(evidence)):
+        padded = np.pad(score, reach, constant_values=-np.inf)
+        reached = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1) - cost
+        best = np.argmax(reached, axis=1)
+        back[k] = columns + offsets[best]
+        score = evidence[k] + reached[columns, best]
+    path = np.empty(len(evidence), dtype=np.intp)
+    path[-1] = np.argmax(score)
+    for k in range(len(evidence) - 1, 0, -1):
+        path[k - 1] = back[k, path[k]]
+    return path

@@ -1,0 +1,329 @@
+r"""Radial speed from the Doppler shift of an engine line, where Doppler is usable at all.
+
+.. math:: f_r = f_0 / (1 + v_r / c), \qquad v_r > 0 \text{ receding},
+
+on the receiver's clock, v_r being that of the emission (retarded time). The frequency at rest f_0 of an
+unknown vehicle is unknown, and the engine's speed wanders: a change of the line proves nothing by itself. It
+is therefore read as Doppler only if the S-curve of a straight pass-by explains it, better than a line at rest
+and better than a smoothly drifting engine, to within the measured variance, if the harmonics agree, and if
+the line grows louder and fainter as the range of that pass-by says. In all other cases the answer is
+`NotUsable`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.values import NotUsable
+
+from .geometry import SPEED_OF_SOUND_M_S
+from .harmonics import HarmonicTrack
+from .scurve import PARAMETERS, PassBy, fit_pass_by, radial_speed_gradient, radial_speed_m_s
+
+FloatArray = NDArray[np.float64]
+
+# A drifting engine: up to a cubic in time, which has as many parameters as the S-curve.
+DRIFT_DEGREES = (1, 2, 3)
+# A smaller change of level than this says nothing.
+LEAST_SWING_DB = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class DopplerSettings:
+    """When Doppler counts as usable.
+
+    Parameters
+    ----------
+    min_windows : int
+        Fewest windows in the track.
+    min_share : float
+        Least share of windows in which the line was found.
+    min_lines : int
+        Fewest harmonics (median over windows); with 1 a single tone will do and their agreement is not
+        tested.
+    max_disagreement : float
+        Largest median reduced chi-squared of the harmonics against one fundamental.
+    relative_floor : float
+        Relative standard deviation added to every frequency: what even a steady engine does.
+    min_gain : float
+        By how much the S-curve's BIC must beat each rival's.
+    max_misfit : float
+        Largest reduced chi-squared of the S-curve.
+    min_level_gain, max_level_gain : float
+        Slope of the line's level against -20 log10 of the fitted range, 1 in free field, where that range
+        changes by 3 dB or more. An engine that slows down at the kerb keeps its level.
+    min_level_correlation : float
+        Least correlation of the two under the same condition. A gain in (-inf, inf) and a correlation of -1
+        skip the test.
+    max_std_m_s : float
+        Largest standard deviation of the radial speed (median over the track).
+    max_speed_m_s : float
+        Fastest vehicle.
+
+    Examples
+    --------
+    >>> DopplerSettings(min_lines=3).min_lines
+    3
+    """
+
+    min_windows: int = 12
+    min_share: float = 0.6
+    min_lines: int = 1
+    max_disagreement: float = 4.0
+    relative_floor: float = 3e-4
+    min_gain: float = 10.0
+    max_misfit: float = 4.0
+    min_level_gain: float = 0.4
+    max_level_gain: float = 2.5
+    min_level_correlation: float = 0.8
+    max_std_m_s: float = 1.0
+    max_speed_m_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        in_range("min_windows", self.min_windows, PARAMETERS + 2, np.inf)
+        in_range("min_share", self.min_share, 0.0, 1.0)
+        in_range("min_lines", self.min_lines, 1, np.inf)
+        in_range("max_disagreement", self.max_disagreement, 0.0, np.inf, open_low=True)
+        in_range("relative_floor", self.relative_floor, 0.0, 0.1)
+        in_range("min_gain", self.min_gain, 0.0, np.inf)
+        in_range("max_misfit", self.max_misfit, 0.0, np.inf, open_low=True)
+        in_range("max_std_m_s", self.max_std_m_s, 0.0, np.inf, open_low=True)
+        in_range("max_speed_m_s", self.max_speed_m_s, 1.0, 100.0)
+
+
+@dataclass(frozen=True, slots=True)
+class RadialSpeed:
+    """Radial speed of one vehicle over its track.
+
+    Parameters
+    ----------
+    time_s : (K,) float
+        Receiver's clock, as in the track.
+    radial_speed_m_s : (K,) float
+        v_r at emission, positive while receding.
+    variance_m2_s2 : (K,) float
+        Its variance, from the fit.
+    rest_frequency_hz : float
+        f_0.
+    speed_m_s, closest_range_m, closest_time_s : float
+        v and d of the straight pass-by, and when its closest point is heard (receiver's clock).
+    misfit : float
+        Reduced chi-squared of the S-curve.
+    """
+
+    time_s: FloatArray
+    radial_speed_m_s: FloatArray
+    variance_m2_s2: FloatArray
+    rest_frequency_hz: float
+    speed_m_s: float
+    closest_range_m: float
+    closest_time_s: float
+    misfit: float
+
+
+def radial_speed(
+    track: HarmonicTrack,
+    settings: DopplerSettings | None = None,
+    *,
+    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+) -> RadialSpeed | NotUsable:
+    r"""Read the radial speed off a tracked engine line, or say why it cannot be read.
+
+    The S-curve (f_0, v, tau_0, d) is compared with a line at rest and with engines that drift as a
+    polynomial, by
+
+    .. math:: \mathrm{BIC} = \chi^2 + k \ln K.
+
+    Parameters
+    ----------
+    track : HarmonicTrack
+        From `worldstate.frontend.harmonics.track_fundamental`.
+    settings : DopplerSettings, optional
+        When to answer.
+    speed_of_sound_m_s : float
+        c.
+
+    Returns
+    -------
+    RadialSpeed or NotUsable
+        The reason is one of: too few windows, too few harmonics, harmonics that disagree, a line that does
+        not move, one that drifts as well without Doppler, one that wanders more than any S-curve, or too
+        large a variance.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the track is not finite or its arrays differ in length.
+
+    Notes
+    -----
+    An engine that changes its speed along exactly an S-curve cannot be told from a pass-by by its line alone.
+    Source: section IV of the paper; BIC by G. Schwarz, Ann. Statist. 6, 1978.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 4.0, 0.1)
+    >>> v_r = radial_speed_m_s(t, 12.0, 2.0, 5.0, 343.0)
+    >>> ones, level_db = np.ones(40), -20 * np.log10(np.hypot(5, 12 * (t - 2)))
+    >>> rest = (1e-4 * ones, ones.astype(int), 0 * ones, level_db, 40)
+    >>> moving = radial_speed(HarmonicTrack(t, 100 / (1 + v_r / 343), *rest))
+    >>> bool(np.abs(moving.radial_speed_m_s - v_r).max() < 0.01)
+    True
+    >>> radial_speed(HarmonicTrack(t, 100 * ones, *rest))
+    NotUsable(reason='the line does not move: its frequency at rest is unknown')
+    """
+    chosen = settings or DopplerSettings()
+    time, frequency, variance = _checked(track)
+    poor = _too_poor(track, chosen)
+    if poor is not None:
+        return poor
+    std = np.sqrt(variance + (chosen.relative_floor * frequency) ** 2)
+    fit = fit_pass_by(time, frequency, std, chosen.max_speed_m_s, speed_of_sound_m_s)
+    rejected = _rejected(time, frequency, std, fit, chosen)
+    if rejected is not None:
+        return rejected
+    speed = _read_out(time, fit, speed_of_sound_m_s)
+    wrong_level = _wrong_level(track.level_db, speed, chosen)
+    if wrong_level is not None:
+        return wrong_level
+    typical = float(np.sqrt(np.median(speed.variance_m2_s2)))
+    if not typical <= chosen.max_std_m_s:
+        return NotUsable(f"radial speed known to {typical:.1f} m/s only, more than {chosen.max_std_m_s:g}")
+    return speed
+
+
+def radial_speed_from_rest(
+    frequency_hz: ArrayLike,
+    variance_hz2: ArrayLike,
+    rest_frequency_hz: float,
+    rest_variance_hz2: float = 0.0,
+    *,
+    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+) -> tuple[FloatArray, FloatArray]:
+    r"""Radial speed and its variance where the frequency at rest is known.
+
+    .. math:: v_r = c\,(f_0 / f - 1), \qquad
+              \mathrm{var}(v_r) = (c / f)^2 \big[\mathrm{var}(f_0) + (f_0 / f)^2\,\mathrm{var}(f)\big]
+
+    Parameters
+    ----------
+    frequency_hz, variance_hz2 : array_like, same shape
+        Received line and its variance.
+    rest_frequency_hz, rest_variance_hz2 : float
+        f_0 > 0 and its variance.
+    speed_of_sound_m_s : float
+        c.
+
+    Returns
+    -------
+    radial_speed_m_s, variance_m2_s2 : float arrays
+        Positive while receding.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On values out of range.
+
+    Examples
+    --------
+    >>> radial_speed_from_rest([103.0], [1e-4], 100.0)[0].round(2)
+    array([-9.99])
+    """
+    frequency = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
+    variance = finite_array("variance_hz2", np.atleast_1d(variance_hz2), frequency.shape)
+    rest = in_range("rest_frequency_hz", rest_frequency_hz, 0.0, np.inf, open_low=True)
+    rest_variance = in_range("rest_variance_hz2", rest_variance_hz2, 0.0, np.inf)
+    if not np.all(frequency > 0) or not np.isfinite(frequency).all() or variance.min() < 0:
+        raise InvalidArgumentError("frequency_hz, variance_hz2: expected positive and non-negative numbers")
+    speed = speed_of_sound_m_s * (rest / frequency - 1.0)
+    gain = (speed_of_sound_m_s / frequency) ** 2
+    return np.asarray(speed), np.asarray(gain * (rest_variance + (rest / frequency) ** 2 * variance))
+
+
+def _checked(track: HarmonicTrack) -> tuple[FloatArray, FloatArray, FloatArray]:
+    time = finite_array("time_s", track.time_s, (None,))
+    frequency = finite_array("frequency_hz", track.frequency_hz, time.shape)
+    variance = finite_array("variance_hz2", track.variance_hz2, time.shape)
+    finite_array("lines", track.lines, time.shape)
+    finite_array("misfit", track.misfit, time.shape)
+    finite_array("level_db", track.level_db, time.shape)
+    if np.any(frequency <= 0) or np.any(variance < 0) or np.any(np.diff(time) <= 0):
+        raise InvalidArgumentError("track: expected ascending times, frequencies > 0 and variances >= 0")
+    return time, frequency, variance
+
+
+def _too_poor(track: HarmonicTrack, settings: DopplerSettings) -> NotUsable | None:
+    found = len(track.time_s)
+    if found < settings.min_windows or found < settings.min_share * track.windows:
+        return NotUsable(f"no stable line: found in {found} of {track.windows} windows")
+    lines = float(np.median(track.lines))
+    if lines < settings.min_lines:
+        return NotUsable(f"{lines:g} harmonics, fewer than {settings.min_lines}")
+    disagreement = float(np.median(track.misfit))
+    if disagreement > settings.max_disagreement:
+        return NotUsable(f"the harmonics disagree: reduced chi-squared {disagreement:.1f}")
+    return None
+
+
+def _rejected(
+    time: FloatArray, frequency: FloatArray, std: FloatArray, fit: PassBy, settings: DopplerSettings
+) -> NotUsable | None:
+    """Return the reason why the S-curve is not the explanation, if there is one."""
+    price = np.log(len(time))
+    curve = fit.chi_squared + PARAMETERS * price
+    at_rest = _polynomial_chi_squared(time, frequency, std, 0) + price
+    if at_rest < curve + settings.min_gain:
+        return NotUsable("the line does not move: its frequency at rest is unknown")
+    misfit = fit.chi_squared / (len(time) - PARAMETERS)
+    if misfit > settings.max_misfit:
+        return NotUsable(f"the line wanders: reduced chi-squared {misfit:.1f} against a pass-by")
+    drift = min(_polynomial_chi_squared(time, frequency, std, k) + (k + 1) * price for k in DRIFT_DEGREES)
+    if drift < curve + settings.min_gain:
+        return NotUsable("a drifting engine explains the line as well as a pass-by")
+    return None
+
+
+def _polynomial_chi_squared(time: FloatArray, frequency: FloatArray, std: FloatArray, degree: int) -> float:
+    unit = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
+    H = legendre.legvander(unit, degree) / std[:, None]
+    y = frequency / std
+    return float(np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2))
+
+
+def _wrong_level(level_db: FloatArray, speed: RadialSpeed, settings: DopplerSettings) -> NotUsable | None:
+    """Return the reason if the loudness of the line does not follow the range of the pass-by."""
+    emission = speed.time_s - speed.closest_time_s
+    expected = -20.0 * np.log10(np.hypot(speed.closest_range_m, speed.speed_m_s * emission))
+    if np.ptp(expected) < LEAST_SWING_DB:
+        return None
+    centred = expected - expected.mean()
+    heard = level_db - level_db.mean()
+    gain = float(centred @ heard / (centred @ centred))
+    correlation = gain * float(np.linalg.norm(centred) / max(np.linalg.norm(heard), np.finfo(float).tiny))
+    follows = settings.min_level_gain <= gain <= settings.max_level_gain
+    if follows and correlation >= settings.min_level_correlation:
+        return None
+    return NotUsable(
+        f"the level does not follow the range of a pass-by: gain {gain:.2f}, correlation {correlation:.2f}"
+    )
+
+
+def _read_out(time: FloatArray, fit: PassBy, sound: float) -> RadialSpeed:
+    f0, v, closest, d = (float(x) for x in fit.values)
+    misfit = fit.chi_squared / (len(time) - PARAMETERS)
+    gradient = radial_speed_gradient(time, fit.values, sound)
+    variance = np.einsum("ki,ij,kj->k", gradient, fit.covariance, gradient) * max(misfit, 1.0)
+    return RadialSpeed(
+        time_s=time,
+        radial_speed_m_s=radial_speed_m_s(time, v, closest, d, sound),
+        variance_m2_s2=variance,
+        rest_frequency_hz=f0,
+        speed_m_s=v,
+        closest_range_m=d,
+        closest_time_s=closest + d / sound,
+        misfit=misfit,
+    )

@@ -1,0 +1,124 @@
+r"""Signatures of band energies: shape without level, and which bands tell vehicles from background.
+
+Source of the profile: R. A. Fisher, "The use of multiple measurements in taxonomic problems", 1936, one band
+at a time.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+FloatArray = NDArray[np.float64]
+
+
+def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
+    r"""Remove the level from log band energies: what remains does not change with gain or range.
+
+    .. math:: s_b = \ln E_b - \frac1B \sum_{b'} \ln E_{b'}
+
+    Parameters
+    ----------
+    band_log_energy : (..., B) float
+        Log energy of each band, any base; 16 bands in this library.
+
+    Returns
+    -------
+    (..., B) float
+        Same base, mean zero over bands.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are fewer than two bands or a value is not finite.
+
+    Examples
+    --------
+    >>> level_invariant_shape([1.0, 2.0, 6.0])
+    array([-2., -1.,  3.])
+    """
+    energy = finite_array("band_log_energy", band_log_energy, (None,) * np.ndim(band_log_energy))
+    if energy.ndim == 0 or energy.shape[-1] < 2:
+        raise InvalidArgumentError(f"band_log_energy: expected at least 2 bands, got shape {energy.shape}")
+    return np.asarray(energy - energy.mean(axis=-1, keepdims=True))
+
+
+def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
+    r"""Fisher ratio of every band between two classes.
+
+    .. math:: F_b = \frac{(\mu_{1b} - \mu_{0b})^2}{\sigma_{1b}^2 + \sigma_{0b}^2}
+
+    Parameters
+    ----------
+    vehicle, background : (n, B), (m, B) float
+        One signature a row, for example of `level_invariant_shape`; at least two rows each.
+
+    Returns
+    -------
+    (B,) float
+        >= 0, with unbiased variances; 0 where both classes are the same constant, infinite where two
+        constants differ.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On a wrong shape, too few rows or non-finite values.
+
+    Notes
+    -----
+    Sampling lifts it: without any difference its mean is about 1/(2n) + 1/(2m).
+
+    Examples
+    --------
+    >>> fisher_profile([[3.0, 0.0], [5.0, 2.0]], [[0.0, 0.0], [2.0, 2.0]])
+    array([2.25, 0.  ])
+    """
+    one = finite_array("vehicle", vehicle, (None, None))
+    zero = finite_array("background", background, (None, one.shape[1]))
+    if min(len(one), len(zero)) < 2:
+        raise InvalidArgumentError(f"expected at least 2 rows of each class, got {len(one)} and {len(zero)}")
+    distance = (one.mean(axis=0) - zero.mean(axis=0)) ** 2
+    spread = one.var(axis=0, ddof=1) + zero.var(axis=0, ddof=1)
+    constant = np.where(distance > 0, np.inf, 0.0)
+    return np.asarray(np.divide(distance, spread, out=constant, where=spread > 0))
+
+
+def discriminative_range_hz(
+    profile: ArrayLike, edges_hz: ArrayLike, share: float = 0.5
+) -> tuple[float, float]:
+    """Find the contiguous range of bands around the best one whose ratio is at least a share of it.
+
+    Parameters
+    ----------
+    profile : (B,) float
+        Fisher ratios, finite.
+    edges_hz : (B + 1,) float
+        Ascending edges of the bands.
+    share : float
+        Of the largest ratio, in (0, 1].
+
+    Returns
+    -------
+    low_hz, high_hz : float
+        Edges of the range.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On wrong shapes or values.
+
+    Examples
+    --------
+    >>> discriminative_range_hz([0.1, 0.8, 1.0, 0.2], [50.0, 300.0, 900.0, 1800.0, 4000.0])
+    (300.0, 1800.0)
+    """
+    ratio = finite_array("profile", profile, (None,))
+    edges = finite_array("edges_hz", edges_hz, (len(ratio) + 1,))
+    if len(ratio) == 0 or np.any(np.diff(edges) <= 0) or not 0 < share <= 1:
+        raise InvalidArgumentError("expected at least one band, ascending edges and a share in (0, 1]")
+    best = int(np.argmax(ratio))
+    below = np.flatnonzero(ratio < share * ratio[best])
+    low = int(below[below < best].max(initial=-1)) + 1
+    high = int(below[below > best].min(initial=len(ratio)))
+    return float(edges[low]), float(edges[high])

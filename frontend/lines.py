@@ -1,0 +1,160 @@
+r"""The teeth of a comb: frequency and variance of each, and the fundamental that they agree on.
+
+Each tooth is demodulated by the track found so far and its slope, so that a gliding one stays sharp, and its
+frequency climbs to the maximum of the windowed periodogram by Newton steps. To first order in the noise, with
+n counted from the centre of the window w,
+
+.. math:: \sigma_h^2 = \frac{1}{2\,\mathrm{SNR}} \frac{(\sum w)^2}{\sum w^2}
+          \frac{\sum w^2 n^2}{(\sum w n^2)^2}, \qquad \mathrm{SNR} = \text{peak power over floor}.
+
+All teeth together give
+
+.. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
+          \chi^2 = \frac{1}{H - 1} \sum_h \frac{(f_h - h \hat f)^2}{\sigma_h^2}.
+
+Source: the variance is the first-order perturbation of the windowed maximum of Rife and Boorstyn 1974.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .comb import ZERO_PADDING, FloatArray, HarmonicSettings
+
+# Largest correction, in resolutions 1 / window, that a tooth's Newton steps may make.
+REACH = 0.75
+NEWTON_STEPS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Fundamental:
+    """What the teeth of K windows say together.
+
+    Parameters
+    ----------
+    frequency_hz, variance_hz2 : (K,) float
+        Fundamental and its variance, widened where the teeth disagree; no meaning without teeth.
+    lines : (K,) int
+        Teeth that entered.
+    misfit : (K,) float
+        Reduced chi-squared of the teeth; 0 with fewer than two.
+    power : (K,) float
+        Sum of the teeth's powers above the floor, in the units of the spectrum.
+    """
+
+    frequency_hz: FloatArray
+    variance_hz2: FloatArray
+    lines: NDArray[np.intp]
+    misfit: FloatArray
+    power: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Windows:
+    """Samples of every window with the noise floor of their spectra.
+
+    Parameters
+    ----------
+    frames : (K, n) float
+        Samples, not windowed.
+    shape : (n,) float
+        The window.
+    floor : (K, bins) float
+        Noise power of the windowed, zero-padded spectra.
+    rate_hz : float
+        Sample rate.
+    """
+
+    frames: FloatArray
+    shape: FloatArray
+    floor: FloatArray
+    rate_hz: float
+
+    @property
+    def n(self) -> FloatArray:
+        """Sample index from the centre of the window, (n,)."""
+        return np.asarray(np.arange(len(self.shape)) - 0.5 * (len(self.shape) - 1), dtype=np.float64)
+
+
+def measure_fundamental(
+    windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray, settings: HarmonicSettings
+) -> Fundamental:
+    """Refine a track of the fundamental from all its teeth.
+
+    Parameters
+    ----------
+    windows : Windows
+        K of them.
+    fundamental_hz, slope_hz_s : (K,) float
+        Track so far and its rate of change.
+    settings : HarmonicSettings
+        Which teeth count.
+
+    Examples
+    --------
+    >>> t = np.arange(1000) / 4000.0
+    >>> wave = np.cos(2 * np.pi * 60.3 * t) + np.cos(2 * np.pi * 120.6 * t)
+    >>> windows = Windows(wave[None], np.hanning(1000), np.ones((1, 2000)), 4000.0)
+    >>> measure_fundamental(windows, np.array([60.0]), np.zeros(1), HarmonicSettings()).frequency_hz.round(2)
+    array([60.3])
+    """
+    most = min(settings.max_harmonics, int(settings.band_high_hz / fundamental_hz.min()))
+    teeth = np.arange(1, most + 1)
+    measured = [_tooth(windows, int(h), fundamental_hz, slope_hz_s, settings) for h in teeth]
+    frequency, variance, power = (np.stack(part, axis=1) for part in zip(*measured, strict=True))
+    return _combined(frequency, variance, power, teeth)
+
+
+def _tooth(
+    windows: Windows, h: int, fundamental: FloatArray, slope: FloatArray, settings: HarmonicSettings
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Frequency, variance and power of tooth h in every window; infinite and 0 where it is of no use."""
+    n, rate = windows.n, windows.rate_hz
+    turn = 2 * np.pi * h * (np.outer(fundamental, n / rate) + 0.5 * np.outer(slope, (n / rate) ** 2))
+    base = windows.shape * windows.frames * np.exp(-1j * turn)
+    shift = np.zeros(len(base))
+    for _ in range(NEWTON_STEPS):
+        shift = shift + _newton_shift(base * np.exp(-1j * np.outer(shift, n)), n)
+    peak = np.abs((base * np.exp(-1j * np.outer(shift, n))).sum(axis=1)) ** 2
+    floor = _floor_at(windows, h * fundamental)
+    snr = peak / floor
+    use = (snr >= settings.tooth_snr) & (np.abs(shift) <= 2 * np.pi * REACH / len(n))
+    use &= h * fundamental <= settings.band_high_hz
+    variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * (rate / (2 * np.pi)) ** 2
+    frequency = h * fundamental + shift * rate / (2 * np.pi)
+    return frequency, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
+
+
+def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
+    bins = np.round(frequency * ZERO_PADDING * len(windows.shape) / windows.rate_hz).astype(np.intp)
+    return np.asarray(windows.floor[np.arange(len(bins)), np.minimum(bins, windows.floor.shape[1] - 1)])
+
+
+def _newton_shift(demodulated: NDArray[np.complex128], n: FloatArray) -> FloatArray:
+    """Newton step, rad per sample, to the maximum of |sum z exp(-j d n)|^2 from d = 0."""
+    s0, s1, s2 = demodulated.sum(axis=1), demodulated @ n, demodulated @ n**2
+    slope = 2.0 * (s0.conj() * s1).imag
+    curvature = 2.0 * (np.abs(s1) ** 2 - (s0.conj() * s2).real)
+    reach = 2 * np.pi * REACH / len(n)
+    step = np.divide(-slope, curvature, out=np.sign(slope) * reach, where=curvature < 0)
+    return np.asarray(np.clip(step, -reach, reach))
+
+
+def _line_variance(window: FloatArray, n: FloatArray) -> float:
+    """Variance, (rad per sample)^2 at unit SNR, of the peak of a windowed periodogram."""
+    spread = np.sum(window**2 * n**2) / np.sum(window * n**2) ** 2
+    return float(0.5 * window.sum() ** 2 / np.sum(window**2) * spread)
+
+
+def _combined(
+    frequency: FloatArray, variance: FloatArray, power: FloatArray, teeth: NDArray[np.intp]
+) -> Fundamental:
+    """Weigh all teeth, (K, H), into one fundamental per window."""
+    weight = 1.0 / variance
+    count = np.count_nonzero(weight, axis=1)
+    information = np.maximum((weight * teeth**2).sum(axis=1), np.finfo(float).tiny)
+    fundamental = (weight * teeth * frequency).sum(axis=1) / information
+    squares = (weight * (frequency - np.outer(fundamental, teeth)) ** 2).sum(axis=1)
+    misfit = np.where(count > 1, squares / np.maximum(count - 1, 1), 0.0)
+    return Fundamental(fundamental, np.maximum(misfit, 1.0) / information, count, misfit, power.sum(axis=1))

@@ -1,0 +1,155 @@
+r"""The frequency curve of a tone that drives past in a straight line, on the receiver's clock.
+
+At emission time tau a source of speed v, closest at range d when tau = tau_0, has
+
+.. math:: r(\tau) = \sqrt{d^2 + v^2 (\tau - \tau_0)^2}, \qquad v_r = v^2 (\tau - \tau_0) / r,
+
+and is heard at :math:`t = \tau + r(\tau)/c` with frequency :math:`f_r = f_0 / (1 + v_r / c)`. With
+:math:`T = t - \tau_0` the emission time is closed-form,
+
+.. math:: \tau - \tau_0 = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}.
+
+Source: P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.2 (sound of a moving source).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+FloatArray = NDArray[np.float64]
+
+SLOWEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 0.3, 300.0
+# Starting points of the fit: places of the closest approach along the track, speeds and ranges.
+START_PLACES = (-0.1, 0.15, 0.35, 0.5, 0.65, 0.85, 1.1)
+START_SHAPES = ((8.0, 4.0), (20.0, 10.0))
+PARAMETERS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PassBy:
+    """A fitted pass-by.
+
+    Parameters
+    ----------
+    values : (4,) float
+        f_0 in Hz, v in m/s, tau_0 in seconds on the receiver's clock, d in metres.
+    covariance : (4, 4) float
+        Of these, from the information of the fit.
+    chi_squared : float
+        Sum of squared normalised residuals.
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    chi_squared: float
+
+
+def radial_speed_m_s(
+    time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float, sound_m_s: float
+) -> FloatArray:
+    """Radial speed at emission of what is heard at each time, positive while receding, shape of `time_s`.
+
+    Parameters
+    ----------
+    time_s : float array
+        Receiver's clock, seconds.
+    speed_m_s, closest_s, range_m : float
+        v, tau_0 (emission time) and d.
+    sound_m_s : float
+        c > v.
+
+    Examples
+    --------
+    >>> radial_speed_m_s(np.array([-100.0, 0.01, 100.0]), 15.0, 0.0, 3.43, 343.0).round(2)
+    array([-15.,   0.,  15.])
+    """
+    c, v, d = sound_m_s, speed_m_s, range_m
+    T = time_s - closest_s
+    emission = (c**2 * T - np.sqrt(d**2 * (c**2 - v**2) + (v * c * T) ** 2)) / (c**2 - v**2)
+    return np.asarray(v**2 * emission / np.sqrt(d**2 + (v * emission) ** 2))
+
+
+def fit_pass_by(
+    time_s: FloatArray,
+    frequency_hz: FloatArray,
+    std_hz: FloatArray,
+    max_speed_m_s: float,
+    sound_m_s: float,
+) -> PassBy:
+    """Fit the four parameters by weighted least squares from several starting points.
+
+    Parameters
+    ----------
+    time_s, frequency_hz, std_hz : (K,) float
+        Track of the tone and its standard deviation.
+    max_speed_m_s : float
+        Upper limit of v.
+    sound_m_s : float
+        c.
+
+    Examples
+    --------
+    >>> t = np.linspace(0.0, 4.0, 40)
+    >>> f = 100.0 / (1 + radial_speed_m_s(t, 12.0, 2.1, 5.0, 343.0) / 343.0)
+    >>> fit_pass_by(t, f, np.full(40, 0.01), 60.0, 343.0).values.round(3)
+    array([100. ,  12. ,   2.1,   5. ])
+    """
+    duration = float(np.ptp(time_s))
+    low = np.array([0.7 * frequency_hz.min(), SLOWEST_M_S, time_s[0] - 2 * duration - 1, NEAREST_M])
+    high = np.array([1.4 * frequency_hz.max(), max_speed_m_s, time_s[-1] + 2 * duration + 1, FARTHEST_M])
+
+    def residuals(values: FloatArray) -> FloatArray:
+        heard = values[0] / (1 + _radial_speed(time_s, values, sound_m_s) / sound_m_s)
+        return np.asarray((heard - frequency_hz) / std_hz)
+
+    scale = np.array([frequency_hz.mean() * 0.01, 5.0, 0.5, 5.0])
+    fits = [
+        least_squares(residuals, np.clip(start, low, high), bounds=(low, high), x_scale=scale, max_nfev=60)
+        for start in _starts(time_s, frequency_hz)
+    ]
+    best = min(fits, key=lambda fit: float(fit.cost))
+    best = least_squares(residuals, best.x, bounds=(low, high), x_scale=scale, max_nfev=300)
+    covariance = np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-14)
+    return PassBy(best.x, covariance, 2.0 * float(best.cost))
+
+
+def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: float) -> FloatArray:
+    """Differentiate the radial speed by (f_0, v, tau_0, d), (K, 4), centrally.
+
+    Parameters
+    ----------
+    time_s : (K,) float
+        Receiver's clock.
+    values : (4,) float
+        As in `PassBy`.
+    sound_m_s : float
+        c.
+
+    Examples
+    --------
+    >>> radial_speed_gradient(np.array([60.0]), np.array([100.0, 12.0, 0.0, 5.0]), 343.0).round(3) + 0.0
+    array([[0., 1., 0., 0.]])
+    """
+    columns = [np.zeros_like(time_s)]
+    for k in (1, 2, 3):
+        step = np.zeros(4)
+        step[k] = 1e-5 * max(1.0, abs(values[k]))
+        ahead, behind = (_radial_speed(time_s, values + side, sound_m_s) for side in (step, -step))
+        columns.append((ahead - behind) / (2 * step[k]))
+    return np.stack(columns, axis=1)
+
+
+def _radial_speed(time_s: FloatArray, values: FloatArray, sound_m_s: float) -> FloatArray:
+    _, speed, closest, distance = values
+    return radial_speed_m_s(time_s, float(speed), float(closest), float(distance), sound_m_s)
+
+
+def _starts(time_s: FloatArray, frequency_hz: FloatArray) -> list[FloatArray]:
+    middle = 0.5 * (frequency_hz.min() + frequency_hz.max())
+    duration = float(np.ptp(time_s))
+    return [
+        np.array([middle, v, time_s[0] + place * duration, d]) for place in START_PLACES for v, d in
+        START_SHAPES
+    ]
