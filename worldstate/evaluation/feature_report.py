@@ -72,7 +72,6 @@ def group_figures(table: FeatureTable, predictions: Predictions) -> dict[str, Fi
         here = table.environments == environment
         scored = here & (table.hazards | table.hazard_free)
         figures[environment] = {
-            "n_windows": int(here.sum()),
             "accuracy": rate(correct, here),
             "auroc": auroc(predictions.score[scored], table.hazards[scored]),
             "tpr": rate(predictions.decision, here & table.hazards),
@@ -102,7 +101,7 @@ def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> d
         "n_hazard": int(table.hazards.sum()),
         "n_hazard_free": int(table.hazard_free.sum()),
         "n_recordings": len(np.unique(table.recording_keys)),
-        "per_group": _mean_groups([group_figures(table, predictions) for predictions in published]),
+        "per_group": _mean_groups(table, [group_figures(table, predictions) for predictions in published]),
     }
 
 
@@ -162,5 +161,11 @@ def _absent_figures(table: FeatureTable, passes: Sequence[Predictions]) -> Figur
     return figures
 
 
-def _mean_groups(passes: Sequence[dict[str, Figures]]) -> dict[str, Figures]:
-    return {environment: mean_figures([one[environment] for one in passes]) for environment in passes[0]}
+def _mean_groups(table: FeatureTable, passes: Sequence[dict[str, Figures]]) -> dict[str, Figures]:
+    return {
+        environment: {
+            "n_windows": int((table.environments == environment).sum()),
+            **mean_figures([one[environment] for one in passes]),
+        }
+        for environment in passes[0]
+    }
