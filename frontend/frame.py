@@ -25,7 +25,7 @@ class AcousticFrame:
     srp : ndarray of float64, shape (A,)
         SRP-PHAT of the decision window, 0..1.
     bearing_rad, bearing_std_rad : float
-        Strongest peak over the last `bearing_hops` hops: it refers to half that interval before `stamp_ns`.
+        Strongest peak over the last `bearing_hops` hops.
     prominence : float
         Peak-to-median ratio of the spectrum that the bearing was read from.
     band_log_energy : ndarray of float64, shape (16,)
@@ -34,6 +34,8 @@ class AcousticFrame:
         Approach rate at the end of the window.
     feature : ndarray of float64, shape (60,)
         The published feature of the decision window: two halves x thirty azimuths, from left to right.
+    bearing_age_s : float
+        How long before `stamp_ns` the middle of the bearing's interval was, seconds.
     """
 
     stamp_ns: int
@@ -46,3 +48,4 @@ class AcousticFrame:
     band_log_energy: NDArray[np.float64]
     looming: Looming | NotUsable
     feature: NDArray[np.float64]
+    bearing_age_s: float = 0.0

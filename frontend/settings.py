@@ -27,7 +27,8 @@ class FrontEndSettings:
     window_hops : int
         Hops in the decision window of `srp` and `feature`, even: the feature has two segments.
     bearing_hops : int
-        Hops behind `bearing_rad`, at most `window_hops`: fewer follow a moving source, more suppress noise.
+        Hops behind `bearing_rad`, at most `window_hops`. More suppress noise, but a car that passes turns
+        by tens of degrees a second, and the bearing is that of the middle of the interval.
     azimuth_span_deg : (float, float)
         First and last azimuth searched, left positive.
     azimuth_step_deg : float
@@ -59,7 +60,7 @@ class FrontEndSettings:
     nfft: int = FEATURE_NFFT
     hop_rate_hz: float = 10.0
     window_hops: int = 10
-    bearing_hops: int = 3
+    bearing_hops: int = 2
     azimuth_span_deg: tuple[float, float] = (-90.0, 90.0)
     azimuth_step_deg: float = 1.0
     srp_band_hz: Band = (300.0, 1800.0)

@@ -141,6 +141,7 @@ class FrontEnd:
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),
+            bearing_age_s=self._age_s(settings.bearing_hops, hop.end),
         )
 
     def _last(self, n_hops: int) -> list[HopSums]:
@@ -151,6 +152,11 @@ class FrontEnd:
         total = np.sum([hop.power for hop in hops], axis=0)
         n_frames = sum(hop.n_frames for hop in hops)
         return normalised(total, n_frames, len(self._listener.srp_bins), self.array.n_microphones)
+
+    def _age_s(self, n_hops: int, end: int) -> float:
+        hops = self._last(n_hops)
+        centre = sum(hop.n_frames * hop.centre for hop in hops) / sum(hop.n_frames for hop in hops)
+        return (end - centre) / self.sample_rate_hz
 
     def _feature(self) -> NDArray[np.float64]:
         hops = self._last(self.settings.window_hops)
