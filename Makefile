@@ -21,7 +21,7 @@ demo: $(VENV)/.core
 	$(BIN)/worldstate demo --out out/demo
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow

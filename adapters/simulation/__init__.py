@@ -1,6 +1,6 @@
 """A blind junction that can be heard: scene, vehicle, propagation, background, camera, data set."""
 
-from .dataset import LogRow, write_dataset, write_recording
+from .dataset import LogRow, write_dataset, write_log, write_recording
 from .presets import DEFAULT_PRESET, PRESETS, Preset, preset
 from .recording import SimulatedRecording, simulate_recording
 from .scene import SITES, Site, site
@@ -20,5 +20,6 @@ __all__ = [
     "simulate_recording",
     "site",
     "write_dataset",
+    "write_log",
     "write_recording",
 ]

@@ -146,7 +146,7 @@ def write_dataset(
         rows.append(row)
         if progress is not None:
             progress(row)
-    write_text(folder / LOG_NAME, _log(rows))
+    write_log(folder, rows)
     return rows
 
 
@@ -229,9 +229,16 @@ def _write_json(path: Path, value: dict[str, Any]) -> None:
     path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _log(rows: list[LogRow]) -> str:
+def write_log(root: str | Path, rows: list[LogRow]) -> None:
+    """Write `DataLog.csv`, in place of the one that is there.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["ID", "Environment", "Class", "T0"])
     writer.writerows([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
-    return text.getvalue()
+    write_text(Path(root) / LOG_NAME, text.getvalue())

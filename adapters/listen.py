@@ -1,0 +1,150 @@
+"""Sound in, world-state out: the whole chain over a recording, for those who bring no loop of their own."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from worldstate.abduction.cueing import CueingPolicy
+from worldstate.abduction.signature import SignatureModel
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.array_xml import read_array_xml
+from worldstate.adapters.audio import open_audio
+from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.detections import DetectionLog, read_detections
+from worldstate.adapters.model_file import load_model
+from worldstate.adapters.ovad import Recording
+from worldstate.adapters.vision import VisionQuery
+from worldstate.filter import WorldFilter
+from worldstate.frontend.array import MicrophoneArray, roof_array_56
+from worldstate.frontend.stream import AcousticFrame
+from worldstate.measurement import Measurement
+from worldstate.state import Context, WorldState
+
+BLOCKS_PER_SECOND = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording with all that is needed to listen to it.
+
+    Parameters
+    ----------
+    audio_path : Path
+        Multichannel sound file.
+    array : MicrophoneArray
+        One microphone a channel, in the order of the channels.
+    detections : DetectionLog or None
+        What the camera reported; None counts as not asked.
+    model : SignatureModel
+        From features to likelihoods.
+    policy : CueingPolicy
+        Threshold, sustained rule and risk map.
+    context : Context
+        Rates, occluders, ego motion.
+    t0_s : float or None
+        Line-of-sight entry where the recording knows it, seconds from its start.
+    """
+
+    audio_path: Path
+    array: MicrophoneArray
+    detections: DetectionLog | None
+    model: SignatureModel
+    policy: CueingPolicy
+    context: Context
+    t0_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One hop: what was heard, what was measured, what is believed."""
+
+    frame: AcousticFrame
+    measurement: Measurement
+    state: WorldState
+
+
+def open_source(
+    path: Path | str,
+    *,
+    array: Path | str | MicrophoneArray | None = None,
+    detections: Path | str | DetectionLog | None = None,
+    model: Path | str | None = None,
+    alpha: float = 0.02,
+    context: Context | None = None,
+) -> Source:
+    """Find everything that belongs to a sound file or to a recording folder.
+
+    Parameters
+    ----------
+    path : path
+        Multichannel sound file, or a recording folder in the OVAD layout.
+    array : path or MicrophoneArray, optional
+        Acoular XML; the built-in 56-microphone roof array where not given.
+    detections : path or DetectionLog, optional
+        Camera detections per frame; those of the recording folder where not given.
+    model : path, optional
+        Model file; the one that ships where not given.
+    alpha : float
+        False-positive budget that the threshold was set for; the model file says which it holds.
+    context : Context, optional
+        Rates, occluders and ego motion; defaults where not given.
+
+    Raises
+    ------
+    InputFileError
+        If a file is missing or damaged; the message names it.
+    InvalidArgumentError
+        If the model holds no threshold for `alpha`.
+    """
+    path = Path(path)
+    recording = Recording.open(path) if path.is_dir() else None
+    signature, policies = load_model(model)
+    found = detections if detections is not None else recording and recording.detections_path
+    return Source(
+        audio_path=recording.audio_path if recording else path,
+        array=_array(array),
+        detections=found if found is None or isinstance(found, DetectionLog) else read_detections(found),
+        model=signature,
+        policy=policies.for_alpha(alpha),
+        context=context or Context(),
+        t0_s=recording.t0_s if recording and recording.label != "none" else None,
+    )
+
+
+def _array(array: Path | str | MicrophoneArray | None) -> MicrophoneArray:
+    if array is None:
+        return roof_array_56()
+    return array if isinstance(array, MicrophoneArray) else read_array_xml(array)
+
+
+def listen(path: Path | str, **options: object) -> Iterator[WorldState]:
+    """Yield one world-state a hop (0.1 s) from a sound file or recording folder.
+
+    Takes the options of `open_source`.
+
+    Examples
+    --------
+    >>> for state in listen("some.wav", array="mics.xml", detections="d.json"):  # doctest: +SKIP
+    ...     print(state.stamp_ns, state.risk)
+    """
+    for step in listen_steps(open_source(path, **options)):  # type: ignore[arg-type]
+        yield step.state
+
+
+def listen_steps(source: Source) -> Iterator[Step]:
+    """Yield every hop of `source` with what was heard and measured.
+
+    Raises
+    ------
+    InputFileError
+        If the sound file is damaged or does not fit the array.
+    """
+    with open_audio(source.audio_path, expect_channels=source.array.positions_m.shape[0]) as audio:
+        vision = VisionQuery(PinholeCamera(), source.detections)
+        adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.model, vision=vision)
+        world = WorldFilter(context=source.context, policy=source.policy)
+        for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
+            for frame in adapter.front_end.process(block):
+                measurement = adapter.interpret(frame)
+                world = world.predict_to(measurement.stamp_ns).update(measurement)
+                yield Step(frame, measurement, world.state)

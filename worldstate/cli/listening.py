@@ -1,0 +1,18 @@
+"""Run a source with a bar that follows the audio."""
+
+from pathlib import Path
+
+from worldstate.adapters.audio import open_audio
+from worldstate.adapters.listen import Source
+from worldstate.cli.progress import progress_bar
+from worldstate.evaluation.recording import RecordingReport, run_recording
+
+
+def listen_with_progress(source: Source, *, title: str, states_path: Path | None) -> RecordingReport:
+    """Listen to `source` to its end while a bar on standard error counts seconds of audio."""
+    with open_audio(source.audio_path) as audio:
+        hops = 10.0 * audio.frames / audio.sample_rate_hz
+    with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
+        return run_recording(
+            source, title=title, states_path=states_path, on_hop=lambda step: bar.advance()
+        )

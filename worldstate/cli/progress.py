@@ -1,0 +1,33 @@
+"""Progress on standard error for anything that takes more than two seconds."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+
+class Bar:
+    """Handle of one running progress bar."""
+
+    def __init__(self, progress: Progress, task: int) -> None:
+        self._progress = progress
+        self._task = task
+
+    def advance(self, amount: float = 1.0) -> None:
+        """Move the bar on by `amount` of its total."""
+        self._progress.advance(self._task, amount)  # type: ignore[arg-type]
+
+
+@contextmanager
+def progress_bar(description: str, total: float | None, *, quiet: bool = False) -> Iterator[Bar]:
+    """Show a bar on standard error while the block runs; nothing where `quiet` or not a terminal.
+
+    Examples
+    --------
+    >>> with progress_bar("working", 3, quiet=True) as bar:
+    ...     bar.advance()
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
+        yield Bar(progress, progress.add_task(description, total=total))

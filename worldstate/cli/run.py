@@ -1,0 +1,60 @@
+"""`worldstate run`: a recording in, one snapshot a hop out."""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.output import print_summary
+
+DESCRIPTION = """\
+Listen to a recording and keep the world-state.
+
+INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), or the folder of one recording in the OVAD layout
+(out_multi.wav and, where there is one, camera_baseline_results.json). Without detections the camera counts as
+not asked, which is neither presence nor absence."""
+
+EXAMPLE = """\
+examples:
+  worldstate run some.wav --array mics.xml --detections d.json --out states.jsonl
+  worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "run",
+        help="sound in, one world-state a hop out",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="sound file or recording folder")
+    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
+    parser.add_argument("--detections", type=Path, metavar="JSON", help="camera detections per frame")
+    parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
+    parser.add_argument(
+        "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
+    )
+    parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    from worldstate.adapters.listen import open_source
+    from worldstate.cli.listening import listen_with_progress
+    from worldstate.evaluation.timeline import write_timeline
+
+    source = open_source(
+        arguments.input,
+        array=arguments.array,
+        detections=arguments.detections,
+        model=arguments.model,
+        alpha=arguments.alpha,
+    )
+    report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
+    if arguments.figure is not None:
+        write_timeline(report.timeline, arguments.figure)
+    print_summary(report.to_dict(), as_json=arguments.json)
+    return 0

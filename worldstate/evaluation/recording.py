@@ -1,0 +1,151 @@
+"""Run one recording through the whole chain and keep what the figures need, hop by hop."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from worldstate.adapters.atomic import atomic_path
+from worldstate.adapters.listen import Source, Step, listen_steps
+from worldstate.evaluation.timeline import Timeline
+from worldstate.evaluation.warning import WarningMeter, WarningSummary
+from worldstate.state import Entity, WorldState
+from worldstate.values import seconds
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingReport:
+    """Outcome of one recording.
+
+    Parameters
+    ----------
+    warning : WarningSummary
+        Advisories against line-of-sight entry.
+    timeline : Timeline
+        What the figure draws.
+    hops : int
+        Decisions taken.
+    peak_risk : float
+        Largest risk of all hops.
+    realtime_factor : float
+        Seconds of audio per second of wall time, the whole chain.
+    """
+
+    warning: WarningSummary
+    timeline: Timeline
+    hops: int
+    peak_risk: float
+    realtime_factor: float
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the summary as JSON-able values; unknown is None."""
+        figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
+        return asdict(self.warning) | figures
+
+
+def run_recording(
+    source: Source,
+    *,
+    title: str = "",
+    states_path: Path | None = None,
+    on_hop: Callable[[Step], None] = lambda step: None,
+) -> RecordingReport:
+    """Listen to `source` to its end.
+
+    Parameters
+    ----------
+    source : Source
+        From `open_source`.
+    title : str
+        Heading of the timeline.
+    states_path : Path, optional
+        Where to write one snapshot a line; nothing half-written is left on an error.
+    on_hop : callable
+        Called after each hop, for progress.
+
+    Raises
+    ------
+    InputFileError
+        If a file of the source is damaged.
+    """
+    log = _HopLog(WarningMeter(source.t0_s))
+    started = time.perf_counter()
+    with _states_writer(states_path) as write_state:
+        for step in listen_steps(source):
+            write_state(step.state)
+            log.add(step)
+            on_hop(step)
+    elapsed_s = time.perf_counter() - started
+    return RecordingReport(
+        warning=log.meter.summary(),
+        timeline=log.timeline(source, title),
+        hops=len(log.time_s),
+        peak_risk=max(log.risk, default=0.0),
+        realtime_factor=(log.time_s[-1] if log.time_s else 0.0) / elapsed_s,
+    )
+
+
+@contextmanager
+def _states_writer(path: Path | None) -> Iterator[Callable[[WorldState], None]]:
+    if path is None:
+        yield lambda state: None
+        return
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        yield lambda state: print(state.to_json(), file=file)
+
+
+@dataclass(slots=True)
+class _HopLog:
+    """A few numbers a hop: an hour of audio stays within some ten megabytes."""
+
+    meter: WarningMeter
+    time_s: list[float] = field(default_factory=list)
+    statistic: list[float] = field(default_factory=list)
+    risk: list[float] = field(default_factory=list)
+    advisory: list[bool] = field(default_factory=list)
+    srp: list[np.ndarray] = field(default_factory=list)
+    entity: list[tuple[float, float]] = field(default_factory=list)
+    sightings: list[tuple[float, float]] = field(default_factory=list)
+    azimuths_rad: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def add(self, step: Step) -> None:
+        state, now_s = step.state, seconds(step.state.stamp_ns)
+        self.meter.update(state)
+        self.time_s.append(now_s)
+        self.statistic.append(max((cue.statistic for cue in state.cues), default=0.0))
+        self.risk.append(state.risk)
+        self.advisory.append(any(cue.advisory for cue in state.cues))
+        self.srp.append(step.frame.srp.astype(np.float32))
+        self.azimuths_rad = step.frame.azimuths_rad
+        leading = _leading_entity(state)
+        self.entity.append((leading.azimuth_rad, leading.azimuth_std_rad) if leading else (np.nan, np.nan))
+        moving = (sighting for sighting in step.measurement.sightings if sighting.moving)
+        self.sightings.extend((now_s, sighting.azimuth_rad) for sighting in moving)
+
+    def timeline(self, source: Source, title: str) -> Timeline:
+        entity = np.array(self.entity, dtype=np.float64).reshape(-1, 2)
+        sightings = np.array(self.sightings, dtype=np.float64).reshape(-1, 2)
+        return Timeline(
+            time_s=np.array(self.time_s),
+            statistic=np.array(self.statistic),
+            risk=np.array(self.risk),
+            threshold=source.policy.gamma,
+            alpha=source.policy.alpha,
+            advisory=np.array(self.advisory, dtype=bool),
+            azimuths_rad=self.azimuths_rad,
+            srp=np.array(self.srp),
+            entity_azimuth_rad=entity[:, 0],
+            entity_std_rad=entity[:, 1],
+            sighting_time_s=sightings[:, 0],
+            sighting_azimuth_rad=sightings[:, 1],
+            t0_s=source.t0_s,
+            title=title,
+        )
+
+
+def _leading_entity(state: WorldState) -> Entity | None:
+    moving = [entity for entity in state.entities if entity.moving]
+    return max(moving, key=lambda entity: entity.existence_probability, default=None)

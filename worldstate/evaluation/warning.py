@@ -1,0 +1,92 @@
+"""What one recording's stream of states amounts to: advisories, lead time, hand-over."""
+
+from dataclasses import dataclass, field
+
+from worldstate.evaluation.advisories import LONGEST_LEAD_S, detection
+from worldstate.state import RiskCue, WorldState
+from worldstate.values import seconds
+
+
+@dataclass(frozen=True, slots=True)
+class WarningSummary:
+    """How the advisory stood to line-of-sight entry in one recording.
+
+    Parameters
+    ----------
+    t0_s : float or None
+        Line-of-sight entry, seconds from the start; None where unknown or nothing approaches.
+    first_advisory_s : float or None
+        First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
+    lead_time_s : float or None
+        ``t0_s - first_advisory_s`` where that onset came before line-of-sight entry.
+    false_advisories_before : int
+        Onsets more than 5 s before `t0_s`; without a `t0_s` every onset.
+    advisory_onsets_s : tuple of float
+        All rising edges of the advisory.
+    hidden_entity_id : str or None
+        The entity that the counted advisory spoke of.
+    visible_entity_id : str or None
+        The first moving entity that came into view.
+    """
+
+    t0_s: float | None
+    first_advisory_s: float | None
+    lead_time_s: float | None
+    false_advisories_before: int
+    advisory_onsets_s: tuple[float, ...]
+    hidden_entity_id: str | None
+    visible_entity_id: str | None
+
+
+@dataclass(slots=True)
+class WarningMeter:
+    """Counts advisories while states go by, and keeps none of them.
+
+    Parameters
+    ----------
+    t0_s : float or None
+        Line-of-sight entry on the clock of the states, seconds.
+    """
+
+    t0_s: float | None
+    _onsets: list[tuple[float, str | None]] = field(default_factory=list)
+    _raised: bool = False
+    _visible_id: str | None = None
+
+    def update(self, state: WorldState) -> None:
+        """Take in the next state of the recording."""
+        raised = [cue for cue in state.cues if cue.advisory]
+        if raised and not self._raised:
+            self._onsets.append((seconds(state.stamp_ns), _strongest(raised).entity_id))
+        self._raised = bool(raised)
+        if self._visible_id is None:
+            self._visible_id = _first_visible(state)
+
+    def summary(self) -> WarningSummary:
+        """Return the figures of all states so far."""
+        onsets_s = tuple(time_s for time_s, _ in self._onsets)
+        found = None if self.t0_s is None else detection(onsets_s, self.t0_s)
+        first_s, hidden_id = next(filter(self._speaks_of_vehicle, self._onsets), (None, None))
+        return WarningSummary(
+            t0_s=self.t0_s,
+            first_advisory_s=first_s,
+            lead_time_s=found.lead_time_s if found else None,
+            false_advisories_before=found.false_advisories_before if found else len(onsets_s),
+            advisory_onsets_s=onsets_s,
+            hidden_entity_id=hidden_id,
+            visible_entity_id=self._visible_id,
+        )
+
+    def _speaks_of_vehicle(self, onset: tuple[float, str | None]) -> bool:
+        return self.t0_s is None or onset[0] >= self.t0_s - LONGEST_LEAD_S
+
+
+def _strongest(cues: list[RiskCue]) -> RiskCue:
+    return max(cues, key=lambda cue: cue.risk)
+
+
+def _first_visible(state: WorldState) -> str | None:
+    for entity in state.entities:
+        if entity.status == "visible" and entity.moving:
+            return entity.id
+    return None
