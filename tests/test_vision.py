@@ -81,6 +81,9 @@ def test_a_moving_car_is_found_in_its_sector_and_nowhere_else(
     beyond = 10 * DEGREE + seen.width_rad / 2 + 0.001
     for away in (seen.azimuth_rad + beyond, seen.azimuth_rad - beyond):
         assert not isinstance(asked.ask(stamp_ns, bearing(away)), Present)
+    reach = beyond - 0.002
+    for at_its_edge in (seen.azimuth_rad + reach, seen.azimuth_rad - reach):
+        assert isinstance(asked.ask(stamp_ns, bearing(at_its_edge)), Present)
 
 
 def test_a_parked_car_is_seen_but_explains_nothing() -> None:
