@@ -62,7 +62,8 @@ class DopplerSettings:
     max_std_m_s : float
         Largest standard deviation of the radial speed (median over the track).
     max_speed_m_s : float
-        Fastest vehicle.
+        Fastest vehicle. An engine that runs down while its vehicle passes reads as a faster one: in town, set
+        what is driven there.
 
     Examples
     --------
@@ -81,7 +82,7 @@ class DopplerSettings:
     max_level_gain: float = 2.5
     min_level_correlation: float = 0.8
     max_std_m_s: float = 1.0
-    max_speed_m_s: float = 60.0
+    max_speed_m_s: float = 40.0
 
     def __post_init__(self) -> None:
         in_range("min_windows", self.min_windows, PARAMETERS + 2, np.inf)

@@ -1,8 +1,8 @@
 r"""The teeth of a comb: frequency and variance of each, and the fundamental that they agree on.
 
 Each tooth is demodulated by the track found so far and its slope, so that a gliding one stays sharp, and its
-frequency climbs to the maximum of the windowed periodogram by Newton steps. To first order in the noise, with
-n counted from the centre of the window w,
+frequency climbs to the maximum of the windowed periodogram by a Newton step. To first order in the noise,
+with n counted from the centre of the window w,
 
 .. math:: \sigma_h^2 = \frac{1}{2\,\mathrm{SNR}} \frac{(\sum w)^2}{\sum w^2}
           \frac{\sum w^2 n^2}{(\sum w n^2)^2}, \qquad \mathrm{SNR} = \text{peak power over floor}.
@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from .comb import ZERO_PADDING, FloatArray, HarmonicSettings
 
-# Largest correction, in resolutions 1 / window, that a tooth's Newton steps may make.
+# Largest correction, in resolutions 1 / window, that one Newton step may make to a tooth.
 REACH = 0.75
-NEWTON_STEPS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,34 +95,38 @@ def measure_fundamental(
     >>> t = np.arange(1000) / 4000.0
     >>> wave = np.cos(2 * np.pi * 60.3 * t) + np.cos(2 * np.pi * 120.6 * t)
     >>> windows = Windows(wave[None], np.hanning(1000), np.ones((1, 2000)), 4000.0)
-    >>> measure_fundamental(windows, np.array([60.0]), np.zeros(1), HarmonicSettings()).frequency_hz.round(2)
+    >>> measure_fundamental(windows, np.array([60.0]), np.zeros(1), HarmonicSettings()).frequency_hz.round(1)
     array([60.3])
     """
     most = min(settings.max_harmonics, int(settings.band_high_hz / fundamental_hz.min()))
     teeth = np.arange(1, most + 1)
-    measured = [_tooth(windows, int(h), fundamental_hz, slope_hz_s, settings) for h in teeth]
+    n, rate = windows.n, windows.rate_hz
+    turn = np.outer(fundamental_hz, n / rate) + 0.5 * np.outer(slope_hz_s, (n / rate) ** 2)
+    back = np.exp(-2j * np.pi * turn)
+    demodulated = np.asarray(windows.shape * windows.frames, dtype=np.complex128)
+    measured = []
+    for h in teeth:
+        demodulated *= back
+        measured.append(_tooth(windows, demodulated, h * fundamental_hz, settings))
     frequency, variance, power = (np.stack(part, axis=1) for part in zip(*measured, strict=True))
     return _combined(frequency, variance, power, teeth)
 
 
 def _tooth(
-    windows: Windows, h: int, fundamental: FloatArray, slope: FloatArray, settings: HarmonicSettings
+    windows: Windows,
+    demodulated: NDArray[np.complex128],
+    expected_hz: FloatArray,
+    settings: HarmonicSettings,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Frequency, variance and power of tooth h in every window; infinite and 0 where it is of no use."""
-    n, rate = windows.n, windows.rate_hz
-    turn = 2 * np.pi * h * (np.outer(fundamental, n / rate) + 0.5 * np.outer(slope, (n / rate) ** 2))
-    base = windows.shape * windows.frames * np.exp(-1j * turn)
-    shift = np.zeros(len(base))
-    for _ in range(NEWTON_STEPS):
-        shift = shift + _newton_shift(base * np.exp(-1j * np.outer(shift, n)), n)
-    peak = np.abs((base * np.exp(-1j * np.outer(shift, n))).sum(axis=1)) ** 2
-    floor = _floor_at(windows, h * fundamental)
+    """Frequency, variance and power of a tooth in every window; infinite and 0 where it is of no use."""
+    n, turns = windows.n, windows.rate_hz / (2 * np.pi)
+    shift, peak = _newton_shift(demodulated, n)
+    floor = _floor_at(windows, expected_hz)
     snr = peak / floor
-    use = (snr >= settings.tooth_snr) & (np.abs(shift) <= 2 * np.pi * REACH / len(n))
-    use &= h * fundamental <= settings.band_high_hz
-    variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * (rate / (2 * np.pi)) ** 2
-    frequency = h * fundamental + shift * rate / (2 * np.pi)
-    return frequency, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
+    use = (snr >= settings.tooth_snr) & (np.abs(shift) < 2 * np.pi * REACH / len(n))
+    use &= expected_hz <= settings.band_high_hz
+    variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * turns**2
+    return expected_hz + shift * turns, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
 
 
 def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
@@ -131,14 +134,16 @@ def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
     return np.asarray(windows.floor[np.arange(len(bins)), np.minimum(bins, windows.floor.shape[1] - 1)])
 
 
-def _newton_shift(demodulated: NDArray[np.complex128], n: FloatArray) -> FloatArray:
-    """Newton step, rad per sample, to the maximum of |sum z exp(-j d n)|^2 from d = 0."""
-    s0, s1, s2 = demodulated.sum(axis=1), demodulated @ n, demodulated @ n**2
+def _newton_shift(demodulated: NDArray[np.complex128], n: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Newton step from d = 0, rad per sample, to the maximum of |sum z exp(-j d n)|^2, and its height."""
+    s0, s1, s2 = (demodulated @ np.stack([np.ones_like(n), n, n**2], axis=1)).T
+    height = np.abs(s0) ** 2
     slope = 2.0 * (s0.conj() * s1).imag
     curvature = 2.0 * (np.abs(s1) ** 2 - (s0.conj() * s2).real)
     reach = 2 * np.pi * REACH / len(n)
     step = np.divide(-slope, curvature, out=np.sign(slope) * reach, where=curvature < 0)
-    return np.asarray(np.clip(step, -reach, reach))
+    step = np.clip(step, -reach, reach)
+    return step, np.maximum(height + slope * step + 0.5 * curvature * step**2, height)
 
 
 def _line_variance(window: FloatArray, n: FloatArray) -> float:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +25,8 @@ SLOWEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 0.3, 300.0
 START_PLACES = (-0.1, 0.15, 0.35, 0.5, 0.65, 0.85, 1.1)
 START_SHAPES = ((8.0, 4.0), (20.0, 10.0))
 PARAMETERS = 4
+# All starts are followed a little way, the best of them to the end.
+ROUGH_EVALUATIONS, EVALUATIONS, FINALISTS = 12, 300, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +107,15 @@ def fit_pass_by(
         return np.asarray((heard - frequency_hz) / std_hz)
 
     scale = np.array([frequency_hz.mean() * 0.01, 5.0, 0.5, 5.0])
-    fits = [
-        least_squares(residuals, np.clip(start, low, high), bounds=(low, high), x_scale=scale, max_nfev=60)
-        for start in _starts(time_s, frequency_hz)
-    ]
-    best = min(fits, key=lambda fit: float(fit.cost))
-    best = least_squares(residuals, best.x, bounds=(low, high), x_scale=scale, max_nfev=300)
+
+    def fit(start: FloatArray, evaluations: int) -> OptimizeResult:
+        inside = np.clip(start, low, high)
+        return least_squares(residuals, inside, bounds=(low, high), x_scale=scale, max_nfev=evaluations)
+
+    rough = [fit(start, ROUGH_EVALUATIONS) for start in _starts(time_s, frequency_hz)]
+    rough.sort(key=lambda found: float(found.cost))
+    finals = [fit(found.x, EVALUATIONS) for found in rough[:FINALISTS]]
+    best = min(finals, key=lambda found: float(found.cost))
     covariance = np.linalg.pinv(best.jac.T @ best.jac, rcond=1e-14)
     return PassBy(best.x, covariance, 2.0 * float(best.cost))
 
@@ -150,6 +155,7 @@ def _starts(time_s: FloatArray, frequency_hz: FloatArray) -> list[FloatArray]:
     middle = 0.5 * (frequency_hz.min() + frequency_hz.max())
     duration = float(np.ptp(time_s))
     return [
-        np.array([middle, v, time_s[0] + place * duration, d]) for place in START_PLACES for v, d in
-        START_SHAPES
+        np.array([middle, v, time_s[0] + place * duration, d])
+        for place in START_PLACES
+        for v, d in START_SHAPES
     ]

@@ -57,9 +57,7 @@ class SubspaceTracker:
     1
     """
 
-    def __init__(
-        self, sources: int, *, guard: int = 2, iterations: int = 2, tolerance: float = 0.05
-    ) -> None:
+    def __init__(self, sources: int, *, guard: int = 2, iterations: int = 2, tolerance: float = 0.05) -> None:
         if sources < 1 or guard < 0 or iterations < 1:
             raise InvalidArgumentError(
                 f"expected sources >= 1, guard >= 0, iterations >= 1, got {sources}, {guard}, {iterations}"

@@ -82,9 +82,7 @@ def test_ml_weighting_beats_phat_where_coherence_varies():
     for _ in range(150):
         X = delayed([1e-4, 0.0], rng, frames=60, noise=1.0, level=level)
         for weighting in errors:
-            errors[weighting].append(
-                gcc_delays(X, FREQUENCIES, 1e-3, weighting=weighting).delay_s[0] - 1e-4
-            )
+            errors[weighting].append(gcc_delays(X, FREQUENCIES, 1e-3, weighting=weighting).delay_s[0] - 1e-4)
     assert np.var(errors["ml"]) < 0.7 * np.var(errors["phat"])
 
 
