@@ -13,9 +13,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.chain import equilibrium, generator, transition
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.seeing import log_co_evidence
-from worldstate.belief.side import Side
 
-SIDES = (Side("left", 0.56, 0.96, 0.35), Side("right", -0.56, -0.96, 0.35))
 DIRECTIONS = ("left", "right")
 rates = st.tuples(*[st.floats(0.0, 3.0)] * 6)
 positive_rates = st.tuples(*[st.floats(0.01, 3.0)] * 6)
@@ -29,7 +27,7 @@ answers = st.one_of(
 
 
 def co_terms(answer, weight=1.0):
-    return log_co_evidence(answer, (), SIDES, 0.6, weight)
+    return log_co_evidence(answer, 2, weight)
 
 
 def evidence(left, right, visible, none):

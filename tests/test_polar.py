@@ -115,7 +115,7 @@ heard = st.tuples(st.floats(-3.1, 3.1), st.floats(-1, 1), st.floats(0, 1), st.fl
 def test_the_covariance_stays_symmetric_and_positive(seed, looks):
     belief, prior = random_belief(seed), MotionBelief.around((0.9, 0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
     for azimuth, rate, weight, time_s in looks:
-        belief = relax(predict(belief, time_s, 2.0), prior, 0.03)
+        belief = relax(predict(belief, time_s, 2.0), prior, 0.97, 0.9)
         belief = update_approach(update_azimuth(belief, azimuth, 0.1, weight), rate, 0.3, weight)
         assert (belief.covariance == belief.covariance.T).all()
         assert np.linalg.eigvalsh(belief.covariance)[0] > 0
@@ -134,9 +134,24 @@ def test_relaxation_returns_to_the_prior_and_no_further():
     prior = MotionBelief.around((0.9, 0.0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
     belief = MotionBelief.around((-0.5, 0.5, -1.0, 2.0), (0.02, 0.05, 0.1, 0.1))
     for _ in range(400):
-        belief = relax(belief, prior, 0.033)
+        belief = relax(belief, prior, 0.967, 0.9)
     assert belief.mean == pytest.approx(prior.mean, abs=1e-4)
     assert belief.covariance == pytest.approx(prior.covariance, abs=1e-4)
+
+
+def test_relaxation_may_leave_the_bearing_alone():
+    prior = MotionBelief.around((0.9, 0.0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
+    belief = random_belief(1)
+    after = relax(belief, prior, 1.0, 0.0)
+    assert after.mean == pytest.approx([*belief.mean[:2], *prior.mean[2:]])
+    assert after.covariance[:2, :2] == pytest.approx(belief.covariance[:2, :2])
+    assert after.covariance[2:, 2:] == pytest.approx(prior.covariance[2:, 2:])
+
+
+def test_nobody_drives_through_the_array():
+    """At a constant bearing and a closing rate that nobody corrects, the azimuth stays what it is."""
+    belief = MotionBelief.around((-0.46, 0.0, -5.0, 3.0), (0.01, 0.01, 0.1, 0.5))
+    assert predict(belief, 1.0, 0.1).azimuth_rad == pytest.approx(-0.46)
 
 
 def mean_nees(runs, seed, steps=30):

@@ -77,9 +77,7 @@ def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: G
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
     explanation, predicted = memory.explanation, priors_of(memory.explanation)
     if weights.sound > 0.0:
-        answer = log_co_evidence(
-            measurement.co_evidence, memory.tracks, ground.sides, ground.view_half_angle_rad, weights.look
-        )
+        answer = log_co_evidence(measurement.co_evidence, len(ground.sides), weights.look)
         explanation = explanation.update(measurement.signature, weights.sound, answer)
     tracks = hear(memory.tracks, measurement, explanation, weights.sound, ground.settings)
     return replace(memory, explanation=explanation, tracks=tracks, predicted=predicted)

@@ -44,14 +44,16 @@ def match_hidden(
 ) -> dict[int, int]:
     """Return {track index: sighting index}: hidden entities that came into view.
 
-    A vehicle comes into view near the edge of what hid it. Each new moving sighting goes to the hidden entity
-    that is likeliest by its existence and the distance to that edge, best pair first.
+    A vehicle comes into view near the edge of what hid it. Of a new moving sighting there are two accounts:
+    it is a hidden entity, whose side may have been heard wrongly, or it is a vehicle that nobody heard. The
+    likelier one holds, best pair first.
     """
     pairs = sorted(
-        (-_emergence(track, sighting, sides, settings), i, j)
+        (-score, i, j)
         for i, track in enumerate(tracks)
         for j, sighting in sightings
-        if _may_emerge(track, sighting, sides, settings)
+        if not track.seen and sighting.moving
+        if (score := _emergence(track, sighting, sides, settings)) > 0.0
     )
     found: dict[int, int] = {}
     for _, i, j in pairs:
@@ -69,16 +71,15 @@ def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> flo
     return residual**2 / variance + (0.0 if sighting.moving == track.moving else _CHANGED_MIND)
 
 
-def _may_emerge(
-    track: Track, sighting: Sighting, sides: tuple[Side, ...], settings: FilterSettings
-) -> bool:
-    near = sides[track.side].distance_rad(sighting.azimuth_rad) <= settings.handover_gate_rad
-    return not track.seen and sighting.moving and near
-
-
 def _emergence(
     track: Track, sighting: Sighting, sides: tuple[Side, ...], settings: FilterSettings
 ) -> float:
-    spread = settings.handover_gate_rad / 2.0
-    distance = sides[track.side].distance_rad(sighting.azimuth_rad)
-    return math.log(max(track.existence, 1e-12)) - 0.5 * (distance / spread) ** 2
+    """Return the log odds of "this entity" against "nobody heard it"; -inf out of reach of any edge."""
+    distances = [side.distance_rad(sighting.azimuth_rad) for side in sides]
+    if min(distances) > settings.handover_gate_rad:
+        return -math.inf
+    near = [math.exp(-2.0 * (distance / settings.handover_gate_rad) ** 2) for distance in distances]
+    own = near.pop(track.side)
+    heard = (1.0 - settings.side_confusion) * own + settings.side_confusion * max(near, default=own)
+    unheard = settings.unheard_probability * max([own, *near])
+    return math.log(max(track.existence, 1e-12) * heard / unheard)

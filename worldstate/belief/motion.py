@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 # No range is ever measured from a standing ego; the belief about it only scales accelerations.
 _NEAREST_M, _FARTHEST_M = 3.0, 200.0
+# Nobody drives through the array: within a step a vehicle comes no closer than half its range.
+_CLOSEST_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,28 +84,33 @@ class _PolarEngine(ExtendedKalmanFilter):  # type: ignore[misc]
 
 def predict(belief: MotionBelief, step_s: float, acceleration_psd: float) -> MotionBelief:
     """Return the belief after `step_s` of constant velocity and white acceleration (m^2/s^3)."""
-    engine = _PolarEngine(belief)
+    start = belief.mean.copy()
+    if step_s > 0.0:
+        start[RADIAL_RATE] = max(start[RADIAL_RATE], -_CLOSEST_SHARE / step_s)
+    engine = _PolarEngine(MotionBelief(start, belief.covariance))
     range_m = min(max(math.exp(belief.mean[LOG_RANGE]), _NEAREST_M), _FARTHEST_M)
     engine.step_s = step_s
-    engine.F = jacobian(belief.mean, step_s)
+    engine.F = jacobian(start, step_s)
     engine.Q = process_noise(acceleration_psd, range_m, step_s)
     engine.predict()
     return _belief(engine.x, engine.P)
 
 
-def relax(belief: MotionBelief, towards: MotionBelief, share: float) -> MotionBelief:
+def relax(
+    belief: MotionBelief, towards: MotionBelief, bearing_kept: float, radial_kept: float
+) -> MotionBelief:
     r"""Return the belief drawn towards another, as an Ornstein-Uhlenbeck process draws it.
 
-    .. math:: m \leftarrow m_0 + \phi (m - m_0), \quad P \leftarrow \phi^2 P + (1 - \phi^2) P_0,
-        \qquad \phi = 1 - \mathrm{share}.
+    .. math:: m \leftarrow m_0 + \Phi (m - m_0), \quad P \leftarrow \Phi P \Phi + (I - \Phi^2) P_0
 
-    A vehicle that is still hidden has not arrived: without news, the longer it stays hidden the more it is
-    simply where hidden vehicles are. Constant velocity alone would drive it out of its occlusion unseen.
+    with :math:`\Phi` diagonal: `bearing_kept` for (theta, theta_dot), `radial_kept` for (rho, log r). P_0 has
+    to be diagonal. Constant velocity alone would drive a vehicle out of its occlusion unheard, or, at a
+    constant bearing whose range nobody measures, straight through the array.
     """
-    phi = 1.0 - share
+    phi = np.array([bearing_kept, bearing_kept, radial_kept, radial_kept])
     offset = belief.mean - towards.mean
     offset[AZIMUTH] = wrap_angle(float(offset[AZIMUTH]))
-    covariance = phi**2 * belief.covariance + (1.0 - phi**2) * towards.covariance
+    covariance = np.outer(phi, phi) * belief.covariance + (1.0 - phi**2)[:, None] * towards.covariance
     return _belief(towards.mean + phi * offset, covariance)
 
 

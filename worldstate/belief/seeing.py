@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
 from worldstate.measurement import Measurement, Sighting
 
 from .association import match_hidden, match_visible
@@ -19,7 +19,6 @@ from .track import Track, entity_id, merged, relabelled
 
 _NEW_RATE_STD = (0.5, 0.5)
 _PARKED_RATE_STD = (1e-3, 1e-3)
-_SAME_PLACE_RAD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,29 +31,18 @@ class Seen:
     born: int
 
 
-def log_co_evidence(
-    answer: CoEvidence,
-    tracks: tuple[Track, ...],
-    sides: tuple[Side, ...],
-    view_half_angle_rad: float,
-    weight: float,
-) -> NDArray[np.float64]:
+def log_co_evidence(answer: CoEvidence, directions: int, weight: float) -> NDArray[np.float64]:
     """Return w log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats.
 
-    A vehicle that is already known to be in view makes "present" expected whether or not another one is
-    hidden elsewhere, so a present answer speaks against a hidden source only near that vehicle.
+    Examples
+    --------
+    >>> log_co_evidence(Absent(miss_rate=0.04), 2, weight=0.5).round(2)
+    array([ 0.  ,  0.  , -1.61,  0.  ])
     """
-    if weight <= 0.0 or isinstance(answer, Unqueried):
-        return np.zeros(len(sides) + 2)
+    if weight <= 0.0:
+        return np.zeros(directions + 2)
     hidden, visible, none = (weight * answer.log_likelihoods()).tolist()
-    log_likelihood = np.array([*[hidden] * len(sides), visible, none])
-    in_view = [t for t in tracks if t.seen and t.moving and _in_view(t, view_half_angle_rad)]
-    if isinstance(answer, Present) and in_view:
-        expected = max(track.existence for track in in_view) * (1.0 - answer.miss_rate)
-        for k, side in enumerate(sides):
-            if all(_elsewhere(track, k, side) for track in in_view):
-                log_likelihood[k] = weight * np.log(max(answer.clutter_rate, expected))
-    return log_likelihood
+    return np.array([*[hidden] * directions, visible, none])
 
 
 def look(
@@ -77,7 +65,7 @@ def look(
         if i in known:
             after.append(_sighted(track, sightings[known[i]], measurement, settings))
         elif i in emerging:
-            after.append(_handed_over(track, sightings[emerging[i]], measurement, settings))
+            after.append(_handed_over(track, sightings[emerging[i]], measurement, sides, settings))
         else:
             after.append(_not_sighted(track, measurement.co_evidence, view_half_angle_rad, weight))
     handed_over = tuple(tracks[i].side for i in emerging)
@@ -103,10 +91,6 @@ def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Trac
 
 def _in_view(track: Track, view_half_angle_rad: float) -> bool:
     return abs(track.motion.azimuth_rad) <= view_half_angle_rad
-
-
-def _elsewhere(track: Track, k: int, side: Side) -> bool:
-    return track.side != k and side.distance_rad(track.motion.azimuth_rad) > _SAME_PLACE_RAD
 
 
 def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
@@ -138,15 +122,22 @@ def _sighted(track: Track, sighting: Sighting, measurement: Measurement, setting
 
 
 def _handed_over(
-    track: Track, sighting: Sighting, measurement: Measurement, settings: FilterSettings
+    track: Track,
+    sighting: Sighting,
+    measurement: Measurement,
+    sides: tuple[Side, ...],
+    settings: FilterSettings,
 ) -> Track:
-    """Return the hidden entity as vision now has it: same id, azimuth from the sighting, the rest kept."""
-    existence = max(track.existence, settings.sighting_existence)
+    """Return the hidden entity as vision now has it: same id, azimuth and side from the sighting."""
     seen = replace(
-        track, seen=True, existence=existence, motion=_motion_at(sighting, track.motion), labels=()
+        track,
+        seen=True,
+        side=nearest_side(sides, sighting.azimuth_rad),
+        existence=max(track.existence, settings.sighting_existence),
+        motion=_motion_at(sighting, track.motion),
     )
-    labelled = replace(seen, labels=((sighting.label, sighting.score),))
-    return replace(_sighted(labelled, sighting, measurement, settings), labels=labelled.labels)
+    labels = ((sighting.label, sighting.score),)
+    return replace(_sighted(seen, sighting, measurement, settings), labels=labels)
 
 
 def _not_sighted(

@@ -25,7 +25,9 @@ class FilterSettings:
     rearm_s : float
         No birth on a side that long after a hand-over: the window still holds the sound from before it.
     relaxation_s : float
-        Time in which a hidden entity without news returns to where hidden vehicles are.
+        Time in which what is not measured returns to what is known beforehand: the azimuth of a hidden
+        entity to where hidden vehicles are, the approach rate of any to its prior. A vehicle that is still
+        hidden has not arrived, whatever its approach rate said.
     acceleration_psd : float
         White acceleration of a moving vehicle, m^2/s^3.
     hidden_std : tuple of float
@@ -45,6 +47,11 @@ class FilterSettings:
         A sighting may belong to a visible entity within so many standard deviations and so many radians.
     handover_gate_rad : float
         A new sighting may be a hidden entity come into view within this of its occluder's edge.
+    side_confusion : float
+        P(the signature names the wrong side). On junctions that a signature model does not know it is
+        anything from rare to the rule.
+    unheard_probability : float
+        P(a vehicle comes into view just then that nobody heard): the rival account of a new sighting.
     handover_residual : float
         Share of P(hidden) that a hand-over leaves: the sighting may have been of another vehicle.
     sighting_existence : float
@@ -77,7 +84,7 @@ class FilterSettings:
     birth_probability: float = 0.5
     death_probability: float = 0.1
     rearm_s: float = 1.0
-    relaxation_s: float = 3.0
+    relaxation_s: float = 1.0
     acceleration_psd: float = 2.0
     hidden_std: tuple[float, float, float] = (0.15, 0.25, 0.6)
     hidden_inverse_tta_hz: float = 0.2
@@ -89,6 +96,8 @@ class FilterSettings:
     gate_sigma: float = 4.0
     gate_rad: float = 0.35
     handover_gate_rad: float = 0.8
+    side_confusion: float = 0.2
+    unheard_probability: float = 0.05
     handover_residual: float = 0.02
     sighting_existence: float = 0.5
     clutter_rate: float = 0.01
@@ -118,6 +127,8 @@ _PROBABILITIES = {
     "hidden_path_probability",
     "line_of_sight_path_probability",
     "handover_residual",
+    "side_confusion",
+    "unheard_probability",
     "sighting_existence",
     "clutter_rate",
     "delete_existence",

@@ -14,6 +14,8 @@ from .side import Side
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
 _LABEL_GAIN = 0.3
 _PARKED_ACCELERATION = 1e-4
+# What is assumed of a vehicle in view before its approach is measured; its azimuth is measured.
+_IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,15 +87,16 @@ def predict_track(
 ) -> Track:
     """Return the track after a time step.
 
-    `hidden_share` is P(hidden | exists): as far as it is hidden, it stays where hidden vehicles are.
+    `hidden_share` is P(hidden | exists): as far as it is hidden, its azimuth stays where hidden vehicles are.
     """
     acceleration = settings.acceleration_psd if track.moving else _PARKED_ACCELERATION
     motion = predict(track.motion, step_s, acceleration)
+    radial_kept = math.exp(-step_s / settings.relaxation_s)
     if track.seen:
         existence = after_time(track.existence, step_s, settings.visible_life_s)
-        return replace(track, motion=motion, existence=existence)
-    share = -math.expm1(-step_s * hidden_share / settings.relaxation_s)
-    return replace(track, motion=relax(motion, sides[track.side].prior(settings), share))
+        return replace(track, motion=relax(motion, _IN_VIEW, 1.0, radial_kept), existence=existence)
+    bearing_kept = math.exp(-step_s * hidden_share / settings.relaxation_s)
+    return replace(track, motion=relax(motion, sides[track.side].prior(settings), bearing_kept, radial_kept))
 
 
 def relabelled(labels: tuple[tuple[str, float], ...], sighting: Sighting) -> tuple[tuple[str, float], ...]:
