@@ -33,6 +33,7 @@ from .bins import band_bins, bin_frequencies_hz
 from .geometry import SPEED_OF_SOUND_M_S
 from .phat import whiten
 from .steering import Steering, cross_spectra
+from .threads import one_blas_thread
 
 FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
 """The published azimuths in this library's convention (left positive), in the published order."""
@@ -132,12 +133,11 @@ def published_feature(
     bins = band_bins(FEATURE_BAND_HZ, rate, FEATURE_NFFT)
     spectra = scipy.signal.stft(samples, nperseg=FEATURE_NFFT, axis=0)[2][bins.start : bins.stop]
     whitened = whiten(np.ascontiguousarray(spectra.transpose(2, 0, 1), np.complex64))
-    steering = feature_steering(array, bins, rate)
     length = len(whitened) // FEATURE_SEGMENTS
-    segments = [whitened[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
-    return np.concatenate(
-        [segment_feature([pair_sum(s, steering)], length, len(bins), array.n_microphones) for s in segments]
-    )
+    with one_blas_thread():
+        steering = feature_steering(array, bins, rate)
+        sums = [pair_sum(whitened[i * length :][:length], steering) for i in range(FEATURE_SEGMENTS)]
+    return np.concatenate([segment_feature([s], length, len(bins), array.n_microphones) for s in sums])
 
 
 @lru_cache(maxsize=8)

@@ -20,6 +20,7 @@ from .listener import HopSums, Listener
 from .looming import Looming, looming
 from .settings import FrontEndSettings
 from .srp import normalised
+from .threads import one_blas_thread
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
@@ -83,7 +84,8 @@ class FrontEnd:
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
-        self._listener = Listener(array, self.sample_rate_hz, settings)
+        with one_blas_thread():
+            self._listener = Listener(array, self.sample_rate_hz, settings)
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
 
@@ -121,8 +123,9 @@ class FrontEnd:
         return samples
 
     def _hear(self, hop: Hop) -> AcousticFrame | None:
-        self._hops.append(self._listener.push(hop.samples))
-        levels = self._meter.push(hop.samples)
+        with one_blas_thread():
+            self._hops.append(self._listener.push(hop.samples))
+            levels = self._meter.push(hop.samples)
         return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
