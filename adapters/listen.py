@@ -1,5 +1,6 @@
 """Sound in, world-state out: the whole chain over a recording, for those who bring no loop of their own."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import DetectionLog, read_detections
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.ovad import Recording
+from worldstate.adapters.sector import Sector
 from worldstate.adapters.vision import VisionQuery
 from worldstate.filter import WorldFilter
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
@@ -140,7 +142,8 @@ def listen_steps(source: Source) -> Iterator[Step]:
         If the sound file is damaged or does not fit the array.
     """
     with open_audio(source.audio_path, expect_channels=source.array.positions_m.shape[0]) as audio:
-        vision = VisionQuery(PinholeCamera(), source.detections)
+        sight = line_of_sight(source.context)
+        vision = VisionQuery(PinholeCamera(), source.detections, line_of_sight=sight)
         adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.model, vision=vision)
         world = WorldFilter(context=source.context, policy=source.policy)
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
@@ -148,3 +151,18 @@ def listen_steps(source: Source) -> Iterator[Step]:
                 measurement = adapter.interpret(frame)
                 world = world.predict_to(measurement.stamp_ns).update(measurement)
                 yield Step(frame, measurement, world.state)
+
+
+def line_of_sight(context: Context) -> Sector:
+    """Return the directions that no occluder of the context hides.
+
+    Examples
+    --------
+    >>> sector = line_of_sight(Context())
+    >>> bool(sector.touches(0.5)), bool(sector.touches(0.7))
+    (True, False)
+    """
+    edges = [occluder.edge_azimuth_rad for occluder in context.occluders]
+    left = min((edge for edge in edges if edge > 0), default=math.pi / 2)
+    right = max((edge for edge in edges if edge < 0), default=-math.pi / 2)
+    return Sector.between(right, left)

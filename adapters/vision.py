@@ -91,6 +91,10 @@ class VisionQuery:
         d in [0, 1], or a function from the stamp to d.
     settings : VisionSettings, optional
         How it is asked.
+    line_of_sight : Sector, optional
+        Directions in which a visible source can stand at all, known from the occluders of the context; all that
+        lies ahead where not given. What sounds from behind an occluder is hidden, or the image of a source in a
+        wall: if it is visible, it stands somewhere in line of sight, so that is what is searched.
 
     Raises
     ------
@@ -116,6 +120,7 @@ class VisionQuery:
         miss_rate: MissRateTable | None = None,
         degradation: float | Callable[[int], float] = 0.0,
         settings: VisionSettings | None = None,
+        line_of_sight: Sector = WHOLE_SIDES[None],
     ) -> None:
         self.camera = camera
         self.detections = detections
@@ -125,6 +130,7 @@ class VisionQuery:
         self._degradation = degradation
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         self._view = Sector.between(*camera.view_rad)
+        self._line_of_sight = line_of_sight
         if detections is not None:
             _check_size(camera, detections)
 
@@ -192,9 +198,12 @@ class VisionQuery:
         )
 
     def _sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:
+        """Return where a visible source would stand that explains what was heard."""
         if side is not None or isinstance(bearing, NotUsable):
-            return WHOLE_SIDES[side]
-        return Sector(bearing.azimuth_rad, self.settings.half_width_rad)
+            sector = WHOLE_SIDES[side]
+        else:
+            sector = Sector(bearing.azimuth_rad, self.settings.half_width_rad)
+        return sector.overlap(self._line_of_sight) or self._line_of_sight
 
     def _expected_miss_rate(self, sector: Sector, stamp_ns: int, labels: Collection[str]) -> float | None:
         """Return beta over the sector, None where nothing of it is in view."""

@@ -203,3 +203,12 @@ def test_refuses_detections_of_another_camera() -> None:
 def test_refuses_settings_without_meaning(setting: dict[str, float]) -> None:
     with pytest.raises(InvalidArgumentError, match=next(iter(setting))):
         VisionSettings(**setting)
+
+
+def test_what_sounds_from_behind_an_occluder_is_sought_in_line_of_sight() -> None:
+    sight = Sector(0.0, 0.5)
+    query = VisionQuery(CENTRED, EMPTY, line_of_sight=sight)
+    behind, anywhere = (query.ask(nanoseconds(1.0), asked) for asked in (bearing(0.9), NotUsable("coarse")))
+    assert isinstance(behind, Absent)
+    assert behind == anywhere
+    assert behind.miss_rate < 0.2
