@@ -101,7 +101,7 @@ def shaped_noise(density: Array, samples: int, rng: np.random.Generator, channel
 
 def noise_frequencies(samples: int, sample_rate_hz: float) -> Array:
     """Bins at which `shaped_noise` wants its density."""
-    return rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz)
+    return np.asarray(rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz))
 
 
 def _ambient_waves(

@@ -6,6 +6,7 @@ from scipy.fft import irfft, rfft, rfftfreq
 
 OCTAVES_HZ = 62.5 * 2.0 ** np.arange(8)  # 62.5 Hz .. 8 kHz
 TRANSITION_OCTAVES = 0.5
+REFERENCE_PA = 20e-6
 
 
 def octave_masks(frequencies_hz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -101,7 +102,4 @@ def level_curve(
     """
     density_db = octave_levels_db - 10.0 * np.log10(OCTAVES_HZ / np.sqrt(2.0))
     curve_db = np.interp(np.log2(np.maximum(frequencies_hz, 1.0)), np.log2(OCTAVES_HZ), density_db)
-    return (REFERENCE_PA**2) * 10.0 ** (curve_db / 10.0)
-
-
-REFERENCE_PA = 20e-6
+    return np.asarray(REFERENCE_PA**2 * 10.0 ** (curve_db / 10.0))

@@ -7,7 +7,7 @@ SPEED_OF_SOUND_MPS = 343.0
 
 
 def screen_attenuation_db(
-    detour_m: NDArray[np.float64], frequency_hz: NDArray[np.float64], cap_db: float = 40.0
+    detour_m: NDArray[np.floating], frequency_hz: NDArray[np.floating], cap_db: float = 40.0
 ) -> NDArray[np.float64]:
     r"""Attenuation by a thin screen beyond spherical spreading.
 

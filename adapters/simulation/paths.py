@@ -1,10 +1,10 @@
 """The ways from a moving source on the crossing street to a receiver in the ego's own street.
 
 Both streets are unfolded: facades of the crossing street mirror the source, side walls of the ego's street
-mirror the receiver. Every pair of images is one straight line through the mouth between the two corners. It is
-either lit, and then it is that line, or it is bent round the nearer corner and pays the screen attenuation. The
-side images decide where a hidden vehicle is heard: the corner's mirror image in the opposite side wall lies in
-much shallower shadow than the corner itself.
+mirror the receiver. Every pair of images is one straight line through the mouth between the two corners. It
+is either lit, and then it is that line, or it is bent round the nearer corner and pays the screen
+attenuation. The side images decide where a hidden vehicle is heard: the corner's mirror image in the
+opposite side wall lies in much shallower shadow than the corner itself.
 """
 
 from dataclasses import dataclass
@@ -181,7 +181,7 @@ def _trace(
 
 
 def _length(dx: float | Array, dy: Array, dz: float) -> Array:
-    return np.sqrt(dx * dx + dy * dy + dz * dz)
+    return np.asarray(np.sqrt(dx * dx + dy * dy + dz * dz))
 
 
 def _bent_length(
@@ -190,7 +190,7 @@ def _bent_length(
     """Shortest way over the vertical edge: the two legs lie in one unfolded plane."""
     before = np.hypot(source_x - mouth, source_y - edge_y)
     after = np.hypot(mouth, edge_y - end_y)
-    return np.hypot(before + after, height)
+    return np.asarray(np.hypot(before + after, height))
 
 
 def _near_facade(

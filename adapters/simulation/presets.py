@@ -55,7 +55,7 @@ class Preset:
     self_noise_db : float
         Electronic noise per microphone, whole band.
     gain_mismatch_db, delay_mismatch_s : float
-        Standard deviation of the channels' gains and delays.
+        Standard deviation of the channels' gains and delays; the latter includes scattering at the roof.
     late_db : float
         Late field of a vehicle at the mouth against its pressure at 1 m, dB.
     late_decay_s : float
@@ -72,19 +72,19 @@ class Preset:
     """
 
     name: str
-    ambient_octaves_db: tuple[float, ...] = (52.0, 50.0, 48.0, 46.0, 44.0, 40.0, 35.0, 30.0)
+    ambient_octaves_db: tuple[float, ...] = (57.0, 56.0, 56.0, 54.0, 52.0, 47.0, 41.0, 35.0)
     ambient_spread_db: float = 1.5
     ambient_waves: int = 72
-    lobe_concentration: float = 4.0
-    lobe_share: float = 0.5
+    lobe_concentration: float = 2.0
+    lobe_share: float = 0.1
     wave_fluctuation_db: float = 2.0
-    far_rate: float = 0.4
-    far_level_db: float = -3.0
-    wind_100hz_db: float = 40.0
-    self_noise_db: float = 32.0
+    far_rate: float = 0.3
+    far_level_db: float = -6.0
+    wind_100hz_db: float = 57.0
+    self_noise_db: float = 38.0
     gain_mismatch_db: float = 0.5
-    delay_mismatch_s: float = 8e-6
-    late_db: float = -30.0
+    delay_mismatch_s: float = 4e-5
+    late_db: float = -32.0
     late_decay_s: float = 0.7
     vehicle_spread_db: float = 1.5
     screen_cap_db: float = 24.0
@@ -97,8 +97,8 @@ class Preset:
             in_range(name, getattr(self, name), low, high)
 
 
-PRESETS = {preset.name: preset for preset in (Preset("street-0"),)}
-DEFAULT_PRESET = "street-0"
+PRESETS = {preset.name: preset for preset in (Preset("street-1"),)}
+DEFAULT_PRESET = "street-1"
 
 
 def preset(name: str = DEFAULT_PRESET) -> Preset:
@@ -111,7 +111,7 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
 
     Examples
     --------
-    >>> preset("street-0").ambient_waves
+    >>> preset("street-1").ambient_waves
     72
     """
     if name not in PRESETS:

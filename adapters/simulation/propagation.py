@@ -1,4 +1,4 @@
-"""A vehicle's sound carried along every path to every microphone."""
+"""A moving source carried along every path to every microphone."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from .diffraction import SPEED_OF_SOUND_MPS
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_paths
 from .scene import Site
 from .static_field import add_static
-from .vehicle import SOURCE_HEIGHT_M, Trajectory
+from .vehicle import SOURCE_HEIGHT_M
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]
@@ -22,7 +22,7 @@ FAINTEST = 1e-3  # a path below this share of the whole is left out
 
 @dataclass(frozen=True, slots=True)
 class Emission:
-    """What a vehicle sends out, split into octave bands between emission knots.
+    """What a source sends out, split into octave bands between emission knots.
 
     Parameters
     ----------
@@ -99,19 +99,27 @@ class Receiver:
         return float(self.positions_m[:, 2].mean()) - SOURCE_HEIGHT_M
 
 
-def add_vehicle(
-    out: Signal, emission: Emission, trajectory: Trajectory, site: Site, receiver: Receiver, cap_db: float
+def add_source(
+    out: Signal,
+    emission: Emission,
+    lane_x_m: float,
+    source_y_m: Array,
+    site: Site,
+    receiver: Receiver,
+    cap_db: float,
 ) -> None:
-    """Add one vehicle, by every path, to all microphones.
+    """Add one moving source, by every path, to all microphones.
 
     Parameters
     ----------
     out : ndarray, shape (M, K * KNOT_SAMPLES)
         Pa, float32, added to in place.
     emission : Emission
-        Its sound; the knots are those of `trajectory.time_s`.
-    trajectory : Trajectory
-        Where it is at the knots.
+        Its sound.
+    lane_x_m : float
+        Distance ahead of the lane along which it moves.
+    source_y_m : ndarray, shape (T,)
+        Its lateral position at the knots of `emission`.
     site : Site
         The junction.
     receiver : Receiver
@@ -119,13 +127,13 @@ def add_vehicle(
     cap_db : float
         Largest screen attenuation.
     """
-    paths = trace_paths(site, trajectory.lane_x_m, trajectory.source_y_m, receiver.height_m, cap_db)
+    paths = trace_paths(site, lane_x_m, source_y_m, receiver.height_m, cap_db)
     images = receiver_images(site)
     bent = np.zeros((len(images), 2, receiver.samples), np.float32)
     for path in _audible(paths):
         for edge in (LEFT, RIGHT):
             _add_bent(bent[images.index(path.receiver), edge], emission, path, edge, receiver.knots_s)
-        _add_lit(out, emission, path, trajectory.source_y_m, receiver)
+        _add_lit(out, emission, path, source_y_m, receiver)
     _add_corners(out, bent, images, site, receiver, emission.sample_rate_hz)
 
 

@@ -138,8 +138,8 @@ def site(name: str) -> Site:
         side_wall_left_m=left + set_back[0],
         side_wall_right_m=right + set_back[1],
         street_width_m=street,
-        side_reflection=rng.uniform(0.75, 0.9),
-        facade_reflection=rng.uniform(0.7, 0.85),
+        side_reflection=rng.uniform(0.77, 0.87),
+        facade_reflection=rng.uniform(0.45, 0.55),
     )
 
 

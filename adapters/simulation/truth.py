@@ -44,8 +44,8 @@ def _frames(
     columns = {
         "time_s": frames_s,
         "speed_mps": seen.speed_mps,
-        "azimuth_rad": np.arctan2(seen.source_y_m, seen.lane_x_m),
-        "range_m": np.hypot(seen.source_y_m, seen.lane_x_m),
+        "azimuth_rad": np.arctan2(seen.axle_y_m(), seen.lane_x_m),
+        "range_m": np.hypot(seen.axle_y_m(), seen.lane_x_m),
         "time_to_visible_s": settings.entry_s - frames_s,
     }
     sight = line_of_sight(seen, settings.site, camera)

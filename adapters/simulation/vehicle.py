@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from .bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 4.3, 1.8, 1.5
-SOURCE_BEHIND_FRONT_M = 1.2  # front axle: tyres and engine
+AXLES_BEHIND_FRONT_M = (0.9, 3.5)  # each axle is a source of its own; the engine is at the first
 SOURCE_HEIGHT_M = 0.3
 
 # CNOSSOS-EU, Directive (EU) 2015/996 as amended by (EU) 2021/1226, table F-1, category 1 (light vehicles):
@@ -49,10 +49,9 @@ class Trajectory:
     lane_x_m: float
     heading: int
 
-    @property
-    def source_y_m(self) -> NDArray[np.float64]:
-        """Where the sound comes from, shape (T,)."""
-        return self.front_y_m - self.heading * SOURCE_BEHIND_FRONT_M
+    def axle_y_m(self, axle: int = 0) -> NDArray[np.float64]:
+        """Lateral position of the front (0) or rear axle (1), shape (T,)."""
+        return self.front_y_m - self.heading * AXLES_BEHIND_FRONT_M[axle]
 
 
 def drive(
@@ -103,7 +102,7 @@ def rolling_level_db(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
     array([100.1])
     """
     speed_kmh = np.maximum(3.6 * speed_mps, SLOWEST_KMH)
-    return ROLLING_A_DB[:, None] + ROLLING_B_DB[:, None] * np.log10(speed_kmh / REFERENCE_KMH)
+    return np.asarray(ROLLING_A_DB[:, None] + ROLLING_B_DB[:, None] * np.log10(speed_kmh / REFERENCE_KMH))
 
 
 def propulsion_level_db(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -125,7 +124,10 @@ def emit(
     level_offset_db: float,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """Draw the emitted pressure at 1 m, in Pa.
+    """Draw the pressure that each axle emits, at 1 m, in Pa.
+
+    The tyres of the two axles share the rolling noise and know nothing of each other, which makes a vehicle
+    in view a wide source; engine noise, broadband and harmonics, comes from the front axle.
 
     Parameters
     ----------
@@ -142,30 +144,48 @@ def emit(
 
     Returns
     -------
-    ndarray, shape (n,)
-        Broadband tyre and engine noise plus engine harmonics, Pa.
+    ndarray, shape (2, n)
+        Front and rear axle.
     """
     time = trajectory.time_s[0] + np.arange(samples) / sample_rate_hz
     rolling = _pressure(rolling_level_db(trajectory.speed_mps) + level_offset_db)
     engine = _pressure(propulsion_level_db(trajectory.speed_mps) + level_offset_db)
-    noise = split_octaves(rng.standard_normal(samples, dtype=np.float32), sample_rate_hz)
-    share = _band_shares(sample_rate_hz)
-    broadband = np.sqrt((rolling**2 + (1.0 - HARMONIC_SHARE) * engine**2) / share[:, None])
-    signal = np.zeros(samples, np.float32)
-    for band, gain in zip(noise, broadband, strict=True):
+    front = np.sqrt(0.5 * rolling**2 + (1.0 - HARMONIC_SHARE) * engine**2)
+    axles = np.stack(
+        [
+            _noise(trajectory, time, pressure, sample_rate_hz, rng)
+            for pressure in (front, np.sqrt(0.5) * rolling)
+        ]
+    )
+    axles[0] += _harmonics(trajectory, time, np.sqrt(HARMONIC_SHARE) * engine, rng)
+    return axles
+
+
+def _noise(
+    trajectory: Trajectory,
+    time: NDArray[np.float64],
+    octave_pressure: NDArray[np.float64],
+    sample_rate_hz: float,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Gaussian noise whose octave pressures (8, T) follow the drive."""
+    bands = split_octaves(rng.standard_normal(len(time), dtype=np.float32), sample_rate_hz)
+    gains = octave_pressure / np.sqrt(_band_shares(sample_rate_hz))[:, None]
+    signal = np.zeros(len(time), np.float32)
+    for band, gain in zip(bands, gains, strict=True):
         signal += band * np.interp(time, trajectory.time_s, gain).astype(np.float32)
-    return signal + _harmonics(trajectory, time, np.sqrt(HARMONIC_SHARE) * engine, rng)
+    return signal
 
 
 def _pressure(power_level_db: NDArray[np.float64]) -> NDArray[np.float64]:
     """RMS pressure at 1 m in Pa."""
-    return REFERENCE_PA * 10.0 ** ((power_level_db + POWER_TO_1M_DB) / 20.0)
+    return np.asarray(REFERENCE_PA * 10.0 ** ((power_level_db + POWER_TO_1M_DB) / 20.0))
 
 
 def _band_shares(sample_rate_hz: float) -> NDArray[np.float64]:
     """Power of white noise of unit variance in every octave band; bands beyond Nyquist stay empty."""
     masks = octave_masks(np.linspace(0.0, sample_rate_hz / 2.0, 4096))
-    return np.maximum((masks**2).mean(axis=1), 1e-6)
+    return np.asarray(np.maximum((masks**2).mean(axis=1), 1e-6))
 
 
 def _harmonics(
@@ -197,4 +217,4 @@ def _firing_frequency(
     geared = idle_to_cruise * np.interp(time, trajectory.time_s, trajectory.speed_mps) / mean_speed
     knots = np.arange(time[0], time[-1] + 0.5, 0.5)
     wander = 1.0 + 0.05 * np.clip(rng.standard_normal(len(knots)) / 2.0, -1.0, 1.0)
-    return np.clip(geared, 25.0, 200.0) * np.interp(time, knots, wander)
+    return np.asarray(np.clip(geared, 25.0, 200.0) * np.interp(time, knots, wander))
