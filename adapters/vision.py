@@ -92,9 +92,9 @@ class VisionQuery:
     settings : VisionSettings, optional
         How it is asked.
     line_of_sight : Sector, optional
-        Directions in which a visible source can stand at all, known from the occluders of the context; all that
-        lies ahead where not given. What sounds from behind an occluder is hidden, or the image of a source in a
-        wall: if it is visible, it stands somewhere in line of sight, so that is what is searched.
+        Directions in which a visible source can stand at all, known from the occluders of the context; any where
+        not given. What sounds from behind an occluder is hidden, or the image of a source in a wall: if it is
+        visible, it stands somewhere in line of sight, so that is what is searched.
 
     Raises
     ------
@@ -120,7 +120,7 @@ class VisionQuery:
         miss_rate: MissRateTable | None = None,
         degradation: float | Callable[[int], float] = 0.0,
         settings: VisionSettings | None = None,
-        line_of_sight: Sector = WHOLE_SIDES[None],
+        line_of_sight: Sector | None = None,
     ) -> None:
         self.camera = camera
         self.detections = detections
@@ -203,6 +203,8 @@ class VisionQuery:
             sector = WHOLE_SIDES[side]
         else:
             sector = Sector(bearing.azimuth_rad, self.settings.half_width_rad)
+        if self._line_of_sight is None:
+            return sector
         return sector.overlap(self._line_of_sight) or self._line_of_sight
 
     def _expected_miss_rate(self, sector: Sector, stamp_ns: int, labels: Collection[str]) -> float | None:
