@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.checks import finite_array, in_range
 from worldstate.errors import InvalidArgumentError
+from worldstate.values import wrap_angle
 
 from .bounds import tone_crb_hz2
 from .spectra import ComplexArray, finite_complex
@@ -108,7 +109,9 @@ def estimate_tone(
     real = not np.iscomplexobj(samples)
     low, high = _checked_band(low_hz, high_hz, rate, rate / len(y) if real else -0.5 * rate)
     omega = 2 * np.pi / rate * _coarse_peak(y, rate, low, high)
-    bounds = (2 * np.pi * low / rate, 2 * np.pi * high / rate)
+    # The frequencies of complex samples form a circle: a search of all of it has no ends to stop at.
+    endless = not real and low_hz is None and high_hz is None
+    bounds = (-np.inf, np.inf) if endless else (2 * np.pi * low / rate, 2 * np.pi * high / rate)
     return _refined(y.real if real else y, omega, bounds, rate)
 
 
@@ -183,7 +186,8 @@ def _tone(
     snr = min(max(snr, np.finfo(float).tiny), 1e300)
     std = float(np.sqrt(tone_crb_hz2(snr, count, rate)))
     phase = float(np.angle(amplitude[0]) - omega * 0.5 * (count - 1))
-    return Tone(omega * rate / (2 * np.pi), size, float(np.angle(np.exp(1j * phase))), snr, std)
+    frequency = wrap_angle(omega) * rate / (2 * np.pi)
+    return Tone(frequency, size, wrap_angle(phase), snr, std)
 
 
 def _checked_band(
