@@ -163,8 +163,8 @@ def radial_speed(
     Notes
     -----
     An engine whose speed falls along an S-curve while its vehicle passes reads as a faster vehicle: line and
-    level alone cannot tell the two apart (5 of 100 simulated run-downs by 10 % within a passage, none of 100 at
-    the kerb).
+    level alone cannot tell the two apart (5 of 100 simulated run-downs by 10 % within a passage, none of 100
+    at the kerb).
     Source: section IV of the paper; BIC by G. Schwarz, Ann. Statist. 6, 1978.
 
     Examples
