@@ -1,0 +1,204 @@
+r"""A threshold that keeps a false-alarm rate while sound and street drift, without hazard labels."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+from .schema import read_number
+
+SECONDS_PER_HOUR = 3600.0
+_EXTREME_LOGIT = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveBudget:
+    r"""A false-alarm rate to be kept, and how far the threshold may go for it.
+
+    The calibrated threshold is shifted in log-odds, :math:`\mathrm{logit}\,\gamma_t = \mathrm{logit}\,\gamma
+    + x_t`, with
+
+    .. math:: x \leftarrow \min(\max(x + \eta\,(N - \lambda\, \Delta t), -x_{down}), x_{up}),
+
+    N false alarms and :math:`\Delta t` hours of street believed empty. Whatever the sounds are, the false
+    alarms counted in T such hours are at most
+
+    .. math:: \lambda T + (x_{down} + x_{up}) / \eta + 1,
+
+    as long as the shift stays below its upper bound. That bound is there so that the threshold can never go
+    deaf: the shift is at most `most_up_nats`, and the threshold never above `highest` unless it was
+    calibrated there. A hazard whose odds are e^{x_up} times those at the calibrated threshold, or whose
+    statistic is at `highest`, is announced however many alarms went before; the budget gives way first.
+
+    Parameters
+    ----------
+    rate_per_hour : float
+        lambda, false alarms per hour of empty street, > 0.
+    step_nats : float
+        eta, the shift that one false alarm brings.
+    most_up_nats, most_down_nats : float
+        Bounds of the shift; downward it keeps quiet nights from making every rustle an alarm.
+    highest : float
+        Largest threshold that a shift may lead to, in (0, 1): one that most approaches reach.
+    empty_probability : float
+        Filtered P(none) from which on the street is believed empty.
+    seen_probability : float
+        Filtered P(visible) from which on an alarm is believed to have been right: something came.
+    longest_alarm_s : float
+        An alarm this old without anything having come counts as false, and again after as long.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> AdaptiveBudget(rate_per_hour=20.0).most_up_nats
+    2.0
+    """
+
+    rate_per_hour: float
+    step_nats: float = 0.25
+    most_up_nats: float = 2.0
+    most_down_nats: float = 1.0
+    highest: float = 0.99
+    empty_probability: float = 0.5
+    seen_probability: float = 0.5
+    longest_alarm_s: float = 15.0
+
+    def __post_init__(self) -> None:
+        in_range("rate_per_hour", self.rate_per_hour, 0.0, 1e5, open_low=True)
+        in_range("step_nats", self.step_nats, 0.0, 10.0, open_low=True)
+        in_range("most_up_nats", self.most_up_nats, 0.0, _EXTREME_LOGIT)
+        in_range("most_down_nats", self.most_down_nats, 0.0, _EXTREME_LOGIT)
+        in_range("highest", self.highest, 0.0, 1.0, open_low=True, open_high=True)
+        in_range("empty_probability", self.empty_probability, 0.0, 1.0, open_low=True)
+        in_range("seen_probability", self.seen_probability, 0.0, 1.0, open_low=True)
+        in_range("longest_alarm_s", self.longest_alarm_s, 0.0, 1e6, open_low=True)
+
+    def gamma(self, calibrated: float, shift_nats: float) -> float:
+        """Return the threshold at a shift; never above `highest` unless it was calibrated there.
+
+        Examples
+        --------
+        >>> budget = AdaptiveBudget(20.0)
+        >>> [round(budget.gamma(0.9, shift), 3) for shift in (-1.0, 0.0, 1.0, 2.0)]
+        [0.768, 0.9, 0.961, 0.985]
+        """
+        if shift_nats == 0.0 or not 0.0 < calibrated < 1.0:
+            return calibrated
+        logit = math.log(calibrated / (1.0 - calibrated)) + shift_nats
+        shifted = 1.0 / (1.0 + math.exp(-max(min(logit, 2 * _EXTREME_LOGIT), -2 * _EXTREME_LOGIT)))
+        return min(shifted, max(calibrated, self.highest))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, data: object) -> "AdaptiveBudget":
+        """Return the budget that `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If something is missing, of the wrong type or out of range.
+        """
+        values = _mapping(data, "adaptive")
+        return cls(**{field.name: read_number(values.get(field.name), field.name) for field in fields(cls)})
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveThreshold:
+    """What the adaptive threshold has learned so far.
+
+    Parameters
+    ----------
+    shift_nats : float
+        x_t.
+    pending_s : float or None
+        Age of an alarm of which it is not known yet whether anything comes; None where there is none.
+    alarm : bool
+        Whether the rule was in alarm at the last hop.
+
+    Examples
+    --------
+    Ten minutes of empty street without an alarm make it bolder, a false alarm more careful:
+
+    >>> budget, start = AdaptiveBudget(rate_per_hour=6.0), AdaptiveThreshold()
+    >>> round(start.advance(budget, visible=0.1, none=0.8, alarm=False, elapsed_s=600.0).shift_nats, 2)
+    -0.25
+    >>> alarmed = start.advance(budget, visible=0.1, none=0.2, alarm=True, elapsed_s=0.1)
+    >>> round(alarmed.advance(budget, visible=0.1, none=0.8, alarm=False, elapsed_s=0.1).shift_nats, 2)
+    0.25
+    """
+
+    shift_nats: float = 0.0
+    pending_s: float | None = None
+    alarm: bool = False
+
+    def advance(
+        self, budget: AdaptiveBudget, *, visible: float, none: float, alarm: bool, elapsed_s: float
+    ) -> "AdaptiveThreshold":
+        """Return the state after one more hop.
+
+        Parameters
+        ----------
+        budget : AdaptiveBudget
+            What is to be kept.
+        visible, none : float
+            Filtered probabilities of the two explanations that end an alarm.
+        alarm : bool
+            Whether the sustained rule is in alarm now.
+        elapsed_s : float
+            Time since the last hop.
+        """
+        onset = alarm and not self.alarm
+        pending_s = 0.0 if onset and self.pending_s is None else self.pending_s
+        empty = not alarm and none >= budget.empty_probability
+        if pending_s is None:
+            quiet_h = elapsed_s / SECONDS_PER_HOUR if empty else 0.0
+            return replace(self._shifted(budget, -budget.rate_per_hour * quiet_h), alarm=alarm)
+        if visible >= budget.seen_probability:
+            return replace(self, pending_s=None, alarm=alarm)
+        if empty:
+            return replace(self._shifted(budget, 1.0), pending_s=None, alarm=alarm)
+        age_s = pending_s + elapsed_s
+        if age_s >= budget.longest_alarm_s:
+            return replace(self._shifted(budget, 1.0), pending_s=0.0, alarm=alarm)
+        return replace(self, pending_s=age_s, alarm=alarm)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {"shift_nats": self.shift_nats, "pending_s": self.pending_s, "alarm": self.alarm}
+
+    @classmethod
+    def from_dict(cls, data: object) -> "AdaptiveThreshold":
+        """Return the state that `to_dict` wrote.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If something is missing, of the wrong type or out of range.
+        """
+        values = _mapping(data, "threshold")
+        pending, alarm = values.get("pending_s"), values.get("alarm")
+        if not isinstance(alarm, bool):
+            raise InvalidArgumentError("threshold.alarm: expected true or false")
+        shift = in_range("shift_nats", read_number(values.get("shift_nats"), "shift_nats"), -100.0, 100.0)
+        age = None if pending is None else in_range("pending_s", read_number(pending, "pending_s"), 0.0, 1e9)
+        return cls(shift, age, alarm)
+
+    def _shifted(self, budget: AdaptiveBudget, events: float) -> "AdaptiveThreshold":
+        shift = self.shift_nats + budget.step_nats * events
+        return replace(self, shift_nats=min(max(shift, -budget.most_down_nats), budget.most_up_nats))
+
+
+def _mapping(value: object, name: str) -> Mapping[str, object]:
+    if not isinstance(value, Mapping):
+        raise InvalidArgumentError(f"{name}: expected an object, got {type(value).__name__}")
+    return value

@@ -1,0 +1,152 @@
+r"""Thresholds with a finite-sample guarantee: the unit is a recording, because windows repeat each other."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+from .cueing import sustained_statistic
+
+
+class _Losses(NamedTuple):
+    """Sustained statistics of all windows, falling, with the share of its recording that each stands for."""
+
+    held: NDArray[np.float64]
+    shares: NDArray[np.float64]
+    recordings: int
+    single: bool
+
+
+def conformal_threshold(
+    hazard_free: Sequence[ArrayLike], alpha: float, sustain_hops: int = 1, confidence: float | None = None
+) -> float:
+    r"""Return the smallest threshold that keeps a budget on recordings not yet made.
+
+    With :math:`L_i(\gamma)` the share of the windows of recording i that are in sustained alarm,
+
+    .. math:: \gamma = \min \Big\{ \gamma : \frac{1 + \sum_{i=1}^n L_i(\gamma)}{n + 1} \le \alpha \Big\}
+              \quad\Rightarrow\quad E[L_{n+1}(\gamma)] \le \alpha
+
+    for exchangeable recordings, whatever the law of their windows (conformal risk control; with one window a
+    recording it is split-conformal prediction). The expectation is over the calibration recordings as well:
+    a single calibration may lie above. With `confidence` c it does so at most in a share 1 - c of them:
+
+    .. math:: P\big(E[L_{n+1} \mid \gamma] \le \alpha\big) \ge c,
+
+    by the Hoeffding-Bentkus bound on the mean of n independent losses in [0, 1], exact binomial where every
+    recording is one window.
+
+    Parameters
+    ----------
+    hazard_free : sequence of array_like, each of shape (windows,)
+        Statistics of each hazard-free calibration recording, in the order of time. Long ones are best cut
+        into pieces that are longer than the statistic's correlation time.
+    alpha : float
+        Budget: share of windows in alarm, in (0, 1).
+    sustain_hops : int
+        k, consecutive hops that the statistic has to hold.
+    confidence : float, optional
+        c in (0, 1).
+
+    Returns
+    -------
+    float
+        +inf where there are fewer than `recordings_needed`: no finite threshold has the guarantee.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are no windows, one is not finite, or a number is out of range.
+
+    References
+    ----------
+    Angelopoulos et al., "Conformal risk control", 2022; Bates et al., "Distribution-free, risk-controlling
+    prediction sets", 2021.
+
+    Examples
+    --------
+    >>> streams = np.random.default_rng(0).normal(size=(99, 1))
+    >>> gamma = conformal_threshold(streams, alpha=0.02)
+    >>> int((streams >= gamma).sum()), conformal_threshold(streams[:40], alpha=0.02)
+    (1, inf)
+    """
+    budget = in_range("alpha", alpha, 0.0, 1.0, open_low=True, open_high=True)
+    losses = _losses(hazard_free, sustain_hops)
+    if confidence is None:
+        allowed = budget * (losses.recordings + 1) - 1.0
+    else:
+        trust = in_range("confidence", confidence, 0.0, 1.0, open_low=True, open_high=True)
+        allowed = _largest_sum(losses, budget, 1.0 - trust)
+    return _smallest_threshold(losses, allowed)
+
+
+def recordings_needed(alpha: float, confidence: float | None = None) -> int:
+    """Return the fewest hazard-free recordings from which a conformal threshold is finite.
+
+    Examples
+    --------
+    >>> recordings_needed(0.02), recordings_needed(0.02, confidence=0.95)
+    (49, 149)
+    """
+    budget = in_range("alpha", alpha, 0.0, 1.0, open_low=True, open_high=True)
+    if confidence is None:
+        return math.ceil(1.0 / budget - 1e-9) - 1
+    trust = in_range("confidence", confidence, 0.0, 1.0, open_low=True, open_high=True)
+    return math.ceil(math.log(1.0 - trust) / math.log1p(-budget) - 1e-9)
+
+
+def _losses(hazard_free: Sequence[ArrayLike], sustain_hops: int) -> _Losses:
+    streams = [finite_array("hazard_free", stream, (None,)) for stream in hazard_free]
+    streams = [stream for stream in streams if stream.size]
+    if not streams:
+        raise InvalidArgumentError("hazard_free: expected at least one window")
+    held = np.concatenate([sustained_statistic(stream, sustain_hops) for stream in streams])
+    shares = np.concatenate([np.full(stream.size, 1.0 / stream.size) for stream in streams])
+    order = np.argsort(-held, kind="stable")
+    single = all(stream.size == 1 for stream in streams)
+    return _Losses(held[order], shares[order], len(streams), single)
+
+
+def _smallest_threshold(losses: _Losses, allowed: float) -> float:
+    if allowed < -1e-9:
+        return math.inf
+    # The next float above the first window that the budget cannot pay for.
+    first = int(np.searchsorted(np.cumsum(losses.shares), allowed + 1e-9, side="right"))
+    if first == losses.held.size:
+        return float(np.finfo(np.float64).min)
+    return float(max(np.nextafter(losses.held[first], np.inf), np.finfo(np.float64).min))
+
+
+def _largest_sum(losses: _Losses, alpha: float, delta: float) -> float:
+    """Return the largest sum of losses from which "the mean exceeds alpha" is refuted at level delta."""
+    sums = np.concatenate([[0.0], np.cumsum(losses.shares)])
+    low, high = -1, sums.size - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        if _p_value(float(sums[middle]), losses, alpha) <= delta:
+            low = middle
+        else:
+            high = middle - 1
+    return float(sums[low]) if low >= 0 else -1.0
+
+
+def _p_value(total: float, losses: _Losses, alpha: float) -> float:
+    from scipy.stats import binom
+
+    n = losses.recordings
+    tail = float(binom.cdf(math.ceil(total - 1e-9), n, alpha))
+    if losses.single:
+        return tail
+    mean = min(total / n, alpha)
+    divergence = -math.log1p(-alpha) if mean == 0.0 else _divergence(mean, alpha)
+    return min(math.exp(-n * divergence), math.e * tail)
+
+
+def _divergence(a: float, b: float) -> float:
+    """Kullback-Leibler divergence of Bernoulli(a) from Bernoulli(b), 0 < a <= b < 1, nats."""
+    return a * math.log(a / b) + (1.0 - a) * math.log((1.0 - a) / (1.0 - b))
