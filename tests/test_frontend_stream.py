@@ -1,5 +1,8 @@
 """The streaming front-end: hops, laws, bad input."""
 
+import gc
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,8 +10,12 @@ from hypothesis import strategies as st
 
 from worldstate.errors import InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
+from worldstate.frontend.bins import band_bins, bin_frequencies_hz
 from worldstate.frontend.looming import Looming
 from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.srp import srp_phat
+from worldstate.frontend.steering import Steering
+from worldstate.frontend.stft import StreamingStft
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.values import NotUsable
 
@@ -205,14 +212,29 @@ def test_bad_settings_are_refused(rate: float, settings_: dict[str, object], mes
 
 
 def test_memory_does_not_grow() -> None:
-    import tracemalloc
-
     front_end = FrontEnd(SQUARE, 8_000)
     sound = noise_from(SQUARE, 0.5, 8_000, 2.0)
-    front_end.process(sound)
     tracemalloc.start()
-    for _ in range(20):
-        front_end.process(sound)
-    grown = tracemalloc.get_traced_memory()[0]
+    traced = []
+    for _ in range(2):
+        for _ in range(10):
+            front_end.process(sound)
+        gc.collect()
+        traced.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    assert grown < 100_000
+    # 200 hops at 2 kB each would be eight times the limit.
+    assert traced[1] - traced[0] < 50_000
+
+
+def test_running_second_is_the_srp_of_the_frames_that_end_in_it() -> None:
+    array, rate = SQUARE, 16_000
+    sound = noise_from(array, 0.5, rate, 1.3)
+    frame = FrontEnd(array, rate).process(sound)[2]
+    bins = band_bins((300.0, 1800.0), rate, 512)
+    spectra = StreamingStft(4, 512, bins).push(sound)
+    ends = 512 + 256 * np.arange(len(spectra))
+    within = (ends > 0.2 * rate) & (ends <= 1.2 * rate)
+    steering = Steering.towards(array, bin_frequencies_hz(bins, rate, 512), frame.azimuths_rad)
+    np.testing.assert_allclose(frame.srp, srp_phat(spectra[within], steering), rtol=1e-5)
+    centres = (ends - 256)[(ends > 1.0 * rate) & (ends <= 1.2 * rate)]
+    assert frame.bearing_age_s == pytest.approx(1.2 - centres.mean() / rate)
