@@ -114,6 +114,14 @@ def test_the_advisory_leads_names_the_side_and_points_at_the_entity():
     assert all(cue.entity_id is not None and cue.alpha == 0.02 for _, cue in raised)
 
 
+def test_a_tie_names_both_sides():
+    """Rounding must not choose a side: the mirrored world would choose the other one."""
+    even = (0.45, 0.45, 0.05, 0.05)
+    for classes in (even, (0.45 + 1e-15, 0.45 - 1e-15, 0.05, 0.05)):
+        world, _ = run(start(), [measured(t, classes) for t in hops(1.0, 1.5)])
+        assert {cue.direction: cue.advisory for cue in world.state.cues} == {"left": True, "right": True}
+
+
 def test_relations_follow_the_entity():
     _, states = run(start(), approach_from_left())
     at = {s.stamp_ns: s for s in states}
@@ -280,6 +288,28 @@ def test_empty_looks_move_existence_as_bernoulli_says(miss_rate):
     pd = 1.0 - miss_rate
     assert after.existence_probability == pytest.approx(r * (1 - pd) / (1 - r * pd))
     assert after.visibility.answer == "absent"
+
+
+def test_looks_in_quick_succession_count_for_their_share():
+    """Three looks within one interval weigh as one."""
+    world = start().update(measured(1.0, FRONT, car(0.0)))
+    r = world.state.entities[0].existence_probability
+    for t in (1.1, 1.2, 1.3):
+        world = world.update(measured(t, FRONT, answer=Absent(0.04)))
+    for _ in range(3):
+        r *= math.exp(-0.01)
+        odds = r / (1 - r) * 0.04 ** (1 / 3)
+        r = odds / (1 + odds)
+    assert world.state.entities[0].existence_probability == pytest.approx(r)
+
+
+def test_a_hand_over_takes_the_risk_with_it():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script.append(measured(4.0, LEFT, car(0.5), answer=Unqueried("sector out of view")))
+    _, states = run(start(), script)
+    assert states[-2].risk > 0.7
+    assert states[-1].risk < 0.1
+    assert states[-1].cues[0].hypotheses.visible > 0.8
 
 
 def test_not_looking_moves_nothing_but_survival():

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.stats import chi2
@@ -65,6 +65,7 @@ def test_the_jacobian_is_the_derivative(state, time_s):
 
 @given(states, times, times)
 def test_two_steps_are_one(state, first, second):
+    assume(state[2] * (first + second) > -0.9)  # short of the array itself
     at_once = propagate(state, first + second)
     assert propagate(propagate(state, first), second) == pytest.approx(at_once, abs=1e-8)
 

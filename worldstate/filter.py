@@ -24,7 +24,7 @@ from worldstate.measurement import Measurement
 from worldstate.memory import Memory, first_memory, priors_of
 from worldstate.publishing import cues_of, entity_of, relations_of
 from worldstate.state import Context, Record, WorldState, check_schema
-from worldstate.step import Ground, advance, alarmed, alert, listen, renew, sides_of, watch, weights_of
+from worldstate.step import Ground, advance, alarmed, alert, listen, renew, scene_of, watch, weights_of
 from worldstate.values import NotUsable, nanoseconds
 
 # A step and the stamp that it aims at may differ by the rounding of sample counts.
@@ -230,7 +230,7 @@ class WorldFilter:
 
     @cached_property
     def _ground(self) -> Ground:
-        return Ground(self.context, self.policy, self.settings, sides_of(self.context))
+        return Ground(self.context, self.policy, scene_of(self.context, self.settings))
 
 
 def _check(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> None:

@@ -95,15 +95,15 @@ def cues_of(
 
 
 def _cue(k: int, memory: Memory, ground: Ground, hazard_risk: float, named: bool) -> RiskCue:
-    explanation, side, instant = memory.explanation, ground.sides[k], memory.instant
+    explanation, side, instant = memory.explanation, ground.scene.sides[k], memory.instant
     assert instant is not None
     track = next((t for t in memory.tracks if not t.seen and t.side == k), None)
-    motion = side.prior(ground.settings) if track is None else track.motion
+    motion = ground.scene.prior(k) if track is None else track.motion
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     return RiskCue(
         direction=side.label,
         azimuth_rad=motion.azimuth_rad,
-        azimuth_std_rad=published_std(motion, True, ground.settings),
+        azimuth_std_rad=published_std(motion, True, ground.scene.settings),
         risk=hazard_risk * share,
         confidence=share,
         statistic=min(instant.hidden_total, 1.0),

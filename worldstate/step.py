@@ -10,12 +10,15 @@ from worldstate.belief.hearing import hear, hidden_share
 from worldstate.belief.lifecycle import renew_hidden
 from worldstate.belief.seeing import log_co_evidence, look, surviving
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side import Side
+from worldstate.belief.side import Scene, Side
 from worldstate.belief.track import predict_track
 from worldstate.measurement import Measurement
 from worldstate.memory import Memory, priors_of
 from worldstate.state import Context
 from worldstate.values import NANOSECONDS_PER_SECOND, seconds
+
+# Sides whose probabilities differ by rounding only are equally likely.
+_TIE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +27,7 @@ class Ground:
 
     context: Context
     policy: CueingPolicy
-    settings: FilterSettings
-    sides: tuple[Side, ...]
-
-    @property
-    def view_half_angle_rad(self) -> float:
-        """Half the field of view of the co-evidence channel."""
-        return self.context.view_half_angle_rad
+    scene: Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +38,13 @@ class Weights:
     look: float
 
 
-def sides_of(context: Context) -> tuple[Side, ...]:
-    """Return the approach sides of a context."""
-    return tuple(
+def scene_of(context: Context, settings: FilterSettings) -> Scene:
+    """Return a context as the beliefs need it."""
+    sides = (
         Side(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
         for o in context.occluders
     )
+    return Scene(tuple(sides), context.view_half_angle_rad, settings)
 
 
 def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
@@ -60,16 +58,14 @@ def advance(memory: Memory, stamp_ns: int, ground: Ground) -> Memory:
     """Return the memory at a later time, nothing having been measured."""
     step_ns, explanation = stamp_ns - memory.stamp_ns, memory.explanation
     tracks = tuple(
-        predict_track(
-            track, ground.sides, hidden_share(track, explanation), seconds(step_ns), ground.settings
-        )
+        predict_track(track, hidden_share(track, explanation), seconds(step_ns), ground.scene)
         for track in memory.tracks
     )
     return replace(
         memory,
         stamp_ns=stamp_ns,
         explanation=explanation.predict(ground.context.rates.values_hz, step_ns),
-        tracks=surviving(tracks, ground.settings),
+        tracks=surviving(tracks, ground.scene.settings),
     )
 
 
@@ -77,9 +73,9 @@ def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: G
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
     explanation, predicted = memory.explanation, priors_of(memory.explanation)
     if weights.sound > 0.0:
-        answer = log_co_evidence(measurement.co_evidence, len(ground.sides), weights.look)
+        answer = log_co_evidence(measurement.co_evidence, len(ground.scene.sides), weights.look)
         explanation = explanation.update(measurement.signature, weights.sound, answer)
-    tracks = hear(memory.tracks, measurement, explanation, weights.sound, ground.settings)
+    tracks = hear(memory.tracks, measurement, explanation, weights.sound, ground.scene.settings)
     return replace(memory, explanation=explanation, tracks=tracks, predicted=predicted)
 
 
@@ -89,11 +85,9 @@ def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Gr
         memory.tracks,
         memory.explanation,
         measurement,
-        ground.sides,
-        ground.view_half_angle_rad,
         weights.look,
         memory.sighted,
-        ground.settings,
+        ground.scene,
     )
     handover_ns = tuple(
         measurement.stamp_ns if k in seen.handed_over else before_ns
@@ -101,7 +95,7 @@ def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Gr
     )
     return replace(
         memory,
-        tracks=surviving(seen.tracks, ground.settings),
+        tracks=surviving(seen.tracks, ground.scene.settings),
         explanation=seen.explanation,
         handover_ns=handover_ns,
         sighted=seen.born,
@@ -117,25 +111,23 @@ def alert(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
 
 
 def alarmed(memory: Memory) -> tuple[bool, ...]:
-    """Return for each side whether the advisory names it: the likeliest one while the rule is in alarm."""
+    """Return for each side whether the advisory names it: the likeliest one, or both in a tie."""
     hidden = memory.explanation.hidden
-    largest = max(hidden)
-    return tuple(memory.rule.alarm and p >= largest for p in hidden)
+    least = max(hidden) * (1.0 - _TIE)
+    return tuple(memory.rule.alarm and p >= least for p in hidden)
 
 
 def renew(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
     """Return the memory after births and deaths of hidden entities, the measurement counted."""
-    rearm_ns = ground.settings.rearm_s * NANOSECONDS_PER_SECOND
+    rearm_ns = ground.scene.settings.rearm_s * NANOSECONDS_PER_SECOND
     hidden = renew_hidden(
         memory.tracks,
         memory.explanation,
         memory.births,
         alarmed(memory),
         [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
-        ground.sides,
-        memory.stamp_ns,
-        measurement.source,
-        ground.settings,
+        measurement,
+        ground.scene,
     )
     last_ns = dict(memory.last_ns) | {measurement.source: measurement.stamp_ns}
     return replace(

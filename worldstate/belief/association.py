@@ -9,7 +9,7 @@ from worldstate.measurement import Sighting
 from worldstate.values import wrap_angle
 
 from .settings import FilterSettings
-from .side import Side
+from .side import Scene
 from .track import Track
 
 _NEVER = 1e6
@@ -37,10 +37,7 @@ def match_visible(
 
 
 def match_hidden(
-    tracks: tuple[Track, ...],
-    sightings: tuple[tuple[int, Sighting], ...],
-    sides: tuple[Side, ...],
-    settings: FilterSettings,
+    tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], scene: Scene
 ) -> dict[int, int]:
     """Return {track index: sighting index}: hidden entities that came into view.
 
@@ -53,7 +50,7 @@ def match_hidden(
         for i, track in enumerate(tracks)
         for j, sighting in sightings
         if not track.seen and sighting.moving
-        if (score := _emergence(track, sighting, sides, settings)) > 0.0
+        if (score := _emergence(track, sighting, scene)) > 0.0
     )
     found: dict[int, int] = {}
     for _, i, j in pairs:
@@ -71,11 +68,10 @@ def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> flo
     return residual**2 / variance + (0.0 if sighting.moving == track.moving else _CHANGED_MIND)
 
 
-def _emergence(
-    track: Track, sighting: Sighting, sides: tuple[Side, ...], settings: FilterSettings
-) -> float:
+def _emergence(track: Track, sighting: Sighting, scene: Scene) -> float:
     """Return the log odds of "this entity" against "nobody heard it"; -inf out of reach of any edge."""
-    distances = [side.distance_rad(sighting.azimuth_rad) for side in sides]
+    settings = scene.settings
+    distances = [side.distance_rad(sighting.azimuth_rad) for side in scene.sides]
     if min(distances) > settings.handover_gate_rad:
         return -math.inf
     near = [math.exp(-2.0 * (distance / settings.handover_gate_rad) ** 2) for distance in distances]

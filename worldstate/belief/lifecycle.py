@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from worldstate.measurement import Measurement
 from worldstate.values import NANOSECONDS_PER_SECOND
 
 from .explanation import ExplanationBelief
-from .settings import FilterSettings
-from .side import Side
+from .side import Scene
 from .track import Track, entity_id
 
 HIDDEN_LABEL = "vehicle"
@@ -28,10 +28,8 @@ def renew_hidden(
     births: tuple[int, ...],
     alarmed: Sequence[bool],
     rearmed: Sequence[bool],
-    sides: tuple[Side, ...],
-    stamp_ns: int,
-    source: str,
-    settings: FilterSettings,
+    measurement: Measurement,
+    scene: Scene,
 ) -> Hidden:
     """Return the world with hidden entities born, refreshed and dropped, one at most per side.
 
@@ -44,17 +42,20 @@ def renew_hidden(
     rearmed : sequence of bool, shape (K,)
         Whether the side may bring forth an entity again after a hand-over.
     """
-    kept, counts = list(tracks), list(births)
-    for k, side in enumerate(sides):
+    settings, kept, counts = scene.settings, list(tracks), list(births)
+    for k in range(len(scene.sides)):
         current = next((track for track in kept if not track.seen and track.side == k), None)
         if current is None:
             heard = explanation.hidden[k] >= settings.birth_probability or alarmed[k]
             if heard and rearmed[k]:
                 explanation = explanation.disown(k)
-                returning = _returning(kept, side, stamp_ns, settings)
-                kept = [track for track in kept if track is not returning]
-                kept.append(_born(returning, k, side, counts[k], explanation, stamp_ns, source, settings))
-                counts[k] += returning is None
+                returning = _returning(kept, k, measurement.stamp_ns, scene)
+                if returning is None:
+                    kept.append(_born(k, counts[k], explanation.hidden[k], measurement, scene))
+                    counts[k] += 1
+                else:
+                    kept.remove(returning)
+                    kept.append(_hidden_again(returning, k, explanation.hidden[k], measurement, scene))
         else:
             kept.remove(current)
             existence = explanation.hidden[k] + explanation.emerged[k]
@@ -63,48 +64,44 @@ def renew_hidden(
     return Hidden(tuple(kept), explanation, tuple(counts))
 
 
-def _returning(
-    tracks: list[Track], side: Side, stamp_ns: int, settings: FilterSettings
-) -> Track | None:
+def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: Scene) -> Track | None:
     """Return the entity that left view near this side a moment ago, if there is one."""
+    side, settings = scene.sides[k], scene.settings
+    earliest_ns = stamp_ns - settings.reocclusion_s * NANOSECONDS_PER_SECOND
+    latest_ns = stamp_ns - settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
     candidates = [
         track
         for track in tracks
-        if track.seen
-        and track.moving
-        and track.last_seen_ns is not None
-        and settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
-        <= stamp_ns - track.last_seen_ns
-        <= settings.reocclusion_s * NANOSECONDS_PER_SECOND
-        and side.distance_rad(track.motion.azimuth_rad) <= settings.handover_gate_rad
+        if track.seen and track.moving and track.last_seen_ns is not None
+        if earliest_ns <= track.last_seen_ns <= latest_ns
+        if side.distance_rad(track.motion.azimuth_rad) <= settings.handover_gate_rad
     ]
     return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)
 
 
-def _born(
-    returning: Track | None,
-    k: int,
-    side: Side,
-    number: int,
-    explanation: ExplanationBelief,
-    stamp_ns: int,
-    source: str,
-    settings: FilterSettings,
-) -> Track:
-    prior, existence = side.prior(settings), explanation.hidden[k]
-    if returning is not None:
-        hidden = replace(returning, side=k, seen=False, was_hidden=True)
-        return replace(hidden, existence=existence, motion=prior, updated_ns=stamp_ns)
+def _hidden_again(track: Track, k: int, existence: float, measurement: Measurement, scene: Scene) -> Track:
+    return replace(
+        track,
+        side=k,
+        seen=False,
+        was_hidden=True,
+        existence=existence,
+        motion=scene.prior(k),
+        updated_ns=measurement.stamp_ns,
+    )
+
+
+def _born(k: int, number: int, existence: float, measurement: Measurement, scene: Scene) -> Track:
     return Track(
-        id=entity_id(settings.stream, side.label, number),
+        id=entity_id(scene.settings.stream, scene.sides[k].label, number),
         side=k,
         seen=False,
         existence=existence,
-        motion=prior,
+        motion=scene.prior(k),
         labels=((HIDDEN_LABEL, 1.0),),
         moving=True,
-        sources=(source,),
-        created_ns=stamp_ns,
-        updated_ns=stamp_ns,
+        sources=(measurement.source,),
+        created_ns=measurement.stamp_ns,
+        updated_ns=measurement.stamp_ns,
         was_hidden=True,
     )

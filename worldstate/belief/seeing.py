@@ -14,11 +14,13 @@ from .explanation import ExplanationBelief
 from .motion import MotionBelief, update_azimuth
 from .polar import LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
-from .side import Side, nearest_side
+from .side import Scene
 from .track import Track, entity_id, merged, relabelled
 
 _NEW_RATE_STD = (0.5, 0.5)
 _PARKED_RATE_STD = (1e-3, 1e-3)
+# A channel that was said to miss everything and yet found something was not that blind.
+_MOST_MISSES = 0.99
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,30 +51,28 @@ def look(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
     measurement: Measurement,
-    sides: tuple[Side, ...],
-    view_half_angle_rad: float,
     weight: float,
     born: int,
-    settings: FilterSettings,
+    scene: Scene,
 ) -> Seen:
     """Return the world after one look; `born` counts the entities that vision brought in so far."""
     sightings = tuple(sorted(measurement.sightings, key=lambda s: (s.azimuth_rad, s.label, s.score)))
-    known = match_visible(tracks, sightings, settings)
+    known = match_visible(tracks, sightings, scene.settings)
     new = tuple((j, s) for j, s in enumerate(sightings) if j not in known.values())
-    emerging = match_hidden(tracks, new, sides, settings)
+    emerging = match_hidden(tracks, new, scene)
     after = []
     for i, track in enumerate(tracks):
         if i in known:
-            after.append(_sighted(track, sightings[known[i]], measurement, settings))
+            after.append(_sighted(track, sightings[known[i]], measurement, scene.settings))
         elif i in emerging:
-            after.append(_handed_over(track, sightings[emerging[i]], measurement, sides, settings))
+            after.append(_handed_over(track, sightings[emerging[i]], measurement, scene))
         else:
-            after.append(_not_sighted(track, measurement.co_evidence, view_half_angle_rad, weight))
+            after.append(_not_sighted(track, measurement.co_evidence, weight, scene))
     handed_over = tuple(tracks[i].side for i in emerging)
     for side in handed_over:
-        explanation = explanation.emerge(side, settings.handover_residual)
+        explanation = explanation.emerge(side, scene.settings.handover_residual)
     fresh = [s for j, s in new if j not in emerging.values()]
-    after += [_born(s, measurement, sides, born + n, settings) for n, s in enumerate(fresh)]
+    after += [_born(s, measurement, born + n, scene) for n, s in enumerate(fresh)]
     return Seen(tuple(after), explanation, handed_over, born + len(fresh))
 
 
@@ -89,30 +89,19 @@ def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Trac
     )
 
 
-def _in_view(track: Track, view_half_angle_rad: float) -> bool:
-    return abs(track.motion.azimuth_rad) <= view_half_angle_rad
-
-
 def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
     """Return miss and clutter rate of a look; a channel that was not asked has neither."""
     if isinstance(answer, Unqueried):
         return 0.0, settings.clutter_rate
-    return answer.miss_rate, answer.clutter_rate or settings.clutter_rate
+    return min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or settings.clutter_rate
 
 
-def _sighted(track: Track, sighting: Sighting, measurement: Measurement, settings: FilterSettings) -> Track:
-    motion = track.motion
-    if sighting.moving != track.moving:
-        motion = _motion_at(sighting, motion)
-    else:
-        motion = update_azimuth(motion, sighting.azimuth_rad, sighting.std_rad, weight=1.0)
+def _found(track: Track, measurement: Measurement, settings: FilterSettings) -> Track:
+    """Return a track that a sighting was given to: its existence and its time stamps."""
     miss, clutter = _rates(measurement.co_evidence, settings)
     return replace(
         track,
-        existence=after_sighting(track.existence, min(miss, 0.99), clutter),
-        motion=motion,
-        labels=relabelled(track.labels, sighting),
-        moving=sighting.moving,
+        existence=after_sighting(track.existence, miss, clutter),
         sources=merged(track.sources, "vision"),
         updated_ns=measurement.stamp_ns,
         last_seen_ns=measurement.stamp_ns,
@@ -121,48 +110,46 @@ def _sighted(track: Track, sighting: Sighting, measurement: Measurement, setting
     )
 
 
-def _handed_over(
-    track: Track,
-    sighting: Sighting,
-    measurement: Measurement,
-    sides: tuple[Side, ...],
-    settings: FilterSettings,
-) -> Track:
+def _sighted(track: Track, sighting: Sighting, measurement: Measurement, settings: FilterSettings) -> Track:
+    if sighting.moving == track.moving:
+        motion = update_azimuth(track.motion, sighting.azimuth_rad, sighting.std_rad, weight=1.0)
+    else:
+        motion = _motion_at(sighting, track.motion)
+    labels = relabelled(track.labels, sighting)
+    changed = replace(track, motion=motion, labels=labels, moving=sighting.moving)
+    return _found(changed, measurement, settings)
+
+
+def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, scene: Scene) -> Track:
     """Return the hidden entity as vision now has it: same id, azimuth and side from the sighting."""
     seen = replace(
         track,
         seen=True,
-        side=nearest_side(sides, sighting.azimuth_rad),
-        existence=max(track.existence, settings.sighting_existence),
+        side=scene.nearest_side(sighting.azimuth_rad),
+        existence=max(track.existence, scene.settings.sighting_existence),
         motion=_motion_at(sighting, track.motion),
+        labels=((sighting.label, sighting.score),),
     )
-    labels = ((sighting.label, sighting.score),)
-    return replace(_sighted(seen, sighting, measurement, settings), labels=labels)
+    return _found(seen, measurement, scene.settings)
 
 
-def _not_sighted(
-    track: Track, answer: CoEvidence, view_half_angle_rad: float, weight: float
-) -> Track:
-    if isinstance(answer, Unqueried) or not (track.seen and _in_view(track, view_half_angle_rad)):
-        searched = isinstance(answer, Absent) and not track.seen
-        miss = answer.miss_rate if isinstance(answer, Absent) and searched else None
+def _not_sighted(track: Track, answer: CoEvidence, weight: float, scene: Scene) -> Track:
+    if not track.seen:
+        searched = isinstance(answer, Absent)
+        miss = answer.miss_rate if isinstance(answer, Absent) else None
         return replace(track, answer="absent" if searched else "unqueried", miss_rate=miss)
+    if isinstance(answer, Unqueried) or not scene.in_view(track.motion.azimuth_rad):
+        return replace(track, answer="unqueried", miss_rate=None)
     existence = after_empty_look(track.existence, answer.miss_rate**weight)
     return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
 
 
-def _born(
-    sighting: Sighting,
-    measurement: Measurement,
-    sides: tuple[Side, ...],
-    number: int,
-    settings: FilterSettings,
-) -> Track:
+def _born(sighting: Sighting, measurement: Measurement, number: int, scene: Scene) -> Track:
     unseen = Track(
-        id=entity_id(settings.stream, "visible", number),
-        side=nearest_side(sides, sighting.azimuth_rad),
+        id=entity_id(scene.settings.stream, "visible", number),
+        side=scene.nearest_side(sighting.azimuth_rad),
         seen=True,
-        existence=settings.sighting_existence,
+        existence=scene.settings.sighting_existence,
         motion=_motion_at(sighting, None),
         labels=((sighting.label, sighting.score),),
         moving=sighting.moving,
@@ -170,7 +157,7 @@ def _born(
         created_ns=measurement.stamp_ns,
         updated_ns=measurement.stamp_ns,
     )
-    return replace(_sighted(unseen, sighting, measurement, settings), labels=unseen.labels)
+    return _found(unseen, measurement, scene.settings)
 
 
 def _motion_at(sighting: Sighting, before: MotionBelief | None) -> MotionBelief:

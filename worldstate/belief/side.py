@@ -1,4 +1,4 @@
-"""An approach side as the beliefs need it: where hidden vehicles are, and where they come into view."""
+"""The place as the beliefs need it: where hidden vehicles are, and where they come into view."""
 
 import math
 from dataclasses import dataclass
@@ -46,6 +46,32 @@ class Side:
         )
 
 
-def nearest_side(sides: tuple[Side, ...], azimuth_rad: float) -> int:
-    """Return the index of the side whose edge is nearest to an azimuth."""
-    return min(range(len(sides)), key=lambda k: sides[k].distance_rad(azimuth_rad))
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What stays the same from step to step.
+
+    Parameters
+    ----------
+    sides : tuple of Side
+        Approach sides, in the order of the signature's directions.
+    view_half_angle_rad : float
+        Half the field of view of the co-evidence channel, centred on the x axis.
+    settings : FilterSettings
+        Noise levels, gates, births and deaths.
+    """
+
+    sides: tuple[Side, ...]
+    view_half_angle_rad: float
+    settings: FilterSettings
+
+    def prior(self, side: int) -> MotionBelief:
+        """Return what is known of a vehicle hidden on a side."""
+        return self.sides[side].prior(self.settings)
+
+    def nearest_side(self, azimuth_rad: float) -> int:
+        """Return the index of the side whose edge is nearest to an azimuth."""
+        return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
+
+    def in_view(self, azimuth_rad: float) -> bool:
+        """Whether the co-evidence channel can see there."""
+        return abs(azimuth_rad) <= self.view_half_angle_rad

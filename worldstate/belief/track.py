@@ -8,8 +8,7 @@ from worldstate.measurement import Sighting
 
 from .existence import after_time
 from .motion import MotionBelief, predict, relax
-from .settings import FilterSettings
-from .side import Side
+from .side import Scene
 
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
 _LABEL_GAIN = 0.3
@@ -82,13 +81,12 @@ def entity_id(stream: str, kind: str, number: int) -> str:
     return str(uuid5(_NAMESPACE, f"{stream}/{kind}/{number}"))
 
 
-def predict_track(
-    track: Track, sides: tuple[Side, ...], hidden_share: float, step_s: float, settings: FilterSettings
-) -> Track:
+def predict_track(track: Track, hidden_share: float, step_s: float, scene: Scene) -> Track:
     """Return the track after a time step.
 
     `hidden_share` is P(hidden | exists): as far as it is hidden, its azimuth stays where hidden vehicles are.
     """
+    settings = scene.settings
     acceleration = settings.acceleration_psd if track.moving else _PARKED_ACCELERATION
     motion = predict(track.motion, step_s, acceleration)
     radial_kept = math.exp(-step_s / settings.relaxation_s)
@@ -96,7 +94,7 @@ def predict_track(
         existence = after_time(track.existence, step_s, settings.visible_life_s)
         return replace(track, motion=relax(motion, _IN_VIEW, 1.0, radial_kept), existence=existence)
     bearing_kept = math.exp(-step_s * hidden_share / settings.relaxation_s)
-    return replace(track, motion=relax(motion, sides[track.side].prior(settings), bearing_kept, radial_kept))
+    return replace(track, motion=relax(motion, scene.prior(track.side), bearing_kept, radial_kept))
 
 
 def relabelled(labels: tuple[tuple[str, float], ...], sighting: Sighting) -> tuple[tuple[str, float], ...]:
