@@ -3,6 +3,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 SHELL := /bin/sh
 
+# Two test processes of one BLAS thread each: on two cores more threads only wait for one another.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
 .PHONY: demo test slow lint clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
