@@ -5,7 +5,7 @@ import io
 import json
 import multiprocessing
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import soundfile
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.atomic import atomic_path, write_text
 from worldstate.checks import in_range
@@ -185,12 +184,41 @@ def write_recording(root: str | Path, recording: SimulatedRecording, number: int
     return row
 
 
+def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
+    """Write `DataLog.csv`, which lists the recordings of a data set.
+
+    Parameters
+    ----------
+    root : str or Path
+        Existing folder of the data set.
+    rows : sequence of LogRow
+        One per recording, as `write_recording` returns them.
+
+    Raises
+    ------
+    InputFileError
+        If the folder does not exist.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as root:
+    ...     write_log(root, [LogRow("1_00_0002", "SA1", "left", 70)])
+    ...     print(Path(root, "DataLog.csv").read_text(), end="")
+    ID,Environment,Class,T0
+    1_00_0002,SA1,left,70
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["ID", "Environment", "Class", "T0"])
+    writer.writerows([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
+    write_text(Path(root) / LOG_NAME, text.getvalue())
+
+
 def _simulate_one(root: Path, duration_s: float, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     settings = draw_settings(plan.environment, plan.approach, rng, duration_s)
-    with threadpool_limits(1):  # the number of BLAS threads would change the last bits
-        recording = simulate_recording(settings, rng)
-    return write_recording(root, recording, plan.number)
+    return write_recording(root, simulate_recording(settings, rng), plan.number)
 
 
 def _each(work: Callable[[Plan], LogRow], plans: list[Plan], jobs: int) -> Iterator[LogRow]:
@@ -227,18 +255,3 @@ def _write_audio(path: Path, recording: SimulatedRecording) -> None:
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:
     path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def write_log(root: str | Path, rows: list[LogRow]) -> None:
-    """Write `DataLog.csv`, in place of the one that is there.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written.
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["ID", "Environment", "Class", "T0"])
-    writer.writerows([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
-    write_text(Path(root) / LOG_NAME, text.getvalue())

@@ -75,7 +75,7 @@ class Path:
     lit : ndarray, shape (T,)
         1 where the line is straight, 0 where it bends round the corner, smooth in between.
     edge : ndarray, shape (T,)
-        The nearer corner, LEFT or RIGHT.
+        The corner with the shorter way round, LEFT or RIGHT.
     bent_m : ndarray, shape (T,)
         Length round that corner to the array's centre.
     gain : ndarray, shape (T, 8)
@@ -168,10 +168,10 @@ def _trace(
     end_y = float(receiver.mirror(np.zeros(1))[0])
     crossing = end_y + (source_y - end_y) * mouth / source.x_m
     clearance = np.minimum(left - crossing, crossing - right)
-    edge = (crossing < 0.5 * (left + right)).astype(np.int8)
-    edge_y = np.where(edge == LEFT, left, right)
+    # The shorter way round: both are equal where the corner changes, so nothing jumps there.
+    ways = [_bent_length(source.x_m, source_y, mouth, y, end_y, height) for y in (left, right)]
+    edge, bent = np.argmin(ways, axis=0).astype(np.int8), np.minimum(*ways)
     straight = _length(source.x_m, source_y - end_y, height)
-    bent = _bent_length(source.x_m, source_y, mouth, edge_y, end_y, height)
     detour = np.copysign(bent - straight, -clearance)
     screen_db = screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db)
     aim_y = np.clip(crossing, right, left)
@@ -185,7 +185,7 @@ def _length(dx: float | Array, dy: Array, dz: float) -> Array:
 
 
 def _bent_length(
-    source_x: float, source_y: Array, mouth: float, edge_y: Array, end_y: float, height: float
+    source_x: float, source_y: Array, mouth: float, edge_y: float, end_y: float, height: float
 ) -> Array:
     """Shortest way over the vertical edge: the two legs lie in one unfolded plane."""
     before = np.hypot(source_x - mouth, source_y - edge_y)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
@@ -77,23 +78,17 @@ def simulate_recording(
     Examples
     --------
     >>> from worldstate.adapters.simulation import SimulationSettings, site
-    >>> settings = SimulationSettings(site("SA1"), "left", duration_s=1.0, entry_s=0.65)
+    >>> settings = SimulationSettings(site("SA1"), "left", duration_s=0.6, entry_s=0.45)
     >>> recording = simulate_recording(settings, np.random.default_rng(1))
     >>> recording.audio.shape, len(recording.detections), recording.t0_frame
-    ((47998, 56), 10, 7)
+    ((28799, 56), 6, 5)
     """
-    to_emission, to_street, to_camera, to_channels = rng.spawn(4)
-    receiver = _receiver(settings, roof_array_56() if array is None else array, to_channels)
-    sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
-    trajectory = _trajectory(settings)
-    if trajectory is not None:
-        _add_vehicle_sound(sound, settings, trajectory, receiver, to_emission)
-    add_background(
-        sound, settings.site, settings.preset, receiver.positions_m, settings.sample_rate_hz, to_street
-    )
-    audio = _to_samples(sound, settings, to_channels)
+    to_sound, to_camera = rng.spawn(2)
+    with threadpool_limits(1):  # the number of BLAS threads would change the last bits
+        audio = _listen(settings, roof_array_56() if array is None else array, to_sound)
     camera = PinholeCamera()
     frames = _frame_times(settings)
+    trajectory = _trajectory(settings)
     seen = None if trajectory is None else _at(trajectory, frames)
     return SimulatedRecording(
         audio=audio,
@@ -102,6 +97,19 @@ def simulate_recording(
         detections=_detections(settings, seen, len(frames), camera, to_camera),
         truth=describe(settings, frames, seen, camera),
     )
+
+
+def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Signal:
+    """Return what the array records, shape (n, M)."""
+    to_emission, to_street, to_channels = rng.spawn(3)
+    receiver = _receiver(settings, array, to_channels)
+    sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
+    trajectory = _trajectory(settings)
+    if trajectory is not None:
+        _add_vehicle_sound(sound, settings, trajectory, receiver, to_emission)
+    positions, rate = receiver.positions_m, settings.sample_rate_hz
+    add_background(sound, settings.site, settings.preset, positions, rate, to_street)
+    return _to_samples(sound, settings, to_channels)
 
 
 def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
