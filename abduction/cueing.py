@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from worldstate.checks import finite_array, in_range
 from worldstate.errors import InvalidArgumentError
 
+from .adaptive_threshold import AdaptiveBudget
 from .risk_map import RiskMap, risk_map_from_dict
 from .schema import read_number, read_numbers
 
@@ -71,6 +72,8 @@ class CueingPolicy:
         The beta at which the statistic was formed on the calibration data: 0 with the visible explanation
         removed, 1 for the published statistic. The statistic falls as beta rises, so a gamma set at 0 keeps
         its budget at every beta.
+    adaptive : AdaptiveBudget, optional
+        A false-alarm rate that the filter keeps by moving the threshold about gamma; None leaves it there.
 
     Raises
     ------
@@ -91,6 +94,7 @@ class CueingPolicy:
     reference_prior: tuple[float, ...]
     risk_map: RiskMap
     miss_rate: float = 0.0
+    adaptive: AdaptiveBudget | None = None
 
     def __post_init__(self) -> None:
         finite_array("gamma", self.gamma, ())
@@ -105,6 +109,10 @@ class CueingPolicy:
         """Whether a statistic is at or above the threshold."""
         return statistic >= self.gamma
 
+    def gamma_at(self, shift_nats: float) -> float:
+        """Return the threshold once it has moved by so much; gamma itself where nothing moves it."""
+        return self.gamma if self.adaptive is None else self.adaptive.gamma(self.gamma, shift_nats)
+
     def rule(self) -> SustainedRule:
         """Return the sustained rule at its start."""
         return SustainedRule(self.sustain_hops)
@@ -118,6 +126,7 @@ class CueingPolicy:
             "reference_prior": list(self.reference_prior),
             "risk_map": self.risk_map.to_dict(),
             "miss_rate": self.miss_rate,
+            "adaptive": None if self.adaptive is None else self.adaptive.to_dict(),
         }
 
     @classmethod
@@ -131,6 +140,7 @@ class CueingPolicy:
         """
         if not isinstance(data, Mapping):
             raise InvalidArgumentError("policy: expected an object")
+        adaptive = data.get("adaptive")
         return cls(
             gamma=read_number(data.get("gamma"), "gamma"),
             sustain_hops=_check_sustain_hops(data.get("sustain_hops")),
@@ -138,6 +148,7 @@ class CueingPolicy:
             reference_prior=read_numbers(data.get("reference_prior"), "reference_prior"),
             risk_map=risk_map_from_dict(data.get("risk_map")),
             miss_rate=read_number(data.get("miss_rate"), "miss_rate"),
+            adaptive=None if adaptive is None else AdaptiveBudget.from_dict(adaptive),
         )
 
 

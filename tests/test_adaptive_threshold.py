@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,16 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from worldstate.abduction.adaptive_threshold import AdaptiveBudget, AdaptiveThreshold
+from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.cueing import SustainedRule
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.errors import InvalidArgumentError
+from worldstate.filter import WorldFilter, uncalibrated_policy
+from worldstate.measurement import Measurement
+from worldstate.values import NotUsable
 
 HOP_S = 0.1
+NO_CAMERA = Unqueried("no camera")
 budgets = st.builds(
     AdaptiveBudget,
     rate_per_hour=st.floats(0.1, 500.0),
@@ -138,3 +145,52 @@ def test_damaged_state_is_refused(damaged):
         AdaptiveThreshold.from_dict(damaged)
     with pytest.raises(InvalidArgumentError):
         AdaptiveBudget.from_dict(damaged)
+
+
+def evidence_at(hop, log_odds, answer):
+    heard = SignatureEvidence(("left", "right"), (log_odds, log_odds), 0.0, 0.0)
+    return Measurement(hop * 100_000_000, heard, answer, NotUsable("-"), NotUsable("-"))
+
+
+def listen(world, log_odds, answer=NO_CAMERA):
+    """Alarm onsets and the filter at the end of a stream of log-odds."""
+    onsets, before = 0, False
+    for score in log_odds:
+        hop = round(world.stamp_ns / 1e8) + 1
+        world = world.predict(0.1).update(evidence_at(hop, score, answer))
+        alarm = any(cue.advisory for cue in world.state.cues)
+        onsets, before = onsets + (alarm and not before), alarm
+    return onsets, world
+
+
+def adaptive_world(**settings):
+    policy = replace(uncalibrated_policy(), adaptive=AdaptiveBudget(rate_per_hour=20.0, **settings))
+    return WorldFilter(policy=policy)
+
+
+BURST = [*[-4.0] * 30, *[2.6] * 4, *[-4.0] * 30]
+
+
+def test_in_the_filter_false_alarms_raise_the_threshold_and_a_checkpoint_keeps_it():
+    fixed, _ = listen(WorldFilter(), BURST * 8)
+    adapted, world = listen(adaptive_world(), BURST * 8)
+    assert fixed == 8
+    assert 1 <= adapted < fixed
+    assert world.policy.gamma < world.gamma < 0.99
+    again = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict())))
+    assert again.gamma == world.gamma
+    assert listen(again, BURST)[1].to_dict() == listen(world, BURST)[1].to_dict()
+
+
+def test_in_the_filter_a_loud_hazard_is_announced_after_any_number_of_false_alarms():
+    _, world = listen(adaptive_world(most_up_nats=1.0), BURST * 12)
+    heard, _ = listen(world, [4.6] * 10)
+    assert heard == 1
+
+
+def test_off_by_default_and_then_a_checkpoint_of_before_still_reads():
+    _, world = listen(WorldFilter(), BURST)
+    assert world.gamma == world.policy.gamma
+    old = world.to_dict()
+    del old["memory"]["threshold"], old["policy"]["adaptive"]
+    assert WorldFilter.from_dict(old).gamma == world.policy.gamma

@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
 from worldstate.belief.explanation import ExplanationBelief
@@ -15,6 +16,8 @@ from worldstate.belief.track import Track
 from worldstate.errors import InvalidArgumentError
 from worldstate.memory import Memory
 from worldstate.state import ANSWERS, Priors, Record
+
+T = TypeVar("T")
 
 SCHEMA_NAME = "worldstate.Filter"
 SCHEMA_VERSION = "1.0.0"
@@ -34,6 +37,7 @@ def memory_to_dict(memory: Memory) -> dict[str, Any]:
         "last": [{"source": source, "stamp_ns": stamp_ns} for source, stamp_ns in memory.last_ns],
         "predicted": None if memory.predicted is None else memory.predicted.to_dict(),
         "instant": None if memory.instant is None else _instant_to_dict(memory.instant),
+        "threshold": memory.threshold.to_dict(),
     }
 
 
@@ -58,6 +62,10 @@ def memory_from_record(record: Record, directions: tuple[str, ...], policy: Cuei
         last_ns=tuple((item.text("source"), item.integer("stamp_ns")) for item in record.records("last")),
         predicted=record.maybe("predicted", lambda key: Priors.from_record(record.record(key))),
         instant=record.maybe("instant", lambda key: _instant_from_record(record.record(key), directions)),
+        threshold=_or(
+            record.maybe("threshold", lambda key: AdaptiveThreshold.from_dict(record.record(key).raw)),
+            AdaptiveThreshold(),
+        ),
     )
 
 
@@ -151,8 +159,8 @@ def _instant_from_record(record: Record, directions: tuple[str, ...]) -> Posteri
     return Posterior(directions, logs, log_lambda, record.number("log_evidence"))
 
 
-def _or(value: float | None, infinite: float) -> float:
-    return infinite if value is None else value
+def _or(value: T | None, otherwise: T) -> T:
+    return otherwise if value is None else value
 
 
 def _births(record: Record, directions: int) -> tuple[int, ...]:

@@ -110,6 +110,11 @@ class WorldFilter:
         return None if instant is None else min(instant.hidden_total, 1.0)
 
     @property
+    def gamma(self) -> float:
+        """Threshold in force: the policy's, moved where it adapts."""
+        return self.policy.gamma_at(self._memory.threshold.shift_nats)
+
+    @property
     def log_lambda(self) -> float | None:
         """Log Lambda of the last window, nats; None before the first."""
         instant = self._memory.instant

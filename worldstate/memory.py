@@ -1,7 +1,8 @@
 """What the filter carries from one call to the next."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
 from worldstate.belief.explanation import ExplanationBelief
@@ -37,6 +38,8 @@ class Memory:
         Explanation priors of the last update; None before the first.
     instant : Posterior or None
         Posterior of the last window alone, at the policy's reference prior; None before the first.
+    threshold : AdaptiveThreshold
+        How far the threshold has moved, where the policy lets it.
     """
 
     stamp_ns: int
@@ -50,6 +53,7 @@ class Memory:
     last_ns: tuple[tuple[str, int], ...] = ()
     predicted: Priors | None = None
     instant: Posterior | None = None
+    threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing import CueingPolicy
 from worldstate.abduction.posterior import abduce
 from worldstate.belief.hearing import hear, hidden_share
@@ -106,8 +107,23 @@ def alert(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
     """Return the memory after the sustained rule has taken in this window's statistic."""
     log_prior = np.log(ground.policy.reference_prior)
     instant = abduce(log_prior, measurement.signature, measurement.co_evidence)
-    rule = memory.rule.advance(ground.policy.exceeded(instant.hidden_total))
-    return replace(memory, instant=instant, rule=rule)
+    held = instant.hidden_total >= ground.policy.gamma_at(memory.threshold.shift_nats)
+    alerted = replace(memory, instant=instant, rule=memory.rule.advance(held))
+    return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, ground.policy))
+
+
+def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThreshold:
+    """Return the threshold's state after this window, once the belief has taken it in."""
+    if policy.adaptive is None:
+        return memory.threshold
+    before_ns = max((ns for _, ns in memory.last_ns), default=stamp_ns)
+    return memory.threshold.advance(
+        policy.adaptive,
+        visible=memory.explanation.visible,
+        none=memory.explanation.none,
+        alarm=memory.rule.alarm,
+        elapsed_s=max(seconds(stamp_ns - before_ns), 0.0),
+    )
 
 
 def alarmed(memory: Memory) -> tuple[bool, ...]:
