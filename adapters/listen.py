@@ -71,7 +71,7 @@ def open_source(
     array: Path | str | MicrophoneArray | None = None,
     detections: Path | str | DetectionLog | None = None,
     model: Path | str | None = None,
-    alpha: float = 0.02,
+    alpha: float | None = 0.02,
     context: Context | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
@@ -86,8 +86,9 @@ def open_source(
         Camera detections per frame; those of the recording folder where not given.
     model : path, optional
         Model file; the one that ships where not given.
-    alpha : float
-        False-positive budget that the threshold was set for; the model file says which it holds.
+    alpha : float or None
+        False-positive budget that the threshold was set for; the model file says which it holds. None takes
+        the first one, for those who only measure.
     context : Context, optional
         Rates, occluders and ego motion; defaults where not given.
 
@@ -107,7 +108,7 @@ def open_source(
         array=_array(array),
         detections=found if found is None or isinstance(found, DetectionLog) else read_detections(found),
         model=signature,
-        policy=policies.for_alpha(alpha),
+        policy=policies.policies[0] if alpha is None else policies.for_alpha(alpha),
         context=context or Context(),
         t0_s=recording.t0_s if recording and recording.label != "none" else None,
     )
@@ -141,16 +142,27 @@ def listen_steps(source: Source) -> Iterator[Step]:
     InputFileError
         If the sound file is damaged or does not fit the array.
     """
+    world = WorldFilter(context=source.context, policy=source.policy)
+    for frame, measurement in measure_steps(source):
+        world = world.predict_to(measurement.stamp_ns).update(measurement)
+        yield Step(frame, measurement, world.state)
+
+
+def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]:
+    """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
+
+    Raises
+    ------
+    InputFileError
+        If the sound file is damaged or does not fit the array.
+    """
     with open_audio(source.audio_path, expect_channels=source.array.positions_m.shape[0]) as audio:
         sight = line_of_sight(source.context)
         vision = VisionQuery(PinholeCamera(), source.detections, line_of_sight=sight)
         adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.model, vision=vision)
-        world = WorldFilter(context=source.context, policy=source.policy)
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):
-                measurement = adapter.interpret(frame)
-                world = world.predict_to(measurement.stamp_ns).update(measurement)
-                yield Step(frame, measurement, world.state)
+                yield frame, adapter.interpret(frame)
 
 
 def line_of_sight(context: Context) -> Sector:

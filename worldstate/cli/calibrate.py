@@ -1,0 +1,123 @@
+"""`worldstate calibrate`: thresholds of a model from a user's own hazard-free hours."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.output import print_summary
+from worldstate.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.evaluation.cueing_calibration import CueingCalibration
+    from worldstate.evaluation.hop_stream import HopStream
+
+DESCRIPTION = """\
+Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
+
+INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
+that --save-streams wrote. Recordings labelled none and sound files count as hazard-free. Approaches with a
+T0, where there are some, give the risk map (Platt for few, isotonic for many); without them the model's own
+is kept. A budget that the hours do not suffice for is warned about, with the hours that it would take."""
+
+EXAMPLE = """\
+examples:
+  worldstate calibrate night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
+  worldstate calibrate my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "calibrate",
+        help="set thresholds on your own hazard-free hours",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
+    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
+    parser.add_argument("--model", type=Path, help="model file to start from (default: the one that ships)")
+    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    parser.add_argument(
+        "--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A",
+        help="budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--method", choices=("conformal", "plain"), default="conformal",
+        help="with a finite-sample guarantee, or the smallest threshold that fits (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
+    parser.add_argument(
+        "--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)"
+    )
+    parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    parser.add_argument("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    from dataclasses import replace
+
+    from worldstate.adapters.model_file import read_model, save_model
+    from worldstate.evaluation.cueing_calibration import CueingSettings, calibrate_cueing
+    from worldstate.evaluation.hop_stream import save_streams
+
+    settings = CueingSettings(
+        alphas=tuple(arguments.alpha),
+        sustain_hops=arguments.sustain_hops,
+        method=arguments.method,
+        confidence=arguments.confidence,
+        block_s=arguments.block,
+    )
+    model = read_model(arguments.model)
+    streams = _streams(arguments)
+    if arguments.save_streams is not None:
+        save_streams(arguments.save_streams, streams)
+    done = calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
+    figures = dict(model.provenance.figures or {}) | {"calibration_hours": done.hours}
+    provenance = replace(model.provenance, figures=figures)
+    save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
+    for warning in done.warnings:
+        print(f"worldstate: warning: {warning}", file=sys.stderr)
+    _print(arguments, done)
+    return 0
+
+
+def _streams(arguments: argparse.Namespace) -> "list[HopStream]":
+    from worldstate.evaluation.calibration_input import find_inputs, read_input
+
+    found = [item for path in arguments.inputs for item in find_inputs(path)]
+    streams = []
+    with progress_bar("listening", len(found)) as bar:
+        for path in found:
+            streams += read_input(path, array=arguments.array, model=arguments.model)
+            bar.advance()
+    return streams
+
+
+def _print(arguments: argparse.Namespace, done: "CueingCalibration") -> None:
+    summary: dict[str, object] = {
+        "out": str(arguments.out),
+        "hazard_free_hours": done.hours,
+        "windows": done.windows,
+        "recordings": done.recordings,
+        "pieces": done.blocks,
+        "correlation_time_s": done.correlation_time_s,
+        "risk_map": done.risk,
+    }
+    if arguments.json:
+        budgets = [report.to_dict() for report in done.budgets]
+        print_summary(summary | {"budgets": budgets, "warnings": list(done.warnings)}, as_json=True)
+        return
+    lines = {
+        f"alpha {report.alpha:g}, beta {report.miss_rate:g}": (
+            f"gamma {report.gamma:.4f}  {report.counted.per_hour:.3g} false alarms/h "
+            f"[{report.counted.low_per_hour:.3g}, {report.counted.high_per_hour:.3g}], "
+            f"one is {report.counted.quantum_per_hour:.3g}/h"
+        )
+        for report in done.budgets
+    }
+    print_summary(summary | lines, as_json=False)

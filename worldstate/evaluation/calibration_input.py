@@ -1,0 +1,44 @@
+"""What can be calibrated on: data sets, recordings, sound files, streams heard before."""
+
+from pathlib import Path
+
+from worldstate.adapters.listen import measure_steps, open_source
+from worldstate.adapters.ovad import LOG_NAME, OvadDataset, Recording
+from worldstate.errors import InputFileError
+from worldstate.evaluation.hop_stream import HopStream, hop_stream, load_streams
+
+
+def find_inputs(path: Path) -> list[Path]:
+    """Return the recordings of a data set, or the file or recording folder itself.
+
+    Raises
+    ------
+    InputFileError
+        If nothing stands there, or a data set's log is damaged.
+    """
+    if not path.exists():
+        raise InputFileError(path, "expected a data set, a recording folder or a sound file")
+    if path.is_dir() and (path / LOG_NAME).is_file():
+        return [recording.path for recording in OvadDataset(path).recordings]
+    return [path]
+
+
+def read_input(path: Path, *, array: Path | None = None, model: Path | None = None) -> list[HopStream]:
+    """Listen to a recording or read streams; a sound file counts as hazard-free.
+
+    Raises
+    ------
+    InputFileError
+        If a file is missing or damaged.
+    InvalidArgumentError
+        If the recording is shorter than a second.
+    """
+    if path.suffix == ".npz":
+        return load_streams(path)
+    source = open_source(path, array=array, model=model, alpha=None)
+    measured = (measurement for _, measurement in measure_steps(source))
+    if not path.is_dir():
+        return [hop_stream(measured, name=str(path))]
+    recording = Recording.open(path)
+    name = "/".join(filter(None, (recording.environment, recording.recording_id)))
+    return [hop_stream(measured, name=name, label=recording.label or "none", t0_s=source.t0_s)]

@@ -1,0 +1,315 @@
+"""Thresholds and risk maps from whole recordings: what `worldstate calibrate` does."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.conformal import conformal_threshold, recordings_needed
+from worldstate.abduction.correlation import correlation_time_hops
+from worldstate.abduction.cueing import CueingPolicies, CueingPolicy
+from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.risk_map import IsotonicMap, RiskMap, fit_risk_map
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.evaluation.calibration import MISS_RATES
+from worldstate.evaluation.false_alarm_map import FalseAlarmRate, false_alarm_rate
+from worldstate.evaluation.hop_stream import HOP_S, HopStream
+from worldstate.evaluation.stream_statistic import StatisticSwitches, stream_statistic
+
+Numbers = NDArray[np.float64]
+Method = Literal["conformal", "plain"]
+
+# With fewer false alarms in all the hours than this, their rate is not known to a factor of two.
+ENOUGH_ONSETS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class CueingSettings:
+    """How thresholds are set.
+
+    Parameters
+    ----------
+    alphas : tuple of float
+        Budgets: share of hazard-free windows in sustained alarm, in (0, 1).
+    sustain_hops : int
+        k of the sustained rule.
+    method : {"conformal", "plain"}
+        With the finite-sample guarantee, or the smallest threshold that keeps the budget on these very hours.
+    confidence : float, optional
+        Of the conformal guarantee; without it the guarantee is on the mean over calibrations.
+    block_s : float
+        Hazard-free hours are cut into pieces of this length, which the guarantee takes for exchangeable: it
+        should be longer than the correlation time of the statistic.
+    folds : int
+        Of the recording-level folds that the achieved rate is measured by, >= 2.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> CueingSettings(alphas=(0.02,)).block_hops
+    100
+    """
+
+    alphas: tuple[float, ...] = (0.01, 0.02, 0.05)
+    sustain_hops: int = 3
+    method: Method = "conformal"
+    confidence: float | None = None
+    block_s: float = 10.0
+    folds: int = 5
+
+    def __post_init__(self) -> None:
+        if not self.alphas:
+            raise InvalidArgumentError("alpha: expected at least one budget")
+        for alpha in self.alphas:
+            in_range("alpha", alpha, 0.0, 1.0, open_low=True, open_high=True)
+        if self.confidence is not None:
+            in_range("confidence", self.confidence, 0.0, 1.0, open_low=True, open_high=True)
+        in_range("block_s", self.block_s, 1.0, 3600.0)
+        in_range("folds", self.folds, 2, 1000)
+        if self.method not in ("conformal", "plain"):
+            raise InvalidArgumentError(f"method: expected conformal or plain, got {self.method!r:.40}")
+
+    @property
+    def block_hops(self) -> int:
+        """Length of a piece in hops."""
+        return max(round(self.block_s / HOP_S), 1)
+
+    def threshold(self, hazard_free: Sequence[Numbers], alpha: float) -> float:
+        """Return gamma(alpha) on recordings; above all of them where no threshold has the guarantee."""
+        if self.method == "plain":
+            return neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
+        blocks = [block for stream in hazard_free for block in cut(stream, self.block_hops)]
+        gamma = conformal_threshold(blocks, alpha, self.sustain_hops, self.confidence)
+        if np.isfinite(gamma):
+            return gamma
+        return neyman_pearson_threshold(hazard_free, 0.0, self.sustain_hops)
+
+
+@dataclass(frozen=True, slots=True)
+class BudgetReport:
+    """What one budget came to.
+
+    Parameters
+    ----------
+    alpha, miss_rate : float
+        The budget, and the beta of the statistic.
+    gamma : float
+        The threshold.
+    counted : FalseAlarmRate
+        Its false alarms on the recordings that it was set on.
+    held_out_rate : float or None
+        Share of windows in alarm by recording-level folds: set on the others, counted on each. None with a
+        single recording.
+    held_out_per_hour : float or None
+        False alarms per hour by the same folds.
+    """
+
+    alpha: float
+    miss_rate: float
+    gamma: float
+    counted: FalseAlarmRate
+    held_out_rate: float | None
+    held_out_per_hour: float | None
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON-able values."""
+        counted = self.counted
+        return {
+            "alpha": self.alpha,
+            "miss_rate": self.miss_rate,
+            "gamma": self.gamma,
+            "window_rate": counted.window_rate,
+            "false_alarms_per_hour": counted.per_hour,
+            "false_alarms_per_hour_95": [counted.low_per_hour, counted.high_per_hour],
+            "quantum_per_hour": counted.quantum_per_hour,
+            "held_out_window_rate": self.held_out_rate,
+            "held_out_false_alarms_per_hour": self.held_out_per_hour,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class CueingCalibration:
+    """Policies, and how far they can be relied on.
+
+    Parameters
+    ----------
+    policies : CueingPolicies
+        One for each budget and miss rate.
+    budgets : tuple of BudgetReport
+        In the same order.
+    hours, windows, recordings, blocks : float and int
+        Hazard-free time, decision windows, recordings and pieces of them.
+    correlation_time_s : float
+        Of the statistic at miss rate 0.
+    risk : {"kept", "platt", "isotonic"}
+        Where the risk map comes from.
+    warnings : tuple of str
+        What the hours do not suffice for.
+    """
+
+    policies: CueingPolicies
+    budgets: tuple[BudgetReport, ...]
+    hours: float
+    windows: int
+    recordings: int
+    blocks: int
+    correlation_time_s: float
+    risk: str
+    warnings: tuple[str, ...]
+
+
+def calibrate_cueing(
+    streams: Sequence[HopStream],
+    reference_prior: tuple[float, ...],
+    kept: CueingPolicies,
+    settings: CueingSettings | None = None,
+) -> CueingCalibration:
+    """Set gamma(alpha) on hazard-free recordings, and the risk map where approaches with a T0 are there too.
+
+    Parameters
+    ----------
+    streams : sequence of HopStream
+        Hazard-free recordings, and approaches if there are any.
+    reference_prior : tuple of float
+        Prior that the statistic is formed at: the signature model's own.
+    kept : CueingPolicies
+        Whose risk maps are kept where no approach is there to fit one to.
+    settings : CueingSettings, optional
+        Budgets and method.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no hazard-free window.
+    """
+    chosen = settings or CueingSettings()
+    free = [stream for stream in streams if stream.hazard_free and len(stream)]
+    if not free:
+        raise InvalidArgumentError("recordings: expected at least one without a hazard")
+    approaches = [stream for stream in streams if stream.before_sight.any()]
+    budgets, policies = [], []
+    for beta in sorted(MISS_RATES):
+        calm = _statistics(free, reference_prior, beta)
+        tau = correlation_time_hops(calm)
+        risk = _risk_map(calm, _hazards(approaches, reference_prior, beta), tau, _risk_of(kept, beta))
+        for report in (_budget(calm, alpha, beta, chosen) for alpha in chosen.alphas):
+            budgets.append(report)
+            policies.append(
+                CueingPolicy(report.gamma, chosen.sustain_hops, report.alpha, reference_prior, risk, beta)
+            )
+    blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
+    tau = correlation_time_hops(_statistics(free, reference_prior, 0.0))
+    return CueingCalibration(
+        policies=CueingPolicies(tuple(policies)),
+        budgets=tuple(budgets),
+        hours=budgets[0].counted.hours,
+        windows=sum(map(len, free)),
+        recordings=len(free),
+        blocks=blocks,
+        correlation_time_s=tau * HOP_S,
+        risk=_kind(policies[0].risk_map) if approaches else "kept",
+        warnings=tuple(_warnings(budgets, chosen, blocks, tau * HOP_S)),
+    )
+
+
+def cut(stream: Numbers, block_hops: int) -> list[Numbers]:
+    """Return pieces of at least `block_hops`; what is left over at the end goes to the last one.
+
+    Examples
+    --------
+    >>> [piece.size for piece in cut(np.zeros(25), 10)]
+    [10, 15]
+    """
+    count = max(stream.size // block_hops, 1)
+    return np.split(stream, [i * block_hops for i in range(1, count)])
+
+
+def _statistics(streams: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[Numbers]:
+    switches = StatisticSwitches(fixed_miss_rate=beta)
+    return [stream_statistic(stream, prior, switches) for stream in streams]
+
+
+def _hazards(approaches: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[Numbers]:
+    scored = _statistics(approaches, prior, beta)
+    return [s[stream.before_sight] for s, stream in zip(scored, approaches, strict=True)]
+
+
+def _budget(calm: list[Numbers], alpha: float, beta: float, settings: CueingSettings) -> BudgetReport:
+    gamma = settings.threshold(calm, alpha)
+    counted = false_alarm_rate(calm, gamma, settings.sustain_hops, HOP_S)
+    rate, per_hour = _held_out(calm, alpha, settings)
+    return BudgetReport(alpha, beta, gamma, counted, rate, per_hour)
+
+
+def _held_out(
+    calm: list[Numbers], alpha: float, settings: CueingSettings
+) -> tuple[float, float] | tuple[None, None]:
+    """Achieved rates by folds that never part a recording."""
+    folds = min(settings.folds, len(calm))
+    if folds < 2:
+        return None, None
+    alarms, onsets, hours = 0.0, 0, 0.0
+    for fold in range(folds):
+        gamma = settings.threshold([s for i, s in enumerate(calm) if i % folds != fold], alpha)
+        found = false_alarm_rate(calm[fold::folds], gamma, settings.sustain_hops, HOP_S)
+        alarms, onsets, hours = (
+            alarms + found.window_rate * found.hours,
+            onsets + found.onsets,
+            hours + found.hours,
+        )
+    return alarms / hours, onsets / hours
+
+
+def _risk_map(calm: list[Numbers], hazards: list[Numbers], time_hops: float, kept: RiskMap) -> RiskMap:
+    if not hazards:
+        return kept
+    scores = np.concatenate([*calm, *hazards])
+    labels = np.arange(scores.size) >= sum(s.size for s in calm)
+    return fit_risk_map(scores, labels, independent=scores.size / time_hops)
+
+
+def _risk_of(policies: CueingPolicies, beta: float) -> RiskMap:
+    return min(policies.policies, key=lambda policy: abs(policy.miss_rate - beta)).risk_map
+
+
+def _kind(risk_map: RiskMap) -> str:
+    return "isotonic" if isinstance(risk_map, IsotonicMap) else "platt"
+
+
+def _warnings(
+    budgets: list[BudgetReport], settings: CueingSettings, blocks: int, correlation_s: float
+) -> Iterator[str]:
+    conformal = settings.method == "conformal"
+    for alpha in settings.alphas:
+        need = recordings_needed(alpha, settings.confidence)
+        if conformal and blocks < need:
+            yield (
+                f"alpha {alpha:g}: the guarantee needs {need} pieces of {settings.block_s:g} s "
+                f"({need * settings.block_s / 3600.0:.2g} h), got {blocks}; the threshold lies above all "
+                "that was heard and guarantees nothing"
+            )
+    for report in budgets:
+        count = report.counted
+        if report.miss_rate == 0.0 and count.onsets < ENOUGH_ONSETS:
+            yield (
+                f"alpha {report.alpha:g}: {count.onsets} false alarms in {count.hours:.3g} h put their rate "
+                f"between {count.low_per_hour:.3g} and {count.high_per_hour:.3g} an hour; "
+                f"{_hours_for_a_rate(report):.2g} h would tell it to a factor of two"
+            )
+    if conformal and correlation_s > settings.block_s / 2:
+        yield (
+            f"the statistic is correlated over {correlation_s:.3g} s: pieces of {settings.block_s:g} s "
+            "depend on each other, take longer ones"
+        )
+
+
+def _hours_for_a_rate(report: BudgetReport) -> float:
+    count = report.counted
+    return count.hours * ENOUGH_ONSETS / max(count.onsets, 1)

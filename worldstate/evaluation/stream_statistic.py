@@ -1,0 +1,116 @@
+"""The hazard statistic over a recorded stream, with the parts of it that an ablation removes as switches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.evaluation.hop_stream import ABSENT, PRESENT, HopStream
+
+Numbers = NDArray[np.float64]
+
+# An approach score beyond this many standard deviations says no more than one at it.
+LARGEST_SCORE = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class StatisticSwitches:
+    """What of eq. (post) the statistic uses.
+
+    Parameters
+    ----------
+    use_absence : bool
+        False drops the answer of the channel that was asked: the signature alone, beta = 1.
+    fixed_miss_rate : float, optional
+        Absence with this beta at every hop, whatever was answered: the statistic that thresholds are set on.
+    approach_weight : float
+        Nats by which the log-odds rise with each standard deviation of the approach rate above zero; where it
+        is not usable it is marginalised.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> StatisticSwitches(approach_weight=0.5).use_absence
+    True
+    """
+
+    use_absence: bool = True
+    fixed_miss_rate: float | None = None
+    approach_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        in_range("approach_weight", self.approach_weight, 0.0, 100.0)
+        if self.fixed_miss_rate is not None:
+            in_range("fixed_miss_rate", self.fixed_miss_rate, 0.0, 1.0)
+
+
+def stream_statistic(
+    stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
+) -> Numbers:
+    r"""Return eq. (post) at a fixed prior at every hop, shape (n,), in [0, 1].
+
+    .. math:: \mathrm{logit}\, s = \log \frac{\sum_k \pi_k \ell_k}
+              {\pi_{vis}\, p(V | vis)\, \ell_{vis} / p(V | hid) + \pi_0\, \ell_0}
+              + w\, \frac{\rho}{\sigma_\rho}
+
+    with the approach rate rho in standard deviations, held within three. Without the last term it is
+    `abduction.posterior.statistic`.
+
+    Parameters
+    ----------
+    stream : HopStream
+        One recording.
+    reference_prior : sequence of float, shape (K + 2,)
+        Of hidden_1 .. hidden_K, visible, none; positive.
+    switches : StatisticSwitches, optional
+        All on, no approach term, where not given.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the prior does not fit the stream.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> stream = replace(HopStream.blank("a", 1), log_likelihoods=np.log([[0.3, 0.1, 0.5, 0.1]]))
+    >>> for beta in (1.0, 0.0):
+    ...     switches = StatisticSwitches(fixed_miss_rate=beta)
+    ...     stream_statistic(stream, (0.25,) * 4, switches).round(3).item()
+    0.4
+    0.8
+    """
+    chosen = switches or StatisticSwitches()
+    prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
+    joint = np.log(prior) + stream.log_likelihoods
+    with np.errstate(divide="ignore"):
+        joint[:, -2] += _log_visible(stream, chosen)
+    hidden = np.logaddexp.reduce(joint[:, :-2], axis=1)
+    log_odds = hidden - np.logaddexp(joint[:, -2], joint[:, -1])
+    log_odds += chosen.approach_weight * approach_score(stream)
+    return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
+
+
+def approach_score(stream: HopStream) -> Numbers:
+    """Return the approach rate in standard deviations within three, 0 where it is not usable, shape (n,)."""
+    usable = np.isfinite(stream.approach)
+    return np.where(usable, np.clip(stream.approach, -LARGEST_SCORE, LARGEST_SCORE), 0.0)
+
+
+def _log_visible(stream: HopStream, switches: StatisticSwitches) -> Numbers:
+    """Log p(V | visible) / p(V | hidden or none) at every hop."""
+    if not switches.use_absence:
+        return np.zeros(len(stream))
+    if switches.fixed_miss_rate is not None:
+        return np.full(len(stream), np.log(switches.fixed_miss_rate))
+    beta, answer = stream.miss_rate, stream.answer
+    # Where nothing is present the clutter does not matter, and 1 keeps its logarithm finite.
+    clutter = np.where(answer == PRESENT, stream.clutter_rate, 1.0)
+    present = np.log1p(-beta * (1.0 - clutter)) - np.log(clutter)
+    return np.select([answer == ABSENT, answer == PRESENT], [np.log(beta), present], 0.0)
