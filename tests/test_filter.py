@@ -16,6 +16,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import statistic
 from worldstate.abduction.risk_map import IsotonicMap, PlattMap
 from worldstate.belief.existence import after_empty_look, after_sighting
+from worldstate.belief.hearing import hear
 from worldstate.errors import InvalidArgumentError, SchemaVersionError
 from worldstate.state import Priors, Rates
 from worldstate.values import NotUsable
@@ -146,6 +147,41 @@ def test_looming_becomes_time_to_arrival_and_its_lack_is_unknown():
     assert (entity.inverse_tta_hz, entity.tta_s) == (None, None)
 
 
+def test_an_assumed_approach_is_not_published():
+    world = start(settings=FilterSettings(hidden_inverse_tta_hz=2.0))
+    world, _ = run(world, [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    (entity,) = world.state.entities
+    assert (entity.inverse_tta_hz, entity.tta_s, world.state.cues[0].horizon_s) == (None, None, None)
+
+
+def test_an_old_approach_rate_fades():
+    """Heard to close at 0.8 1/s, then seen for three seconds and not heard to approach."""
+    script = [measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(0.4)) for t in hops(4.0, 7.0)]
+    _, states = run(start(), script)
+    assert states[29].entities[0].tta_s < 2.0
+    assert states[-1].entities[0].tta_s is None
+    assert abs(states[-1].entities[0].inverse_tta_hz) < 0.4
+
+
+def test_a_hidden_azimuth_says_that_it_may_be_biased():
+    peak = Bearing(0.6, 0.06, 1.4)
+    world, _ = run(start(), [measured(t, LEFT, bearing=peak) for t in hops(1.0, 6.0)])
+    spread = world.memory.tracks[0].motion.azimuth_std_rad
+    bias = world.settings.hidden_bias_std_rad
+    assert world.state.entities[0].azimuth_std_rad == pytest.approx(math.hypot(spread, bias))
+    assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, bias))
+
+
+def test_the_sound_from_before_a_hand_over_brings_forth_nobody():
+    off = Unqueried("sector out of view")
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script += [measured(t, LEFT, car(0.5), answer=off) for t in hops(4.0, 4.9)]
+    _, states = run(start(), script)
+    assert any(cue.advisory for cue in states[-1].cues)
+    assert [e.status for e in states[-1].entities] == ["visible"]
+
+
 def test_the_side_comes_from_the_signature_and_not_from_the_peak():
     """Most peaks of a hidden vehicle stand on images in the walls of the other side."""
     wrong = Bearing(-0.9, 0.06, 1.4)
@@ -241,6 +277,38 @@ def test_a_parked_car_is_context_and_no_hand_over():
     parked = car(0.5, moving=False)
     _, states = run(start(), [measured(t, LEFT, parked, answer=Absent(0.04)) for t in hops(1.0, 4.0)])
     assert [(e.status, e.moving) for e in states[-1].entities] == [("visible", False), ("hidden", True)]
+
+
+def test_a_parked_car_that_comes_to_notice_takes_nobodys_place():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script += [measured(4.0, LEFT, car(0.5, moving=False), answer=Absent(0.04))]
+    _, states = run(start(), script)
+    assert [(e.status, e.moving) for e in states[-1].entities] == [("hidden", True), ("visible", False)]
+
+
+def test_a_parked_car_drives_off():
+    script = [measured(t, FRONT, car(0.3, moving=False)) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(0.3 - 0.6 * (t - 4.0))) for t in hops(4.0, 5.0)]
+    _, states = run(start(), script)
+    (entity,) = states[-1].entities
+    assert {e.id for s in states for e in s.entities} == {entity.id}
+    assert (entity.moving, entity.azimuth_rad) == (True, pytest.approx(-0.24, abs=0.03))
+    assert entity.azimuth_rate_rad_s == pytest.approx(-0.6, abs=0.1)
+
+
+def test_a_new_entity_does_not_inherit_the_last_ones_existence():
+    """What came into view before it was born was another vehicle."""
+    off, slow = Unqueried("-"), FilterSettings(birth_probability=0.7)
+    script = [measured(t, LEFT, answer=off) for t in hops(1.0, 2.5)]
+    script += [measured(t, FRONT, answer=off) for t in hops(2.5, 4.0)]
+    script += [measured(t, LEFT, answer=off) for t in hops(4.0, 9.0)]
+    world = WorldFilter(policy=replace(POLICY, gamma=1.1), settings=slow)
+    for measurement in script:
+        before, world = world, world.update(measurement)
+        if world.state.entities:
+            break
+    assert before.explanation.emerged[0] > 0.02
+    assert world.state.entities[0].existence_probability == pytest.approx(world.explanation.hidden[0])
 
 
 def test_a_moving_car_drives_past_a_parked_one():
@@ -492,6 +560,24 @@ def test_overlapping_windows_are_not_counted_twice():
     often, _ = run(start(context=context), [measured(t, LEFT, answer=off) for t in hops(0.1, 1.01)])
     once, _ = run(start(context=context), [measured(1.0, LEFT, answer=off)])
     assert often.explanation.hidden_total == pytest.approx(once.explanation.hidden_total)
+
+
+def test_overlapping_bearings_are_not_counted_twice():
+    """Ten tenths of a window tell about as much as one window; of the azimuth a little more.
+
+    Whether the peak is the entity's own is asked anew each hop, which one window asks once.
+    """
+    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
+    (track,) = world.memory.tracks
+    once, often = (track,), (track,)
+    once = hear(once, m, world.explanation, 1.0, FilterSettings())
+    for _ in range(10):
+        often = hear(often, m, world.explanation, 0.1, FilterSettings())
+    for row, most in ((0, 0.35), (2, 0.2)):
+        one, ten, none = (t.motion.covariance[row, row] for t in (once[0], often[0], track))
+        assert ten == pytest.approx(one, rel=most)
+        assert one < 0.9 * none
 
 
 @settings(max_examples=20, deadline=None)
