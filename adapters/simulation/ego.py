@@ -1,0 +1,269 @@
+"""What the ego vehicle sounds like on its own roof: engine, exhaust, tyres, airflow and wind.
+
+Every source stands still against the array, so that its sound reaches each microphone after a delay of its
+own that never changes: coherent across the array, a few directions, all of them near. What lies below the
+roof comes over the nearest point of the roof's edge, once from itself and once from its image in the road.
+Wind is the turbulence at the microphones themselves and knows nothing of its neighbour. Neither reflections
+in the body's upper side nor in the street are rendered.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+from .background import noise_frequencies, shaped_noise
+from .bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
+from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
+from .static_field import add_static
+from .vehicle import (
+    HARMONIC_SHARE,
+    POWER_TO_1M_DB,
+    SLOWEST_KMH,
+    propulsion_level_db,
+    rolling_level_db,
+)
+
+Array = NDArray[np.float64]
+Signal = NDArray[np.float32]
+
+# Places in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
+TYRES_M = np.array([[1.1, 0.75, 0.1], [1.1, -0.75, 0.1], [-1.5, 0.75, 0.1], [-1.5, -0.75, 0.1]])
+ENGINE_M = np.array([1.3, 0.1, 0.6])
+EXHAUST_M = np.array([-2.2, -0.5, 0.3])
+PILLARS_M = np.array([[0.6, 0.75, 1.1], [0.6, -0.75, 1.1]])
+ROOF_X_M, ROOF_Y_M = (-1.6, 0.4), (-0.6, 0.6)
+ROOF_BELOW_ARRAY_M = 0.05
+ROAD_REFLECTION = 0.9
+SCREEN_CAP_DB = 24.0
+
+EXHAUST_SHARE = 0.3  # of the propulsion power; the rest leaves through the engine bay
+FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # at 1 m, per octave and pillar
+FLOW_EXPONENT = 60.0  # dB per decade of speed: a dipole's power grows with the sixth power of the flow
+WIND_AT_10_DB = 76.0  # octave of 100 Hz at 10 m/s behind a windscreen
+WIND_EXPONENT = 40.0  # dB per decade: pseudo-sound is dynamic pressure
+WIND_SLOPE, WIND_FLOOR_HZ = -2.2, 20.0
+
+# Firing frequency of four cylinders over speed in gears 1 to 5, Hz per m/s; the engine idles at 800 rpm.
+GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0, 3.2)
+IDLE_HZ, SHIFT_UP_HZ = 26.7, 45.0
+ENGINE_WANDER, WANDER_STEP_S = 0.01, 0.5
+HARMONICS = 24
+
+KNOT = 1024  # levels are evaluated so often, samples
+FASTEST_MPS = 70.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EgoSound:
+    """What the moving ego adds to every microphone.
+
+    Parameters
+    ----------
+    pressure_pa : ndarray of float32, shape (n, M)
+    firing_hz : ndarray, shape (n,)
+        Firing frequency of the engine, whose multiples are its lines.
+    """
+
+    pressure_pa: Signal
+    firing_hz: Array
+
+
+def ego_noise(
+    positions_m: ArrayLike, speed_mps: ArrayLike, sample_rate_hz: float, rng: np.random.Generator
+) -> Signal:
+    """Render the noise of the ego vehicle at its own microphones: `ego_sound` without the engine's speed.
+
+    Parameters
+    ----------
+    positions_m, speed_mps, sample_rate_hz, rng
+        See `ego_sound`.
+
+    Returns
+    -------
+    ndarray of float32, shape (n, M)
+        Pa.
+
+    Examples
+    --------
+    >>> pair = np.array([[0, 0.1, 1.7], [0, -0.1, 1.7]])
+    >>> slow, fast = (ego_noise(pair, np.full(8000, v), 16e3, np.random.default_rng(1)) for v in (3.0, 15.0))
+    >>> slow.shape, bool(fast.std() > 3 * slow.std())
+    ((8000, 2), True)
+    """
+    return ego_sound(positions_m, speed_mps, sample_rate_hz, rng).pressure_pa
+
+
+def ego_sound(
+    positions_m: ArrayLike, speed_mps: ArrayLike, sample_rate_hz: float, rng: np.random.Generator
+) -> EgoSound:
+    r"""Render the noise of the ego vehicle at its own microphones.
+
+    .. math:: n_m(t) = w_m(t) + \sum_q \sum_{i \in \{0, 1\}} \frac{\rho^i\, g_{q,i}}{d_{q,i,m}}\,
+              s_q\Big(t - \frac{d_{q,i,m}}{c}\Big)
+
+    over the sources q (four tyres, engine, exhaust, two pillars) and their road images i, with the path
+    length d over the roof's edge, the screen attenuation g per octave, and wind w. Tyres and engine emit the
+    sound power of CNOSSOS-EU, category 1, the airflow that of a dipole (sixth power of the speed), wind
+    grows with the dynamic pressure.
+
+    Parameters
+    ----------
+    positions_m : array_like, shape (M, 3)
+        Microphones in `base_link`, z above the road; x = 0 at the array.
+    speed_mps : array_like, shape (n,)
+        Speed of the ego at every sample, 0 to 70 m/s; n decides the length.
+    sample_rate_hz : float
+        Rate, 8 to 192 kHz.
+    rng : numpy.random.Generator
+        Source of randomness; the same state gives the same sound.
+
+    Returns
+    -------
+    EgoSound
+
+    Raises
+    ------
+    InvalidArgumentError
+        On a wrong shape, no samples or a number out of range.
+
+    References
+    ----------
+    Directive (EU) 2015/996 as amended by (EU) 2021/1226 (sound power of vehicles). N. Curle, "The influence
+    of solid boundaries upon aerodynamic sound", 1955 (sixth power). U. J. Kurze and G. S. Anderson, 1971
+    (screens).
+
+    Examples
+    --------
+    >>> pair = np.array([[0, 0.1, 1.7], [0, -0.1, 1.7]])
+    >>> sound = ego_sound(pair, np.full(8000, 8.0), 16e3, np.random.default_rng(1))
+    >>> sound.pressure_pa.shape, round(float(sound.firing_hz.mean()))
+    ((8000, 2), 64)
+    """
+    positions = finite_array("positions_m", positions_m, (None, 3))
+    speed = finite_array("speed_mps", speed_mps, (None,))
+    rate = in_range("sample_rate_hz", sample_rate_hz, 8_000.0, 192_000.0)
+    if not len(positions) or not len(speed):
+        raise InvalidArgumentError(
+            f"expected at least one microphone and one sample, got {len(positions)} and {len(speed)}"
+        )
+    in_range("speed_mps: lowest", speed.min(), 0.0, FASTEST_MPS)
+    in_range("speed_mps: highest", speed.max(), 0.0, FASTEST_MPS)
+    to_engine, to_noise, to_wind = rng.spawn(3)
+    firing = _firing_hz(speed, rate, to_engine)
+    out = np.zeros((len(positions), len(speed)), np.float32)
+    _add_sources(out, positions, speed, firing, rate, to_noise)
+    _add_wind(out, speed, rate, to_wind)
+    return EgoSound(np.ascontiguousarray(out.T), firing)
+
+
+def _add_sources(
+    out: Signal, positions: Array, speed: Array, firing: Array, rate: float, rng: np.random.Generator
+) -> None:
+    roof = _roof_edge(float(positions[:, 2].min()) - ROOF_BELOW_ARRAY_M)
+    levels = _levels_db(speed[::KNOT])
+    for place, level_db, lines in zip(_places(), levels, _line_shares(), strict=True):
+        bands = split_octaves(_emission(firing, lines, rate, rng), rate)
+        bands *= _at_samples(_pressure_pa(level_db), len(speed))
+        for image, reflection in ((1.0, 1.0), (-1.0, ROAD_REFLECTION)):
+            length, detour = _paths_m(place * [1.0, 1.0, image], positions, roof)
+            screen = 10.0 ** (-screen_attenuation_db(detour, OCTAVES_HZ, SCREEN_CAP_DB) / 20.0)
+            signal = (reflection * screen).astype(np.float32) @ bands
+            add_static(out, signal[None], length[None] / SPEED_OF_SOUND_MPS, rate, 1.0 / length[None])
+
+
+def _places() -> Array:
+    return np.concatenate([TYRES_M, ENGINE_M[None], EXHAUST_M[None], PILLARS_M])
+
+
+def _line_shares() -> tuple[float, ...]:
+    """Share of every source's power that is harmonics of the firing frequency."""
+    return (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
+
+
+def _levels_db(speed: Array) -> list[Array]:
+    """Pressure level at 1 m of every source per octave, (8, knots), dB re 20 uPa."""
+    slowest = SLOWEST_KMH / 3.6
+    # The law ends above a standstill; below, rolling noise fades with the speed itself.
+    fade = 20.0 * np.log10(np.clip(speed / slowest, 1e-5, 1.0))
+    tyre = rolling_level_db(speed) + POWER_TO_1M_DB - 10.0 * np.log10(len(TYRES_M)) + fade
+    propulsion = propulsion_level_db(speed) + POWER_TO_1M_DB
+    bay = propulsion + 10.0 * np.log10(1.0 - EXHAUST_SHARE)
+    exhaust = propulsion + 10.0 * np.log10(EXHAUST_SHARE)
+    relative = np.log10(np.maximum(speed, 0.1) / (70.0 / 3.6))
+    flow = FLOW_AT_70_DB[:, None] + FLOW_EXPONENT * relative
+    return [tyre] * len(TYRES_M) + [bay, exhaust] + [flow] * len(PILLARS_M)
+
+
+def _pressure_pa(level_db: Array) -> Array:
+    return np.asarray(REFERENCE_PA * 10.0 ** (level_db / 20.0))
+
+
+def _at_samples(knots: Array, samples: int) -> Signal:
+    """Straight lines between the knots, (8, knots) -> (8, n)."""
+    time = np.arange(samples)
+    return np.stack([np.interp(time, np.arange(len(row)) * KNOT, row) for row in knots]).astype(np.float32)
+
+
+def _emission(firing: Array, line_share: float, rate: float, rng: np.random.Generator) -> Signal:
+    """Noise and engine lines that together have unit mean square in every octave, shape (n,)."""
+    samples = len(firing)
+    masks = octave_masks(noise_frequencies(samples, rate))
+    # White noise divided by its own share of power per octave: unit pressure in each of them.
+    shares = np.maximum((masks**2).mean(axis=1), 1e-6)
+    shape = (masks / np.sqrt(shares)[:, None]).sum(axis=0)
+    noise = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng, 1)[0]
+    return noise + _lines(firing, line_share, rate, rng) if line_share > 0.0 else noise
+
+
+def _lines(firing: Array, share: float, rate: float, rng: np.random.Generator) -> Signal:
+    """Multiples of the firing frequency that share each octave's pressure, shape (n,)."""
+    cycles = np.cumsum(firing) / rate
+    orders = np.arange(1, HARMONICS + 1)
+    octave = np.clip(np.round(np.log2(orders * firing.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
+    crowd = np.bincount(octave, minlength=8)
+    lines = np.zeros(len(firing), np.float32)
+    for order, band in zip(orders, octave, strict=True):
+        phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
+        lines += np.float32(np.sqrt(2.0 * share / crowd[band])) * np.cos(phase.astype(np.float32))
+    return lines
+
+
+def _firing_hz(speed: Array, rate: float, rng: np.random.Generator) -> Array:
+    """Follow the speed in the highest gear that its mean allows, never below idling; wander a little."""
+    mean = float(speed.mean())
+    gear = next((g for g in reversed(GEARS_HZ_PER_MPS) if g * mean >= SHIFT_UP_HZ), GEARS_HZ_PER_MPS[0])
+    knots = np.arange(0.0, len(speed) / rate + 2.0 * WANDER_STEP_S, WANDER_STEP_S)
+    wander = np.interp(np.arange(len(speed)) / rate, knots, rng.standard_normal(len(knots)))
+    return np.asarray(np.maximum(gear * speed, IDLE_HZ) * (1.0 + ENGINE_WANDER * np.clip(wander, -2.0, 2.0)))
+
+
+def _roof_edge(height_m: float) -> Array:
+    """Points round the roof, five centimetres apart, shape (E, 3)."""
+    x, y = (np.linspace(*ends, round((ends[1] - ends[0]) / 0.05) + 1) for ends in (ROOF_X_M, ROOF_Y_M))
+    sides = [np.stack([x, np.full_like(x, edge)], axis=1) for edge in ROOF_Y_M]
+    ends = [np.stack([np.full_like(y, edge), y], axis=1) for edge in ROOF_X_M]
+    flat = np.concatenate([*sides, *ends])
+    return np.column_stack([flat, np.full(len(flat), height_m)])
+
+
+def _paths_m(source: Array, positions: Array, roof: Array) -> tuple[Array, float]:
+    """Length of the shortest way over the roof's edge to every microphone, and how much longer it is."""
+    to_edge = np.linalg.norm(roof - source, axis=1)
+    onward = np.linalg.norm(roof[:, None] - positions, axis=2)
+    length = (to_edge[:, None] + onward).min(axis=0)
+    detour = (length - np.linalg.norm(positions - source, axis=1)).mean()
+    return length, float(detour)
+
+
+def _add_wind(out: Signal, speed: Array, rate: float, rng: np.random.Generator) -> None:
+    """Add turbulence at every microphone by itself, its level following the speed."""
+    frequencies = noise_frequencies(len(speed), rate)
+    density = REFERENCE_PA**2 * 10.0 ** (WIND_AT_10_DB / 10.0) / (100.0 / np.sqrt(2.0))
+    shape = density * (np.maximum(frequencies, WIND_FLOOR_HZ) / 100.0) ** WIND_SLOPE * rate
+    gain = (np.maximum(speed, 0.1) / 10.0) ** (WIND_EXPONENT / 20.0)
+    for channel in out:
+        channel += shaped_noise(shape, len(speed), rng, 1)[0] * gain.astype(np.float32)
