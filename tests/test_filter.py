@@ -148,7 +148,7 @@ def test_looming_becomes_time_to_arrival_and_its_lack_is_unknown():
 
 
 def test_an_assumed_approach_is_not_published():
-    world = start(settings=FilterSettings(hidden_inverse_tta_hz=2.0))
+    world = start(settings=FilterSettings(hidden_std=(0.15, 0.1, 0.6)))
     world, _ = run(world, [measured(t, LEFT) for t in hops(1.0, 4.0)])
     (entity,) = world.state.entities
     assert (entity.inverse_tta_hz, entity.tta_s, world.state.cues[0].horizon_s) == (None, None, None)
