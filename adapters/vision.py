@@ -92,9 +92,9 @@ class VisionQuery:
     settings : VisionSettings, optional
         How it is asked.
     line_of_sight : Sector, optional
-        Directions in which a visible source can stand at all, known from the occluders of the context; any where
-        not given. What sounds from behind an occluder is hidden, or the image of a source in a wall: if it is
-        visible, it stands somewhere in line of sight, so that is what is searched.
+        Directions in which a visible source can stand at all, known from the occluders of the context; all
+        where not given. What sounds from behind an occluder is hidden, or the image of a source in a wall: if
+        it is visible, it stands somewhere in line of sight, so that is what is searched.
 
     Raises
     ------
