@@ -21,8 +21,10 @@ LIMITS: dict[str, tuple[float, float]] = {
     "self_noise_db": (0.0, 80.0),
     "gain_mismatch_db": (0.0, 10.0),
     "delay_mismatch_s": (0.0, 1e-3),
-    "late_db": (-90.0, 0.0),
+    "late_walled_db": (-90.0, 0.0),
+    "late_open_db": (-90.0, 0.0),
     "late_decay_s": (0.05, 5.0),
+    "vehicle_level_db": (-30.0, 30.0),
     "vehicle_spread_db": (0.0, 20.0),
     "screen_cap_db": (5.0, 60.0),
 }
@@ -56,12 +58,14 @@ class Preset:
         Electronic noise per microphone, whole band.
     gain_mismatch_db, delay_mismatch_s : float
         Standard deviation of the channels' gains and delays; the latter includes scattering at the roof.
-    late_db : float
-        Late field of a vehicle at the mouth against its pressure at 1 m, dB.
+    late_walled_db, late_open_db : float
+        Late field of a vehicle at the mouth against its pressure at 1 m, dB, in a crossing street with a wall
+        opposite (type A) and without (type B).
     late_decay_s : float
         Reverberation time of the late field.
-    vehicle_spread_db : float
-        Standard deviation of the level of single vehicles.
+    vehicle_level_db, vehicle_spread_db : float
+        Mean level of vehicles against CNOSSOS on its reference asphalt (brick paving: some 3 to 6 dB more)
+        and its standard deviation.
     screen_cap_db : float
         Largest screen attenuation.
 
@@ -83,9 +87,11 @@ class Preset:
     wind_100hz_db: float = 57.0
     self_noise_db: float = 38.0
     gain_mismatch_db: float = 0.5
-    delay_mismatch_s: float = 4e-5
-    late_db: float = -32.0
+    delay_mismatch_s: float = 5e-5
+    late_walled_db: float = -22.0
+    late_open_db: float = -32.0
     late_decay_s: float = 0.7
+    vehicle_level_db: float = 3.0
     vehicle_spread_db: float = 1.5
     screen_cap_db: float = 24.0
 
@@ -97,8 +103,8 @@ class Preset:
             in_range(name, getattr(self, name), low, high)
 
 
-PRESETS = {preset.name: preset for preset in (Preset("street-1"),)}
-DEFAULT_PRESET = "street-1"
+PRESETS = {preset.name: preset for preset in (Preset("street-2"),)}
+DEFAULT_PRESET = "street-2"
 
 
 def preset(name: str = DEFAULT_PRESET) -> Preset:
@@ -111,7 +117,7 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
 
     Examples
     --------
-    >>> preset("street-1").ambient_waves
+    >>> preset("street-2").ambient_waves
     72
     """
     if name not in PRESETS:

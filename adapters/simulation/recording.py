@@ -153,22 +153,25 @@ def _add_vehicle_sound(
     receiver: Receiver,
     rng: np.random.Generator,
 ) -> None:
-    level = settings.preset.vehicle_spread_db * rng.standard_normal()
+    preset = settings.preset
+    level = preset.vehicle_level_db + preset.vehicle_spread_db * rng.standard_normal()
     rate, samples = settings.sample_rate_hz, (len(path.time_s) - 1) * KNOT_SAMPLES
     axles = emit(path, samples, rate, level, rng)
     for axle, signal in enumerate(axles):
         emission = Emission.of(signal, path.time_s[0], rate)
-        y, cap_db = path.axle_y_m(axle), settings.preset.screen_cap_db
+        y, cap_db = path.axle_y_m(axle), preset.screen_cap_db
         add_source(sound, emission, path.lane_x_m, y, settings.site, receiver, cap_db)
     dry = axles.sum(axis=0) * _late_gain(settings, path, samples)
     heard = dry[: round(-path.time_s[0] * rate) + sound.shape[1]]
-    add_late_field(sound, heard, settings.preset.late_decay_s, receiver.positions_m, rate, rng)
+    add_late_field(sound, heard, preset.late_decay_s, receiver.positions_m, rate, rng)
 
 
 def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> Signal:
     """How strongly the source feeds the late field: less the farther it is from the mouth."""
     away = np.hypot(path.lane_x_m - settings.site.corner_ahead_m, path.axle_y_m())
-    gain = 10.0 ** (settings.preset.late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
+    walled = settings.site.opposite_wall_m is not None
+    late_db = settings.preset.late_walled_db if walled else settings.preset.late_open_db
+    gain = 10.0 ** (late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
     knots = np.arange(len(gain)) * KNOT_SAMPLES
     return np.asarray(np.interp(np.arange(samples), knots, gain), np.float32)
 
