@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 from .array import MicrophoneArray
 from .bands import mean_square_per_bin
 from .bins import band_bins, bin_frequencies_hz
+from .ego_noise import EgoNoise
 from .feature import feature_steering, pair_sum
 from .phat import power, whiten
 from .settings import FrontEndSettings
 from .srp import steered_power
 from .steering import Steering
 from .stft import StreamingStft
+
+Spectra = NDArray[np.complex64]
+Steered = tuple[Spectra, Steering]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,19 +74,40 @@ class Listener:
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft = nfft
         self._n_frames = 0
+        self.ego_noise = self._ego_noise(array.n_microphones, 2.0 * sample_rate_hz / nfft, settings)
 
     def push(self, samples: NDArray[np.float32]) -> HopSums:
         """Sum over the frames that these samples (n, M) complete; at least one frame."""
         spectra = self._stft.push(samples)
         powers = power(spectra)
         whitened = whiten(spectra, powers)
+        srp, feature = self._steered(spectra, whitened)
         return HopSums(
             n_frames=len(spectra),
             centre=self._centre(len(spectra)),
-            power=steered_power(whitened[:, self._srp], self._beams),
-            pairs=pair_sum(whitened[:, self._feature], self._feature_beams),
+            power=steered_power(*srp),
+            pairs=pair_sum(*feature),
             energy=float(mean_square_per_bin(powers[:, self._looming], self._nfft).sum()),
         )
+
+    def _steered(self, spectra: Spectra, whitened: Spectra) -> tuple[Steered, Steered]:
+        """Choose what the beams of SRP and of the feature listen to, and the beams."""
+        srp = whitened[:, self._srp], self._beams
+        feature = whitened[:, self._feature], self._feature_beams
+        if self.ego_noise is None:
+            return srp, feature
+        quiet = self.ego_noise.process(spectra)
+        return quiet[0], quiet[1] if len(quiet) > 1 else feature
+
+    def _ego_noise(
+        self, n_microphones: int, frame_rate_hz: float, settings: FrontEndSettings
+    ) -> EgoNoise | None:
+        if settings.ego_noise is None:
+            return None
+        beams = [(self._beams, self._srp)]
+        if settings.ego_noise.feature:
+            beams.append((self._feature_beams, self._feature))
+        return EgoNoise(settings.ego_noise, frame_rate_hz, n_microphones, beams)
 
     def _centre(self, n_new: int) -> float:
         """Middle of the new frames; frame t covers samples t N/2 .. t N/2 + N."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
+from .ego_noise import EgoNoiseSettings
 from .feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_SEGMENTS
 from .geometry import SPEED_OF_SOUND_M_S
 
@@ -45,6 +46,8 @@ class FrontEndSettings:
         Standard deviation of a prominent bearing at broadside.
     speed_of_sound_m_s : float
         Speed of sound.
+    ego_noise : EgoNoiseSettings, optional
+        Learn the noise of the own vehicle and prewhiten with it: see `FrontEnd.learn_ego_noise`.
 
     Raises
     ------
@@ -72,6 +75,7 @@ class FrontEndSettings:
     looming_hops: int = 10
     bearing_std_rad: float = float(np.radians(3.4))
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
+    ego_noise: EgoNoiseSettings | None = None
 
     def __post_init__(self) -> None:
         _even("nfft", self.nfft, 4, 65536)

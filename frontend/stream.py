@@ -106,6 +106,27 @@ class FrontEnd:
         frames = (self._hear(hop) for hop in self._cutter.cut(self._checked(block)))
         return [frame for frame in frames if frame is not None]
 
+    def learn_ego_noise(self, none_probability: float) -> None:
+        """Say how likely it is that no source is there, so that what is heard is the own vehicle's noise.
+
+        It holds for every hop that ends from now on, until told otherwise; before the first call nothing is
+        learned and nothing changes. A caller with a filter passes its posterior of "none" after every
+        update; one that knows better (a calibration drive, an empty road) passes 1, then 0.
+
+        Parameters
+        ----------
+        none_probability : float
+            In [0, 1]. Below `EgoNoiseSettings.min_weight` nothing is learned.
+
+        Raises
+        ------
+        InvalidArgumentError
+            Out of range, or `settings.ego_noise` is None.
+        """
+        if self._listener.ego_noise is None:
+            raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")
+        self._listener.ego_noise.weight = in_range("none_probability", none_probability, 0.0, 1.0)
+
     def _checked(self, block: ArrayLike) -> NDArray[np.float32]:
         try:
             with np.errstate(over="ignore"):
