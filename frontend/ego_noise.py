@@ -28,7 +28,7 @@ from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
 from .phat import whiten
-from .prewhitening import inverse_root
+from .prewhitening import shrunk_inverse_root
 from .steering import Steering, cross_spectra
 
 _TINY = np.float32(1e-30)
@@ -49,8 +49,9 @@ class EgoNoiseSettings:
     min_shrinkage : float
         Least shrinkage towards white noise, in (0, 1]: no direction is amplified by more than its inverse
         root.
-    bins_per_hop : int
-        Bins whose whitening is brought up to date every hop, in turn: one 56 x 56 eigendecomposition each.
+    refresh_hops : int
+        Every so many hops the whitening of one bin, in turn, is brought up to date; every hop until all
+        bins have been. It costs an M x M eigendecomposition.
     feature : bool
         Compute the published feature from prewhitened sound too. Off, because its classifier was trained
         without.
@@ -70,7 +71,7 @@ class EgoNoiseSettings:
     guard_hops: int = 5
     min_weight: float = 0.5
     min_shrinkage: float = 0.03
-    bins_per_hop: int = 1
+    refresh_hops: int = 3
     feature: bool = False
 
     def __post_init__(self) -> None:
@@ -78,7 +79,7 @@ class EgoNoiseSettings:
         in_range("min_weight", self.min_weight, 0.0, 1.0)
         in_range("min_shrinkage", self.min_shrinkage, 1e-4, 1.0)
         _whole("guard_hops", self.guard_hops, 0, 100)
-        _whole("bins_per_hop", self.bins_per_hop, 1, 10_000)
+        _whole("refresh_hops", self.refresh_hops, 1, 1000)
 
 
 class NoiseCovariance:
@@ -105,10 +106,11 @@ class NoiseCovariance:
         self._forgetting = forgetting_frames
 
     def learn(self, total: NDArray[np.complex64], n_frames: int, weight: float) -> None:
-        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]."""
+        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed."""
         kept = math.exp(-weight * n_frames / self._forgetting)
+        total *= np.float32(weight)
         self._sum *= np.float32(kept)
-        self._sum += np.float32(weight) * total
+        self._sum += total
         self.n_frames = kept * self.n_frames + weight * n_frames
 
     def mean(self, bin_index: int) -> NDArray[np.complex64]:
@@ -184,7 +186,7 @@ class EgoNoise:
     >>> for _ in range(3):
     ...     ((whitened, steering),) = ego.process(hop)
     >>> round(ego.learned_frames, 1), whitened.shape
-    (59.4, (20, 1, 2))
+    (29.7, (20, 1, 2))
     """
 
     def __init__(
@@ -201,16 +203,18 @@ class EgoNoise:
         self._slices = [slice(bins.start - first, bins.stop - first) for _, bins in beams]
         n_bins = last - first
         self._settings = settings
-        self._covariance = NoiseCovariance(n_bins, n_microphones, settings.forgetting_s * frames_per_s)
+        self._covariance = NoiseCovariance(n_bins, n_microphones, 0.5 * settings.forgetting_s * frames_per_s)
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
         self._waiting: deque[tuple[NDArray[np.complex64] | None, int]] = deque()
         self._weights: deque[float] = deque(maxlen=settings.guard_hops + 1)
         self._next_bin = 0
         self._stale = 0
+        self._hops_since_refresh = 0
+        self._all_bins_seen = False
 
     @property
     def learned_frames(self) -> float:
-        """Number of frames that the covariance remembers."""
+        """Number of frames that the covariance remembers; every second one is learned."""
         return self._covariance.n_frames
 
     def process(self, spectra: NDArray[np.complex64]) -> list[tuple[NDArray[np.complex64], Steering]]:
@@ -238,7 +242,9 @@ class EgoNoise:
         """Put this hop in the queue, take the one that has waited long enough."""
         used = self.weight if self.weight >= self._settings.min_weight else 0.0
         self._weights.append(used)
-        self._waiting.append((_direction_sum(spectra) if used > 0.0 else None, len(spectra)))
+        # Frames overlap by half: every second one says nearly everything.
+        frames = spectra[::2]
+        self._waiting.append((_direction_sum(frames) if used > 0.0 else None, len(frames)))
         if len(self._waiting) <= self._settings.guard_hops:
             return
         total, n_frames = self._waiting.popleft()
@@ -248,19 +254,23 @@ class EgoNoise:
             self._stale = len(self._roots)
 
     def _refresh(self) -> None:
-        """Bring the next bins up to date, until all have seen what was learned last."""
-        n_bins = len(self._roots)
-        for _ in range(min(self._settings.bins_per_hop, self._stale)):
-            self._update(self._next_bin)
-            self._next_bin = (self._next_bin + 1) % n_bins
-            self._stale -= 1
+        """Bring the next bin up to date if it is time, until all have seen what was learned last."""
+        self._hops_since_refresh += 1
+        due = not self._all_bins_seen or self._hops_since_refresh >= self._settings.refresh_hops
+        if not (self._stale and due):
+            return
+        self._update(self._next_bin)
+        self._next_bin = (self._next_bin + 1) % len(self._roots)
+        self._all_bins_seen |= self._next_bin == 0
+        self._stale -= 1
+        self._hops_since_refresh = 0
 
     def _update(self, index: int) -> None:
         n_microphones = self._roots.shape[1]
-        # As many pseudo-observations of white noise as there are microphones.
-        few = n_microphones / (n_microphones + self.learned_frames)
+        # White noise counts like half as many observations as there are microphones.
+        few = n_microphones / (n_microphones + 2.0 * self.learned_frames)
         shrinkage = max(self._settings.min_shrinkage, few)
-        self._roots[index] = inverse_root(self._covariance.mean(index)[None], shrinkage)[0]
+        self._roots[index] = shrunk_inverse_root(self._covariance.mean(index), shrinkage)
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
                 beams.update(index - bins.start, self._roots[index])

@@ -131,10 +131,18 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
     if R.shape[1] != R.shape[2]:
         raise InvalidArgumentError(f"noise_covariance: expected shape (bins, M, M), got {R.shape}")
     s = in_range("shrinkage", shrinkage, 0.0, 1.0)
-    return np.stack([_inverse_root(matrix, s) for matrix in R]) if len(R) else R
+    return np.stack([shrunk_inverse_root(matrix, s) for matrix in R]) if len(R) else R
 
 
-def _inverse_root(R: ComplexArray, s: float) -> ComplexArray:
+def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
+    """Invert one matrix (M, M) as `inverse_root` does, unchecked.
+
+    Examples
+    --------
+    >>> shrunk_inverse_root(np.diag([7.0, 1.0]), 1.0)
+    array([[1., 0.],
+           [0., 1.]])
+    """
     power = np.einsum("mm->m", R).real
     alive = power > _DEAD * power.mean()
     root = np.zeros_like(R) if alive.any() else np.eye(len(R), dtype=R.dtype)
