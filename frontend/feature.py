@@ -75,9 +75,13 @@ def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.
     -------
     ndarray of complex128, shape (directions,)
     """
-    matrices = cross_spectra(whitened.transpose(1, 0, 2))
-    matrices *= _pairs_mask(whitened.shape[2])
-    return steering.quadratic_form(steering.compress(matrices))
+    return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
+
+
+def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
+    """Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already."""
+    pairs = matrices * _pairs_mask(matrices.shape[2])
+    return steering.quadratic_form(steering.compress(pairs))
 
 
 def segment_feature(

@@ -7,7 +7,10 @@ from numpy.typing import NDArray
 
 from worldstate.values import NotUsable
 
+from .channel_health import ArrayHealth
 from .looming import Looming
+
+_NOT_WATCHED = NotUsable("microphones were not watched")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +39,8 @@ class AcousticFrame:
         The published feature of the decision window: two halves x thirty azimuths, from left to right.
     bearing_age_s : float
         How long before `stamp_ns` the middle of the bearing's interval was, seconds.
+    health : ArrayHealth or NotUsable
+        What is wrong with the microphones, and which were left out; not usable in frames made by hand.
     """
 
     stamp_ns: int
@@ -49,3 +54,4 @@ class AcousticFrame:
     looming: Looming | NotUsable
     feature: NDArray[np.float64]
     bearing_age_s: float = 0.0
+    health: ArrayHealth | NotUsable = _NOT_WATCHED

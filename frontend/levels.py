@@ -43,7 +43,15 @@ class LevelMeter:
         self._channels = slice(None, None, step)
         self._stft = StreamingStft(-(-n_channels // step), settings.nfft, self._bins)
 
-    def push(self, samples: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame."""
-        spectra = self._stft.push(np.ascontiguousarray(samples[:, self._channels]))
-        return log_band_energy(mean_square_per_bin(power(spectra), self._nfft), self._edges, self._bins.start)
+    def push(
+        self, samples: NDArray[np.float32], keep: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float64]:
+        """Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame.
+
+        Of the picked microphones those count that are to be kept (M,), all if none of them is.
+        """
+        powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
+        kept = None if keep is None else keep[self._channels]
+        if kept is not None and kept.any() and not kept.all():
+            powers = powers[:, :, kept]
+        return log_band_energy(mean_square_per_bin(powers, self._nfft), self._edges, self._bins.start)

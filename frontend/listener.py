@@ -8,12 +8,15 @@ from numpy.typing import NDArray
 from .array import MicrophoneArray
 from .bands import mean_square_per_bin
 from .bins import band_bins, bin_frequencies_hz
+from .channel_health import ArrayHealth
+from .channel_monitor import ChannelMonitor
 from .ego_noise import EgoNoise
-from .feature import feature_steering, pair_sum
+from .feature import feature_steering, pair_sum, pair_sum_of
+from .masking import ChannelMask
 from .phat import power, whiten
 from .settings import FrontEndSettings
 from .srp import steered_power
-from .steering import Steering
+from .steering import Steering, cross_spectra
 from .stft import StreamingStft
 
 Spectra = NDArray[np.complex64]
@@ -31,18 +34,22 @@ class HopSums:
     centre : float
         Mean of their middles, samples from the start of the stream.
     power : ndarray of float64, shape (A,)
-        Steered power: see `worldstate.frontend.srp.steered_power`.
+        Steered power: see `worldstate.frontend.srp.steered_power`. Where microphones are left out, power and
+        pairs are scaled to what all would give.
     pairs : ndarray of complex128, shape (30,)
         Pair sums: see `worldstate.frontend.feature.pair_sum`.
-    energy : float
-        Mean square in the looming band.
+    energies : ndarray of float64, shape (M,)
+        Mean square in the looming band of every microphone.
+    health : ArrayHealth
+        What is wrong with the array, and which microphones counted.
     """
 
     n_frames: int
     centre: float
     power: NDArray[np.float64]
     pairs: NDArray[np.complex128]
-    energy: float
+    energies: NDArray[np.float64]
+    health: ArrayHealth
 
 
 class Listener:
@@ -74,6 +81,8 @@ class Listener:
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft = nfft
         self._n_frames = 0
+        self._unwatched = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
+        self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array.n_microphones, 2.0 * sample_rate_hz / nfft, settings)
 
     def push(self, samples: NDArray[np.float32]) -> HopSums:
@@ -81,23 +90,48 @@ class Listener:
         spectra = self._stft.push(samples)
         powers = power(spectra)
         whitened = whiten(spectra, powers)
-        srp, feature = self._steered(spectra, whitened)
-        return HopSums(
-            n_frames=len(spectra),
-            centre=self._centre(len(spectra)),
-            power=steered_power(*srp),
-            pairs=pair_sum(*feature),
-            energy=float(mean_square_per_bin(powers[:, self._looming], self._nfft).sum()),
-        )
+        energies = self._energies(powers)
+        matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
+        health = self._watch(samples, energies, matrices, len(spectra))
+        health.mask.silence(spectra)
+        health.mask.silence(whitened)
+        srp, pairs = self._sums(spectra, whitened, matrices, health.mask)
+        centre = self._centre(len(spectra))
+        return HopSums(len(spectra), centre, srp, pairs, energies, health)
 
-    def _steered(self, spectra: Spectra, whitened: Spectra) -> tuple[Steered, Steered]:
-        """Choose what the beams of SRP and of the feature listen to, and the beams."""
-        srp = whitened[:, self._srp], self._beams
-        feature = whitened[:, self._feature], self._feature_beams
-        if self.ego_noise is None:
-            return srp, feature
-        quiet = self.ego_noise.process(spectra)
-        return quiet[0], quiet[1] if len(quiet) > 1 else feature
+    def _energies(self, powers: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Mean square in the looming band per microphone: the mean over its bins, times their number."""
+        band = powers[:, self._looming]
+        return np.asarray(mean_square_per_bin(band.swapaxes(1, 2), self._nfft) * band.shape[1])
+
+    def _watch(
+        self, samples: NDArray[np.float32], energies: NDArray[np.float64], matrices: Spectra, n_frames: int
+    ) -> ArrayHealth:
+        if self.monitor is None:
+            return self._unwatched
+        return self.monitor.push(samples, energies, matrices, n_frames)
+
+    def _sums(
+        self, spectra: Spectra, whitened: Spectra, matrices: Spectra, mask: ChannelMask
+    ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+        """Steered power and pair sums of one hop, as of all microphones."""
+        quiet: list[Steered] = [] if self.ego_noise is None else self.ego_noise.process(spectra)
+        for heard, _ in quiet:
+            mask.silence(heard)
+        srp = quiet[0] if quiet else (whitened[:, self._srp], self._beams)
+        if len(quiet) > 1:
+            pairs = pair_sum(*quiet[1])
+        else:
+            pairs = pair_sum_of(mask.cross(matrices), self._feature_beams)
+        return steered_power(*srp) * mask.power_scale, pairs * mask.pair_scale
+
+    def _monitor(
+        self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings
+    ) -> ChannelMonitor | None:
+        if not settings.watch_channels:
+            return None
+        frequencies = bin_frequencies_hz(self.feature_bins, sample_rate_hz, settings.nfft)
+        return ChannelMonitor(array, frequencies, sample_rate_hz, settings.speed_of_sound_m_s)
 
     def _ego_noise(
         self, n_microphones: int, frame_rate_hz: float, settings: FrontEndSettings

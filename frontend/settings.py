@@ -48,6 +48,8 @@ class FrontEndSettings:
         Speed of sound.
     ego_noise : EgoNoiseSettings, optional
         Learn the noise of the own vehicle and prewhiten with it: see `FrontEnd.learn_ego_noise`.
+    watch_channels : bool
+        Look for microphones that misbehave and leave them out: see `worldstate.frontend.channel_health`.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class FrontEndSettings:
     bearing_std_rad: float = float(np.radians(3.4))
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
     ego_noise: EgoNoiseSettings | None = None
+    watch_channels: bool = True
 
     def __post_init__(self) -> None:
         _even("nfft", self.nfft, 4, 65536)

@@ -146,7 +146,7 @@ class FrontEnd:
     def _hear(self, hop: Hop) -> AcousticFrame | None:
         with one_blas_thread():
             self._hops.append(self._listener.push(hop.samples))
-            levels = self._meter.push(hop.samples)
+            levels = self._meter.push(hop.samples, self._keep)
         return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
@@ -166,10 +166,16 @@ class FrontEnd:
             looming=self._looming(hop.end),
             feature=self._feature(),
             bearing_age_s=self._age_s(settings.bearing_hops, hop.end),
+            health=self._hops[-1].health,
         )
 
     def _last(self, n_hops: int) -> list[HopSums]:
         return list(self._hops)[-n_hops:]
+
+    @property
+    def _keep(self) -> NDArray[np.bool_]:
+        """Microphones that count now."""
+        return self._hops[-1].health.mask.keep
 
     def _srp(self, n_hops: int) -> NDArray[np.float64]:
         hops = self._last(n_hops)
@@ -199,7 +205,9 @@ class FrontEnd:
         hops = self._last(settings.looming_hops)
         if len(hops) < settings.looming_hops:
             return NotUsable(f"needs {settings.looming_hops} hops, heard {len(hops)}")
-        energies = np.array([hop.energy for hop in hops])
+        # The same microphones throughout: one that fails within the window makes no step.
+        keep = self._keep if self._keep.any() else slice(None)
+        energies = np.array([hop.energies[keep].mean() for hop in hops])
         if energies.min() <= SILENCE:
             return NotUsable("silence within the window")
         times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz

@@ -1,0 +1,75 @@
+r"""Leaving microphones out, exactly and without new steering vectors.
+
+A whitened channel that is set to zero adds nothing to a sum over microphones, so that the beams of the whole
+array steer any part of it. What changes is the scale: with n of M microphones left, beam power is smaller by
+(n / M)^2 and the sum over pairs by n (n - 1) / (M (M - 1)). Sums are scaled back when they are made, so that
+windows may hold hops of different masks.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelMask:
+    """Which microphones count.
+
+    Parameters
+    ----------
+    keep : ndarray of bool, shape (M,)
+        False for those left out.
+
+    Examples
+    --------
+    >>> mask = ChannelMask(np.array([True, False, True, True]))
+    >>> mask.n_kept, round(mask.power_scale, 3), mask.pair_scale
+    (3, 1.778, 2.0)
+    """
+
+    keep: NDArray[np.bool_]
+
+    @classmethod
+    def all_of(cls, n_channels: int) -> "ChannelMask":
+        """Leave none out."""
+        return cls(np.ones(n_channels, bool))
+
+    @property
+    def n_kept(self) -> int:
+        """Number of microphones left."""
+        return int(np.count_nonzero(self.keep))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all are left."""
+        return bool(self.keep.all())
+
+    @property
+    def power_scale(self) -> float:
+        """(M / n)^2: from the beam power of n microphones to that of M; finite for none."""
+        return float((len(self.keep) / max(self.n_kept, 1)) ** 2)
+
+    @property
+    def pair_scale(self) -> float:
+        """Ratio of the numbers of pairs; finite for fewer than two microphones."""
+        whole, kept = len(self.keep), max(self.n_kept, 2)
+        return whole * (whole - 1) / (kept * (kept - 1))
+
+    def silence(self, spectra: NDArray[np.complex64]) -> None:
+        """Set the channels left out to zero in place, (..., M)."""
+        if not self.is_whole:
+            spectra[..., ~self.keep] = 0.0
+
+    def cross(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return cross-spectra (..., M, M) without the channels left out; the same array if there are none.
+
+        Examples
+        --------
+        >>> ChannelMask(np.array([True, False])).cross(np.ones((1, 2, 2), np.complex64))[0].real
+        array([[1., 0.],
+               [0., 0.]], dtype=float32)
+        """
+        if self.is_whole:
+            return matrices
+        return np.asarray(matrices * (self.keep[:, None] & self.keep))

@@ -1,0 +1,124 @@
+"""Noisy, inverted and swapped microphones, by the place that their sound fits: see `place_fit`."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from worldstate.values import NotUsable
+
+from .array import MicrophoneArray
+from .channel_health import ChannelFault, Fault, faults_where
+from .place_fit import place_scores, place_weights
+
+# Judged once in so many hops, on a mean over the last two seconds.
+_EVERY_HOPS = 10
+_FORGET = 1.0 - 1.0 / 20.0
+# Median coherence below which nothing is judged: chance alone gives 0.02 in two seconds.
+_MIN_COHERENCE = 0.15
+# Shares of the median coherence at which a channel becomes suspect, and well again. Simulated streets:
+# healthy ones above 0.59, incoherent ones below 0.07.
+_SUSPECT, _WELL = 0.3, 0.45
+# How much better another place must fit. Simulated streets: right places lose by 0.18 at most, swapped
+# channels that stand 9 cm or more apart across the road gain 0.25 to 0.75.
+_MARGIN = 0.3
+
+
+class PlaceCheck:
+    """Judge the places of all channels once a second; a verdict needs two judgements in a row.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Where the microphones are believed to be.
+    frequencies_hz : ndarray, shape (K,)
+        Bins of the cross-spectra.
+    speed_of_sound_m_s : float
+        Speed of sound.
+
+    Attributes
+    ----------
+    coherence : float or NotUsable
+        Median of the usable channels' scores at their own places.
+
+    Examples
+    --------
+    >>> array = MicrophoneArray([[0, 0.1 * i, 0] for i in range(5)])
+    >>> check, frequencies = PlaceCheck(array, np.array([100.0])), np.array([100.0])
+    >>> wave = array.steering(frequencies, 0.3)[:, :, 0] * np.array([1, 1, -1, 1, 1])
+    >>> matrices = (wave[:, :, None] * wave[:, None].conj()).astype(np.complex64)
+    >>> for hop in range(20):
+    ...     check.push(18 * matrices, 18, np.ones(5, bool))
+    >>> [(fault.channel, fault.fault.value) for fault in check.faults()]
+    [(2, 'inverted')]
+    """
+
+    def __init__(
+        self, array: MicrophoneArray, frequencies_hz: NDArray[np.float64], speed_of_sound_m_s: float = 343.0
+    ) -> None:
+        n = array.n_microphones
+        self.coherence: float | NotUsable = NotUsable("the first second is not over")
+        self._geometry = array, frequencies_hz, speed_of_sound_m_s
+        self._sum = np.zeros((len(frequencies_hz), n, n), np.float32)
+        self._n_frames = 0.0
+        self._hops = 0
+        self._usable = np.ones(n, bool)
+        self._weights = place_weights(array, frequencies_hz, self._usable, speed_of_sound_m_s)
+        self._suspects = np.zeros(n, bool)
+        self._once: set[ChannelFault] = set()
+        self._faults: list[ChannelFault] = []
+
+    def push(self, matrices: NDArray[np.complex64], n_frames: int, there: NDArray[np.bool_]) -> None:
+        """Take the cross-spectra (K, M, M) of one hop, sums over its frames, and who is there (M,)."""
+        self._sum *= np.float32(_FORGET)
+        self._sum += matrices.real
+        self._n_frames = _FORGET * self._n_frames + n_frames
+        self._hops += 1
+        if self._hops % _EVERY_HOPS == 0:
+            self._judge(there)
+
+    def faults(self) -> list[ChannelFault]:
+        """Say which channels are noisy, inverted or swapped."""
+        return self._faults
+
+    def _judge(self, there: NDArray[np.bool_]) -> None:
+        self._use(there & ~self._suspects)
+        scores = place_scores(self._sum / np.float32(self._n_frames), self._weights)
+        own = scores.diagonal()
+        typical = float(np.median(own[self._usable])) if self._usable.any() else 0.0
+        found: list[ChannelFault] = []
+        if typical < _MIN_COHERENCE:
+            self.coherence = NotUsable(f"nothing coherent sounds ({typical:.2f})")
+        else:
+            self.coherence = typical
+            found = self._incoherent(own / typical, there) + self._swapped(scores, there)
+        self._confirm(found)
+
+    def _use(self, usable: NDArray[np.bool_]) -> None:
+        """Guess from these channels only; new weights, where they changed, cost a few milliseconds."""
+        if not np.array_equal(usable, self._usable):
+            array, frequencies_hz, speed = self._geometry
+            self._usable = usable
+            self._weights = place_weights(array, frequencies_hz, usable, speed)
+
+    def _incoherent(self, share: NDArray[np.float64], there: NDArray[np.bool_]) -> list[ChannelFault]:
+        limit = np.where(self._suspects, _WELL, _SUSPECT)
+        inverted = there & (share < -limit)
+        noisy = there & ~inverted & (share < limit)
+        self._suspects = noisy | inverted
+        return faults_where(Fault.NOISY, noisy, share) + faults_where(Fault.INVERTED, inverted, share)
+
+    def _swapped(self, scores: NDArray[np.float64], there: NDArray[np.bool_]) -> list[ChannelFault]:
+        """Seat the healthy channels where they fit best together; a few microphones trade places."""
+        seated = np.flatnonzero(there & ~self._suspects)
+        table = scores[np.ix_(seated, seated)]
+        best = linear_sum_assignment(table, maximize=True)[1]
+        gain = table[np.arange(len(seated)), best] - table.diagonal()
+        return [
+            ChannelFault(int(seated[i]), Fault.SWAPPED, float(gain[i]), looks_like=int(seated[best[i]]))
+            for i in np.flatnonzero(gain > _MARGIN)
+        ]
+
+    def _confirm(self, found: list[ChannelFault]) -> None:
+        before = {(fault.channel, fault.fault) for fault in self._once}
+        self._faults = [fault for fault in found if (fault.channel, fault.fault) in before]
+        self._once = set(found)

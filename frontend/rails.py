@@ -1,0 +1,64 @@
+"""Clipping: samples that pile up at one extreme value of a channel, wherever that value is."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Width of the shell below an extreme that an unclipped distribution fills more than the extreme itself.
+_SHELL = 0.1
+# Fewer samples at the extreme are chance.
+_MIN_COUNT = 16
+
+
+class RailCounter:
+    """Count samples at and just below the highest and the lowest value of every channel.
+
+    An unclipped sound meets its extreme once, and more often the values just below it; a clipped one stays at
+    it. Only channels that reach their extreme in a hop are counted there, so that a clean stream costs
+    nothing; a new extreme starts the count anew, because what was below it was no rail.
+
+    Parameters
+    ----------
+    n_channels : int
+        Number of channels M.
+
+    Examples
+    --------
+    >>> sound = np.random.default_rng(0).standard_normal((4800, 2)).astype(np.float32)
+    >>> sound[:, 1] = sound[:, 1].clip(-1.5, 1.5)
+    >>> rails = RailCounter(2)
+    >>> rails.push(sound, sound.min(axis=0), sound.max(axis=0))
+    >>> rails.clipped_share().round(2)
+    array([0.  , 0.13])
+    """
+
+    def __init__(self, n_channels: int) -> None:
+        self._n_samples = 0
+        self._extreme = np.full((2, n_channels), -np.inf, np.float32)
+        self._at = np.zeros((2, n_channels), np.int64)
+        self._below = np.zeros((2, n_channels), np.int64)
+
+    def push(
+        self, samples: NDArray[np.float32], lowest: NDArray[np.float32], highest: NDArray[np.float32]
+    ) -> None:
+        """Take the samples (n, M) of a hop and their extremes (M,)."""
+        self._n_samples += len(samples)
+        self._side(0, samples, highest, highest - lowest)
+        self._side(1, -samples, -lowest, highest - lowest)
+
+    def _side(
+        self, side: int, samples: NDArray[np.float32], top: NDArray[np.float32], span: NDArray[np.float32]
+    ) -> None:
+        extreme, at, below = self._extreme[side], self._at[side], self._below[side]
+        higher = top > extreme
+        extreme[higher], at[higher], below[higher] = top[higher], 0, 0
+        reached = np.flatnonzero((top == extreme) & (span > 0.0))
+        if len(reached):
+            near = samples[:, reached] >= extreme[reached] - np.float32(0.5 * _SHELL) * span[reached]
+            n_at = (samples[:, reached] == extreme[reached]).sum(axis=0)
+            at[reached] += n_at
+            below[reached] += near.sum(axis=0) - n_at
+
+    def clipped_share(self) -> NDArray[np.float64]:
+        """Share of all samples that stand at a rail, (M,); 0 for channels without one."""
+        clipped = np.where((self._at >= _MIN_COUNT) & (self._at > self._below), self._at, 0)
+        return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))

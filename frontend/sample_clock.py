@@ -1,0 +1,149 @@
+r"""How many samples a second there really are, by another clock.
+
+.. math:: n_i = n_0 + f_s t_i + \epsilon_i, \qquad
+          \hat f_s = \frac{\sum_i (t_i - \bar t)(n_i - \bar n)}{\sum_i (t_i - \bar t)^2}, \qquad
+          \sigma^2_{\hat f} = \frac{s^2}{\sum_i (t_i - \bar t)^2}
+
+least squares over the pairs (samples so far, time of arrival). A recorder that runs at 47,998 Hz where its
+header says 48,000 is 42 millionths off: a clock that is good to a millisecond needs two minutes to see it.
+"""
+
+import math
+from dataclasses import dataclass
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.values import NotUsable, seconds
+
+# Fewer pairs say too little about their own scatter.
+_MIN_READINGS = 10
+# An error that many standard deviations large is one.
+_SIGNIFICANT = 4.0
+# Crystals are good to some ten millionths; below this nobody would care.
+_TOLERATED = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class RateEstimate:
+    """A measured sample rate.
+
+    Parameters
+    ----------
+    rate_hz, std_hz : float
+        Estimate and standard deviation.
+    nominal_hz : float
+        What the stream calls itself.
+
+    Examples
+    --------
+    >>> RateEstimate(47_998.0, 0.1, 48_000.0).is_wrong, RateEstimate(47_999.8, 0.1, 48_000.0).is_wrong
+    (True, False)
+    """
+
+    rate_hz: float
+    std_hz: float
+    nominal_hz: float
+
+    @property
+    def error(self) -> float:
+        """Relative error of the nominal rate."""
+        return self.rate_hz / self.nominal_hz - 1.0
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the nominal rate is off by more than 10 millionths and four standard deviations."""
+        limit = max(_SIGNIFICANT * self.std_hz / self.nominal_hz, _TOLERATED)
+        return abs(self.error) > limit
+
+
+def rate_from_duration(
+    n_samples: int, duration_s: float, duration_std_s: float, nominal_hz: float
+) -> RateEstimate:
+    """Sample rate from the length of a recording by another clock, such as a camera's.
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples per channel.
+    duration_s, duration_std_s : float
+        Length and its standard deviation, seconds.
+    nominal_hz : float
+        What the file says.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a duration is not positive.
+
+    Examples
+    --------
+    >>> rate_from_duration(28_798_800, 600.0, 0.001, 48_000.0)
+    RateEstimate(rate_hz=47998.0, std_hz=0.0799..., nominal_hz=48000.0)
+    """
+    in_range("duration_s", duration_s, 0.0, math.inf, open_low=True, open_high=True)
+    in_range("duration_std_s", duration_std_s, 0.0, math.inf, open_low=True, open_high=True)
+    rate = n_samples / duration_s
+    return RateEstimate(rate, rate * duration_std_s / duration_s, nominal_hz)
+
+
+class SampleClock:
+    """Line through the samples against the time of a caller's clock, in constant memory.
+
+    Parameters
+    ----------
+    nominal_hz : float
+        Rate that the stream calls its own.
+
+    Examples
+    --------
+    >>> clock = SampleClock(nominal_hz=48_000.0)
+    >>> for second in range(200):
+    ...     clock.read(n_samples=47_998 * second, captured_ns=10**9 * second)
+    >>> round(clock.estimate().rate_hz, 3)
+    47998.0
+    """
+
+    def __init__(self, nominal_hz: float) -> None:
+        self._nominal_hz = nominal_hz
+        self._origin: tuple[int, int] | None = None
+        self._latest = (0, 0)
+        self._n = 0
+        self._mean_t = self._mean_e = 0.0
+        self._tt = self._te = self._ee = 0.0
+
+    def read(self, n_samples: int, captured_ns: int) -> None:
+        """Take the time at which sample number `n_samples` was captured.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If either clock runs backwards.
+        """
+        if self._origin is None:
+            self._origin = n_samples, captured_ns
+        elif n_samples < self._latest[0] or captured_ns < self._latest[1]:
+            before = f"{self._latest[0]} samples at {self._latest[1]}"
+            raise InvalidArgumentError(
+                f"captured_ns: expected a clock that runs on after {before}, got {n_samples} at {captured_ns}"
+            )
+        self._latest = n_samples, captured_ns
+        time_s = seconds(captured_ns - self._origin[1])
+        # Only the excess over the nominal rate is summed up: no digits are lost over days.
+        self._add(time_s, n_samples - self._origin[0] - self._nominal_hz * time_s)
+
+    def _add(self, t: float, e: float) -> None:
+        self._n += 1
+        dt, de = t - self._mean_t, e - self._mean_e
+        self._mean_t += dt / self._n
+        self._mean_e += de / self._n
+        self._tt += dt * (t - self._mean_t)
+        self._te += dt * (e - self._mean_e)
+        self._ee += de * (e - self._mean_e)
+
+    def estimate(self) -> RateEstimate | NotUsable:
+        """Return the rate so far; at least ten readings at different times."""
+        if self._n < _MIN_READINGS or self._tt <= 0.0:
+            return NotUsable(f"needs {_MIN_READINGS} readings of a clock, got {self._n}")
+        slope = self._te / self._tt
+        variance = max(self._ee - slope * self._te, 0.0) / (self._n - 2)
+        return RateEstimate(self._nominal_hz + slope, math.sqrt(variance / self._tt), self._nominal_hz)
