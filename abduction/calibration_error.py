@@ -106,12 +106,28 @@ def calibration_error_floor(
     >>> round(calibration_error_floor(np.full(400, 0.5), np.random.default_rng(0)), 2)
     0.02
     """
+    return calibration_error_sampling(risk, rng, bins, draws)[0]
+
+
+def calibration_error_sampling(
+    risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
+) -> tuple[float, float]:
+    """Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
+
+    Parameters and errors are those of `calibration_error_floor`, which is the mean.
+
+    Examples
+    --------
+    >>> mean, deviation = calibration_error_sampling(np.full(400, 0.5), np.random.default_rng(0))
+    >>> round(mean, 2), round(deviation, 3)
+    (0.02, 0.014)
+    """
     predicted, _ = _checked_sample(risk, np.zeros(np.shape(risk)))
     index = _bin_index(predicted, bins)
     labels = rng.random((draws, predicted.size)) < predicted
     membership = (index[:, None] == np.arange(bins)).astype(np.float64)
-    gaps = np.abs((labels - predicted) @ membership)
-    return float(gaps.sum(axis=1).mean() / predicted.size)
+    errors = np.abs((labels - predicted) @ membership).sum(axis=1) / predicted.size
+    return float(errors.mean()), float(errors.std())
 
 
 def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:

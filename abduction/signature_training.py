@@ -13,11 +13,12 @@ from sklearn.svm import SVC
 from worldstate.checks import finite_array
 from worldstate.errors import InvalidArgumentError
 
+from .mirror import mirror_features as mirror_features
 from .pairwise import class_pairs
 from .platt import fit_sigmoid
 from .signature import CLASSES, FRONT, LEFT, NONE, RIGHT, SignatureModel
+from .standardise import standardisation
 
-SEGMENTS = 2
 PLATT_FOLDS = 5
 
 Numbers = NDArray[np.float64]
@@ -75,8 +76,8 @@ class PublishedClassifier:
             If the features are not finite or a class is missing or unknown.
         """
         features = finite_array("X", X, (None, None))
-        features, labels = mirror_hazards(features, _checked_labels(y, len(features)))
-        mean, scale = _standardisation(features)
+        features, labels = mirror_hazards(features, checked_labels(y, len(features)))
+        mean, scale = standardisation(features)
         standard = (features - mean) / scale
         codes = np.searchsorted(CLASSES, labels)
         machine = SVC(kernel="linear", C=self.penalty, decision_function_shape="ovo").fit(standard, codes)
@@ -119,24 +120,6 @@ class PublishedClassifier:
         return decisions
 
 
-def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
-    """Return the features of the mirrored scene: azimuths reversed within each segment.
-
-    Parameters
-    ----------
-    X : ndarray, shape (n, segments * azimuths)
-        Segment-major: all azimuths of the first segment, then those of the next.
-    segments : int
-        Stretches of time that a feature vector covers.
-
-    Examples
-    --------
-    >>> mirror_features(np.array([[1, 2, 3, 4, 5, 6]]))
-    array([[3, 2, 1, 6, 5, 4]])
-    """
-    return X.reshape(len(X), segments, -1)[:, :, ::-1].reshape(X.shape)
-
-
 def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
     """Append the mirror images of all left and right windows, sides swapped.
 
@@ -157,13 +140,19 @@ def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
     return np.concatenate([X, mirror_features(X[hazard])]), np.concatenate([y, swapped])
 
 
-def _standardisation(features: Numbers) -> tuple[Numbers, Numbers]:
-    deviation = features.std(axis=0)
-    # A feature that never changes carries nothing; leave it as it is.
-    return features.mean(axis=0), np.where(deviation > 10 * np.finfo(float).eps, deviation, 1.0)
+def checked_labels(y: ArrayLike, n: int) -> Labels:
+    """Return class names as an array; the sides stand in for each other, the other classes must be there.
 
+    Raises
+    ------
+    InvalidArgumentError
+        If there are not `n` names, or a class is unknown or missing.
 
-def _checked_labels(y: ArrayLike, n: int) -> Labels:
+    Examples
+    --------
+    >>> checked_labels(["none", "left", "front"], 3)
+    array(['none', 'left', 'front'], dtype='<U5')
+    """
     labels = np.asarray(y, dtype=np.str_)
     if labels.shape != (n,):
         raise InvalidArgumentError(f"y: expected {n} class names, got shape {labels.shape}")

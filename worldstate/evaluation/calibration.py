@@ -1,21 +1,25 @@
 """Threshold and risk map from windows that stand alone, one hazard-free window a recording."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit, logit
 
 from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.risk_map import RiskMap, fit_isotonic
+from worldstate.abduction.risk_map import PlattMap, RiskMap, fit_isotonic
 from worldstate.abduction.signature import hazard_statistic
 from worldstate.errors import InvalidArgumentError
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+FitMap = Callable[[ArrayLike, ArrayLike], RiskMap]
 
 # The published statistic takes no account of vision; ours removes the visible explanation.
 PUBLISHED_MISS_RATE = 1.0
 ABSENT_MISS_RATE = 0.0
+_SMALLEST_GAMMA = 1e-12
 MISS_RATES = (PUBLISHED_MISS_RATE, ABSENT_MISS_RATE)
 
 
@@ -44,9 +48,15 @@ class WindowCalibration:
 
 
 def calibrate_windows(
-    probabilities: Numbers, hazards: Flags, hazard_free: Flags, *, alpha: float, miss_rate: float
+    probabilities: Numbers,
+    hazards: Flags,
+    hazard_free: Flags,
+    *,
+    alpha: float,
+    miss_rate: float,
+    fit_map: FitMap = fit_isotonic,
 ) -> WindowCalibration:
-    """Set threshold and isotonic map on posteriors of windows that the classifier was not trained on.
+    """Set threshold and risk map on posteriors of windows that the classifier was not trained on.
 
     The threshold is set for single windows. A sustained rule alarms on a part of those only, and so keeps
     the budget too.
@@ -61,6 +71,8 @@ def calibrate_windows(
         Budget.
     miss_rate : float
         beta of the statistic.
+    fit_map : callable
+        Fits the map from statistics and labels: `fit_isotonic`, or `fit_platt` where windows are few.
 
     Raises
     ------
@@ -82,5 +94,41 @@ def calibrate_windows(
     return WindowCalibration(
         miss_rate=miss_rate,
         gamma=neyman_pearson_threshold(list(score[hazard_free][:, None]), alpha),
-        risk_map=fit_isotonic(score[scored], hazards[scored]),
+        risk_map=fit_map(score[scored], hazards[scored]),
     )
+
+
+def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
+    """Return the calibration half-way, in log-odds, between several of the same statistic.
+
+    A classifier at a junction that it never saw stands between two that can be measured on its training set:
+    one that saw fewer junctions and not this one (leave one junction out), and one that saw this one too
+    (leave recordings out). The first is too careful, the second too bold.
+
+    Parameters
+    ----------
+    levels : sequence of WindowCalibration
+        At least one; with more than one, all with a `PlattMap`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is none, or there are several and a risk map is no sigmoid.
+
+    Examples
+    --------
+    >>> careful = WindowCalibration(0.0, 0.9, PlattMap(-2.0, 1.0))
+    >>> bold = WindowCalibration(0.0, 0.5, PlattMap(-1.0, 0.0))
+    >>> middle = between([careful, bold])
+    >>> round(middle.gamma, 3), middle.risk_map
+    (0.75, PlattMap(slope=-1.5, offset=0.5))
+    """
+    if len(levels) == 1:
+        return levels[0]
+    maps = [level.risk_map for level in levels if isinstance(level.risk_map, PlattMap)]
+    if not levels or len(maps) != len(levels):
+        raise InvalidArgumentError("levels: expected calibrations with sigmoids as risk maps")
+    slope, offset = np.mean([(one.slope, one.offset) for one in maps], axis=0).tolist()
+    gammas = np.clip([level.gamma for level in levels], _SMALLEST_GAMMA, 1.0 - _SMALLEST_GAMMA)
+    gamma = float(expit(logit(gammas).mean()))
+    return WindowCalibration(levels[0].miss_rate, gamma, PlattMap(slope, offset))

@@ -9,7 +9,7 @@ import numpy as np
 
 from worldstate.abduction.calibration_error import (
     brier_score,
-    calibration_error_floor,
+    calibration_error_sampling,
     expected_calibration_error,
 )
 from worldstate.adapters.atomic import atomic_path
@@ -48,6 +48,7 @@ def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
     """
     scored = table.hazards | table.hazard_free
     hazards, score, risk = table.hazards[scored], predictions.score[scored], predictions.risk[scored]
+    floor, floor_std = calibration_error_sampling(risk, np.random.default_rng(FLOOR_SEED))
     by_group = auroc_by_group(score, hazards, table.environments[scored])
     return {
         "accuracy": float(np.mean(predictions.classes == table.labels)),
@@ -58,7 +59,8 @@ def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
         "fpr": rate(predictions.decision, table.hazard_free),
         "ece_raw": expected_calibration_error(score, hazards),
         "ece": expected_calibration_error(risk, hazards),
-        "ece_floor": calibration_error_floor(risk, np.random.default_rng(FLOOR_SEED)),
+        "ece_floor": floor,
+        "ece_floor_std": floor_std,
         "brier_raw": brier_score(score, hazards),
         "brier": brier_score(risk, hazards),
     }
@@ -101,7 +103,7 @@ def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> d
         "n_hazard": int(table.hazards.sum()),
         "n_hazard_free": int(table.hazard_free.sum()),
         "n_recordings": len(np.unique(table.recording_keys)),
-        "per_group": _mean_groups(table, [group_figures(table, predictions) for predictions in published]),
+        "per_group": report_groups(table, [group_figures(table, predictions) for predictions in published]),
     }
 
 
@@ -161,7 +163,8 @@ def _absent_figures(table: FeatureTable, passes: Sequence[Predictions]) -> Figur
     return figures
 
 
-def _mean_groups(table: FeatureTable, passes: Sequence[dict[str, Figures]]) -> dict[str, Figures]:
+def report_groups(table: FeatureTable, passes: Sequence[dict[str, Figures]]) -> dict[str, Figures]:
+    """Return the figures of each junction, mean over the passes, with its number of windows."""
     return {
         environment: {
             "n_windows": int((table.environments == environment).sum()),

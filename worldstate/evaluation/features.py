@@ -1,20 +1,23 @@
 """Evaluation of a signature classifier and its cueing on labelled feature windows.
 
 Everything that is scored was predicted by a classifier, a threshold and a risk map that saw no window of the
-recording (protocol ``cv``) or junction (``lojo``): threshold and map come from inner out-of-fold scores.
+recording (protocol ``cv``), junction (``lojo``) or kind of driving (``transfer``): threshold and map come
+from inner out-of-fold scores of the training windows.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.abduction.risk_map import fit_isotonic
 from worldstate.abduction.signature import CLASSES
 from worldstate.abduction.signature_training import Classifier
 from worldstate.adapters.feature_table import FeatureTable
+from worldstate.errors import InvalidArgumentError
 
-from .calibration import MISS_RATES, WindowCalibration, calibrate_windows
+from .calibration import MISS_RATES, FitMap, WindowCalibration, between, calibrate_windows
 from .splits import Folds, Split
 
 Numbers = NDArray[np.float64]
@@ -68,6 +71,8 @@ def cross_validate(
     rng: np.random.Generator,
     *,
     alpha: float,
+    inner_splits: Sequence[Split] = (),
+    fit_map: FitMap = fit_isotonic,
     on_fold: Callable[[], None] = lambda: None,
 ) -> dict[float, Predictions]:
     """Predict every window once, by classifier, threshold and map that never saw its fold.
@@ -77,13 +82,18 @@ def cross_validate(
     table : FeatureTable
         Windows.
     split : callable
-        Folds of a table; used for the outer folds and again inside each training set.
+        Folds of a table.
     make : callable
         Makes an untrained classifier.
     rng : numpy.random.Generator
         Draws folds and whatever the classifier draws.
     alpha : float
         Budget of the threshold.
+    inner_splits : sequence of callable
+        Folds inside each training set, from which threshold and map are learned: `split` again, unless given;
+        with several, the calibration is that `between` them.
+    fit_map : callable
+        Fits the risk map.
     on_fold : callable
         Called after each outer fold, for progress.
 
@@ -98,14 +108,51 @@ def cross_validate(
         held_out = folds == fold
         train = table.select(~held_out)
         probabilities = _trained(make, train, rng).predict_proba(table.features[held_out])
-        inner = out_of_fold(train, split(train, rng), make, rng)
+        inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits or (split,)]
         for beta, prediction in predictions.items():
-            calibration = calibrate_windows(
-                inner, train.hazards, train.hazard_free, alpha=alpha, miss_rate=beta
-            )
-            prediction.fill(held_out, probabilities, calibration)
+            prediction.fill(held_out, probabilities, _calibration(train, inner, alpha, beta, fit_map))
         on_fold()
     return predictions
+
+
+def transfer(
+    train: FeatureTable,
+    test: FeatureTable,
+    inner_splits: Sequence[Split],
+    make: MakeClassifier,
+    rng: np.random.Generator,
+    *,
+    alpha: float,
+    fit_map: FitMap = fit_isotonic,
+) -> dict[float, Predictions]:
+    """Predict every window of one table by what was learned on another.
+
+    Parameters
+    ----------
+    train, test : FeatureTable
+        Windows to learn from, threshold and map included, and windows to predict.
+    inner_splits, make, rng, alpha, fit_map
+        As for `cross_validate`.
+
+    Returns
+    -------
+    dict of float to Predictions
+        For each beta, as one fold named ``transfer``.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the two share a recording.
+    """
+    shared = np.intersect1d(train.recording_keys, test.recording_keys)
+    if shared.size:
+        raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")
+    inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits]
+    probabilities = _trained(make, train, rng).predict_proba(test.features)
+    return {
+        beta: predict_with(test, probabilities, _calibration(train, inner, alpha, beta, fit_map), "transfer")
+        for beta in MISS_RATES
+    }
 
 
 def out_of_fold(
@@ -120,12 +167,26 @@ def out_of_fold(
     return probabilities
 
 
-def predict_with(table: FeatureTable, probabilities: Numbers, calibration: WindowCalibration) -> Predictions:
-    """Return the predictions of a finished model, as one fold named ``model``."""
-    predictions = Predictions.blank(np.full(len(table), "model"))
+def predict_with(
+    table: FeatureTable, probabilities: Numbers, calibration: WindowCalibration, fold: str = "model"
+) -> Predictions:
+    """Return the predictions of a finished model, as one fold."""
+    predictions = Predictions.blank(np.full(len(table), fold))
     predictions.fill(np.ones(len(table), dtype=np.bool_), probabilities, calibration)
     return predictions
 
 
 def _trained(make: MakeClassifier, table: FeatureTable, rng: np.random.Generator) -> Classifier:
     return make(rng).fit(table.features, table.labels)
+
+
+def _calibration(
+    train: FeatureTable, inner: Sequence[Numbers], alpha: float, miss_rate: float, fit_map: FitMap
+) -> WindowCalibration:
+    levels = [
+        calibrate_windows(
+            one, train.hazards, train.hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_map
+        )
+        for one in inner
+    ]
+    return between(levels)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from worldstate.adapters.feature_table import FeatureTable
 from worldstate.errors import InvalidArgumentError
 
-Protocol = Literal["cv", "lojo"]
-PROTOCOLS: tuple[Protocol, ...] = ("cv", "lojo")
+Protocol = Literal["cv", "lojo", "transfer"]
+PROTOCOLS: tuple[Protocol, ...] = ("cv", "lojo", "transfer")
 N_FOLDS = 5
 
 Folds = NDArray[np.str_]
@@ -83,7 +83,7 @@ def junction_folds(table: FeatureTable, rng: np.random.Generator | None = None) 
 
 
 def split_for(protocol: Protocol) -> Split:
-    """Return the way a protocol splits, outside and inside: the inner folds are like the outer ones.
+    """Return the way a protocol splits; ``transfer`` splits its training set by junction.
 
     Examples
     --------

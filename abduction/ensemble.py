@@ -1,0 +1,198 @@
+r"""Signature model for junctions never seen: linear experts on a window compared with its site.
+
+Every expert looks at the window in its own way (a view) and gives log-posteriors; the ensemble is their mean
+over experts and over the window and its mirror image, sides exchanged:
+
+.. math:: \log P(c \mid x) \propto \tfrac{1}{2 E} \sum_e \big[ \ell_e(c, x) + \ell_e(\bar c, \bar x) \big],
+          \qquad \ell_e = \log \mathrm{softmax}\, \big( W_e (v_e(x) - \mu_e) / \sigma_e + b_e \big),
+
+so that mirroring the world exchanges left and right to the bit.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import log_softmax
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+from .evidence import SignatureEvidence
+from .expert import Expert, expert_view, split_reference
+from .mirror import SEGMENTS, mirror_features
+from .pairwise import SMALLEST_PROBABILITY
+from .schema import read_numbers
+from .signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS, LEFT, RIGHT
+from .site import KINDS, SiteReference, log_levels
+
+MOST_EXPERTS = 32
+KIND = "ensemble"
+MIRRORED_CLASSES = [{LEFT: RIGHT, RIGHT: LEFT}.get(column, column) for column in range(len(CLASSES))]
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnsembleModel:
+    """Coefficients of the ensemble, no rows of the data it was trained on.
+
+    Parameters
+    ----------
+    experts : tuple of Expert
+        At least one.
+    class_prior : ndarray, shape (4,)
+        Class frequencies of the training set, mirrored rows included.
+    home : SiteReference
+        Mean reference of the training sites, mirrored ones included: stands in where no site is known.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the experts do not fit the reference or the prior is none.
+
+    Examples
+    --------
+    >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
+    >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))))
+    >>> model.predict_proba(np.ones((1, 6)))
+    array([[0.25, 0.25, 0.25, 0.25]])
+    """
+
+    experts: tuple[Expert, ...]
+    class_prior: Numbers
+    home: SiteReference
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.experts) <= MOST_EXPERTS:
+            raise InvalidArgumentError(f"experts: expected 1 to {MOST_EXPERTS}, got {len(self.experts)}")
+        prior = finite_array("class_prior", self.class_prior, (len(CLASSES),)).copy()
+        if (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
+            raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
+        prior.flags.writeable = False
+        object.__setattr__(self, "class_prior", prior)
+        if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
+            raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
+        for expert in self.experts:
+            inputs = expert_view(expert.view, self.home.mean[None], self.home.row[None]).shape[1]
+            if expert.mean.size != inputs:
+                raise InvalidArgumentError(f"expert: expected {inputs} inputs, got {expert.mean.size}")
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the columns of `predict_proba`."""
+        return CLASSES
+
+    @property
+    def directions(self) -> tuple[str, ...]:
+        """Names of the hidden hypotheses of `evidence`."""
+        return DIRECTIONS
+
+    @property
+    def n_features(self) -> int:
+        """Length of the feature vector of one window."""
+        return int(self.home.mean.size)
+
+    @property
+    def reference_prior(self) -> tuple[float, ...]:
+        """Training prior in the order of the explanations (left, right, visible, none)."""
+        return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
+
+    def at_site(self, reference: SiteReference) -> "EnsembleModel":
+        """Return the model with another reference in place of the training sites' mean.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the reference is of another length.
+        """
+        return replace(self, home=reference)
+
+    def predict_proba(self, X: ArrayLike) -> Numbers:
+        """Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features) or (n, 4 * features)
+            Windows, or windows each with the `row` of its site's reference behind it.
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another shape, NaN or infinity.
+        """
+        levels, reference = self._split(X)
+        posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
+        return np.asarray(posteriors / posteriors.sum(axis=1, keepdims=True))
+
+    def log_likelihoods(self, X: ArrayLike) -> Numbers:
+        r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
+
+        Parameters and errors are those of `predict_proba`.
+        """
+        ratios = np.log(self.predict_proba(X)) - np.log(self.class_prior)
+        return np.asarray(ratios[:, EXPLANATION_COLUMNS])
+
+    def evidence(self, feature: ArrayLike) -> SignatureEvidence:
+        """Return the log-likelihoods of one window, shape (features,) or (4 * features,).
+
+        Raises
+        ------
+        InvalidArgumentError
+            On another shape, NaN or infinity.
+        """
+        left, right, visible, none = self.log_likelihoods(np.atleast_2d(feature))[0].tolist()
+        return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values; reading them back gives the same model to the bit."""
+        return {
+            "kind": KIND,
+            "classes": list(CLASSES),
+            "class_prior": self.class_prior.tolist(),
+            "home": self.home.row.tolist(),
+            "experts": [expert.to_dict() for expert in self.experts],
+        }
+
+    @classmethod
+    def from_dict(cls, data: object) -> "EnsembleModel":
+        """Return the model that `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If something is missing, of the wrong type or out of range.
+        """
+        if not isinstance(data, Mapping) or data.get("classes") != list(CLASSES):
+            raise InvalidArgumentError(f"signature: expected an object of classes {', '.join(CLASSES)}")
+        experts = data.get("experts")
+        if not isinstance(experts, list) or len(experts) > MOST_EXPERTS:
+            raise InvalidArgumentError(f"experts: expected a list of at most {MOST_EXPERTS}")
+        return cls(
+            tuple(Expert.from_dict(expert) for expert in experts),
+            np.array(read_numbers(data.get("class_prior"), "class_prior")),
+            SiteReference.from_row(read_numbers(data.get("home"), "home")),
+        )
+
+    def _split(self, X: ArrayLike) -> tuple[Numbers, Numbers]:
+        n_features = self.n_features
+        inputs = finite_array("X", X, (None, None))
+        if inputs.shape[1] not in (n_features, n_features * (1 + len(KINDS))):
+            raise InvalidArgumentError(
+                f"X: expected {n_features} features or {n_features * (1 + len(KINDS))} with a reference, "
+                f"got shape {inputs.shape}"
+            )
+        if inputs.shape[1] > n_features:
+            return split_reference(inputs)
+        return log_levels(inputs), np.broadcast_to(self.home.row, (len(inputs), self.home.row.size))
+
+    def _log_posteriors(self, levels: Numbers, reference: Numbers) -> Numbers:
+        mirrored = mirror_features(levels, SEGMENTS), mirror_features(reference, SEGMENTS * len(KINDS))
+        sums = np.zeros((len(levels), len(CLASSES)))
+        for expert in self.experts:
+            # Added to each other first: the sum of two does not depend on which is the mirror image.
+            there, back = expert.log_posteriors(levels, reference), expert.log_posteriors(*mirrored)
+            sums += there + back[:, MIRRORED_CLASSES]
+        return np.asarray(log_softmax(sums / (2 * len(self.experts)), axis=1))

@@ -1,0 +1,134 @@
+"""Training of the ensemble: every window and its mirror image, one softmax regression for each view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.linear_model import LogisticRegression
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+from .ensemble import MIRRORED_CLASSES, EnsembleModel
+from .expert import SHAPE, Expert, expert_view, split_reference
+from .mirror import SEGMENTS, mirror_features
+from .signature import CLASSES
+from .signature_training import checked_labels
+from .site import KINDS, SiteReference
+from .standardise import standardisation
+
+_ITERATIONS = 1000
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What one expert looks at and how strongly it is held back.
+
+    Parameters
+    ----------
+    view : str
+        See `Expert`.
+    ridge : float
+        Weight of half the squared norm of the coefficients beside the mean log loss, > 0.
+
+    Examples
+    --------
+    >>> Recipe("mean", 1e-3).view
+    'mean'
+    """
+
+    view: str
+    ridge: float
+
+
+# Chosen on eight junctions, every choice judged on a junction that it was not made on; see docs/signature.md.
+RECIPES = (
+    Recipe("mean", 1e-3),
+    Recipe("median", 1e-3),
+    Recipe("quiet", 1e-3),
+    Recipe(SHAPE, 1e-2),
+)
+
+
+class SiteEnsembleClassifier:
+    """Trainer of `EnsembleModel`, scikit-learn style; nothing in it is drawn at random.
+
+    Parameters
+    ----------
+    recipes : sequence of Recipe
+        One for each expert.
+
+    Attributes
+    ----------
+    model_ : EnsembleModel
+        After `fit`: all that inference needs.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> y = np.repeat(CLASSES, 10)
+    >>> windows = np.exp(rng.normal(size=(40, 60)) + np.repeat(np.arange(4), 10)[:, None])
+    >>> X = np.hstack([windows, np.zeros((40, 180))])
+    >>> SiteEnsembleClassifier().fit(X, y).predict_proba(X).shape
+    (40, 4)
+    """
+
+    model_: EnsembleModel
+
+    def __init__(self, recipes: Sequence[Recipe] = RECIPES) -> None:
+        self.recipes = recipes
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Fit on windows with the references of their sites behind them, and class names.
+
+        Parameters
+        ----------
+        X : array_like, shape (n, 4 * features)
+            Levels of each window, then mean, median and quiet reference of its site.
+        y : array_like of str, shape (n,)
+            front, left, none or right.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If X has another shape or is not finite, or a class is missing or unknown.
+        """
+        inputs = finite_array("X", X, (None, None))
+        if inputs.shape[1] % (SEGMENTS * (1 + len(KINDS))):
+            raise InvalidArgumentError(f"X: expected windows with a reference, got shape {inputs.shape}")
+        codes = np.searchsorted(CLASSES, checked_labels(y, len(inputs)))
+        levels, reference, codes = _with_mirror_images(*split_reference(inputs), codes)
+        self.model_ = EnsembleModel(
+            tuple(_fit_expert(recipe, levels, reference, codes) for recipe in self.recipes),
+            np.bincount(codes) / codes.size,
+            SiteReference.from_row(reference.mean(axis=0)),
+        )
+        return self
+
+    def predict_proba(self, X: ArrayLike) -> Numbers:
+        """Return posteriors of front, left, none, right, shape (n, 4)."""
+        return self.model_.predict_proba(X)
+
+
+def _with_mirror_images(
+    levels: Numbers, reference: Numbers, codes: NDArray[np.intp]
+) -> tuple[Numbers, Numbers, NDArray[np.intp]]:
+    """Append the mirror image of every window, front and none included: no class becomes more frequent."""
+    mirrored_reference = mirror_features(reference, SEGMENTS * len(KINDS))
+    return (
+        np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
+        np.concatenate([reference, mirrored_reference]),
+        np.concatenate([codes, np.array(MIRRORED_CLASSES)[codes]]),
+    )
+
+
+def _fit_expert(recipe: Recipe, levels: Numbers, reference: Numbers, codes: NDArray[np.intp]) -> Expert:
+    seen = expert_view(recipe.view, levels, reference)
+    mean, scale = standardisation(seen)
+    machine = LogisticRegression(C=1.0 / (recipe.ridge * len(seen)), max_iter=_ITERATIONS)
+    machine.fit((seen - mean) / scale, codes)
+    return Expert(recipe.view, mean, scale, machine.coef_, machine.intercept_)

@@ -1,0 +1,126 @@
+"""One linear expert of an ensemble, and the views of a window that an expert may have."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_softmax
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+from .mirror import SEGMENTS
+from .schema import read_numbers, read_rows
+from .shape import shape_features
+from .site import KINDS, log_levels
+
+SHAPE = "shape"
+VIEWS = (*KINDS, SHAPE)
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expert:
+    """One linear softmax classifier and what it looks at.
+
+    Parameters
+    ----------
+    view : str
+        ``mean``, ``median`` or ``quiet``: log-levels above that summary of the site; ``shape``: how the shape
+        of the window differs from that of the site's median.
+    mean, scale : ndarray, shape (inputs,)
+        Standardisation; scale > 0.
+    weights : ndarray, shape (4, inputs)
+        One row for each of front, left, none, right.
+    intercepts : ndarray, shape (4,)
+        Added to the weighted sums.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the view is unknown, shapes do not agree, a number is not finite or a scale is not positive.
+
+    Examples
+    --------
+    >>> Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4)).view
+    'mean'
+    """
+
+    view: str
+    mean: Numbers
+    scale: Numbers
+    weights: Numbers
+    intercepts: Numbers
+
+    def __post_init__(self) -> None:
+        if self.view not in VIEWS:
+            raise InvalidArgumentError(f"view: expected one of {', '.join(VIEWS)}, got {self.view!r:.40}")
+        inputs = np.size(self.mean)
+        shapes = {"mean": (inputs,), "scale": (inputs,), "weights": (4, inputs), "intercepts": (4,)}
+        for name, shape in shapes.items():
+            value = finite_array(name, getattr(self, name), shape).copy()
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if (self.scale <= 0).any():
+            raise InvalidArgumentError("scale: expected positive numbers")
+
+    def log_posteriors(self, levels: Numbers, reference: Numbers) -> Numbers:
+        """Return log-softmax of the weighted sums, shape (n, 4)."""
+        seen = expert_view(self.view, levels, reference)
+        sums = (seen - self.mean) / self.scale @ self.weights.T + self.intercepts
+        return np.asarray(log_softmax(sums, axis=1))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        names = ("mean", "scale", "weights", "intercepts")
+        return {"view": self.view} | {name: getattr(self, name).tolist() for name in names}
+
+    @classmethod
+    def from_dict(cls, data: object) -> "Expert":
+        """Return the expert that `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If something is missing, of the wrong type or out of range.
+        """
+        if not isinstance(data, Mapping):
+            raise InvalidArgumentError("expert: expected an object")
+        rows = read_rows(data.get("weights"), "weights")
+        if len({len(row) for row in rows}) != 1:
+            raise InvalidArgumentError("weights: expected rows of one length")
+        vectors = {k: np.array(read_numbers(data.get(k), k)) for k in ("mean", "scale", "intercepts")}
+        return cls(view=str(data.get("view")), weights=np.array(rows), **vectors)
+
+
+def expert_view(view: str, levels: Numbers, reference: Numbers) -> Numbers:
+    """Return what an expert looks at, shape (n, inputs).
+
+    Parameters
+    ----------
+    view : str
+        One of `VIEWS`.
+    levels : ndarray, shape (n, features)
+        Natural logarithms.
+    reference : ndarray, shape (n, 3 * features)
+        Mean, median and quiet reference behind one another.
+
+    Examples
+    --------
+    >>> expert_view("median", np.full((1, 2), 3.0), np.array([[0.0, 0.0, 1.0, 2.0, 0.0, 0.0]]))
+    array([[2., 1.]])
+    """
+    kind = KINDS.index("median" if view == SHAPE else view)
+    summary = reference[:, kind * levels.shape[1] : (kind + 1) * levels.shape[1]]
+    if view == SHAPE:
+        return shape_features(levels, SEGMENTS) - shape_features(summary, SEGMENTS)
+    return levels - summary
+
+
+def split_reference(X: Numbers) -> tuple[Numbers, Numbers]:
+    """Part windows with a reference behind them into log-levels and references."""
+    n_features = X.shape[1] // (1 + len(KINDS))
+    return log_levels(X[:, :n_features]), X[:, n_features:]

@@ -1,0 +1,26 @@
+"""The mirror image of a feature vector: what the same scene with its sides exchanged would give."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+SEGMENTS = 2
+
+Numbers = NDArray[np.float64]
+
+
+def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
+    """Return the features of the mirrored scene: azimuths reversed within each segment.
+
+    Parameters
+    ----------
+    X : ndarray, shape (n, segments * azimuths)
+        Segment-major: all azimuths of the first segment, then those of the next.
+    segments : int
+        Stretches of time that a feature vector covers.
+
+    Examples
+    --------
+    >>> mirror_features(np.array([[1, 2, 3, 4, 5, 6]]))
+    array([[3, 2, 1, 6, 5, 4]])
+    """
+    return X.reshape(len(X), segments, -1)[:, :, ::-1].reshape(X.shape)

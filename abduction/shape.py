@@ -1,0 +1,61 @@
+"""The shape of a window in a few numbers: how high, how wide, on which side, rising or falling."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SHARPNESS = 4.0
+
+Numbers = NDArray[np.float64]
+
+
+def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
+    """Return peaks, sides, widths and changes of log-levels over directions, shape (n, 13 * segments + 5).
+
+    Mirroring the directions exchanges the sides and changes the sign of what points to one.
+
+    Parameters
+    ----------
+    levels : ndarray, shape (n, segments * directions)
+        Natural logarithms, segment by segment; at least three directions.
+    segments : int
+        Stretches of time, at least two; the change is that from the first to the last.
+
+    Examples
+    --------
+    >>> rising = np.log([[1.0, 2.0, 1.0, 1.0, 4.0, 1.0]])
+    >>> shape_features(rising).shape
+    (1, 31)
+    >>> shape_features(rising)[:, -2].round(2)  # the peak rises by a factor of two
+    array([0.69])
+    """
+    stretches = levels.reshape(len(levels), segments, -1)
+    columns = [column for i in range(segments) for column in _segment(stretches[:, i])]
+    return np.stack(columns + _change(stretches[:, 0], stretches[:, -1]), axis=1)
+
+
+def _segment(levels: Numbers) -> list[Numbers]:
+    n_directions = levels.shape[1]
+    peak, middle = levels.max(axis=1), np.median(levels, axis=1)
+    third = n_directions // 3
+    first = levels[:, :third].max(axis=1)
+    centre = levels[:, third : n_directions - third].max(axis=1)
+    last = levels[:, n_directions - third :].max(axis=1)
+    position, width = _centroid(levels)
+    heights = [peak, middle, levels.min(axis=1), peak - middle]
+    sides = [first, centre, last, first - last, position, np.abs(position)]
+    return [*heights, *sides, levels.std(axis=1), width, np.diff(levels, axis=1).std(axis=1)]
+
+
+def _centroid(levels: Numbers) -> tuple[Numbers, Numbers]:
+    """Mean and spread of the direction, on [-1, 1], weighted by the levels above their peak's foot."""
+    direction = np.linspace(-1.0, 1.0, levels.shape[1])
+    weights = np.exp(_SHARPNESS * (levels - levels.max(axis=1, keepdims=True)))
+    weights /= weights.sum(axis=1, keepdims=True)
+    position = weights @ direction
+    return position, np.sqrt(np.maximum(weights @ direction**2 - position**2, 0.0))
+
+
+def _change(first: Numbers, last: Numbers) -> list[Numbers]:
+    change = last - first
+    peak = last.max(axis=1) - first.max(axis=1)
+    return [change.max(axis=1), change.min(axis=1), change.mean(axis=1), peak, change.std(axis=1)]

@@ -1,0 +1,103 @@
+r"""What a site is like when nothing is known of its labels: the reference that features are compared with.
+
+A feature is a row of positive levels, so the comparison is a difference of logarithms: reflections that every
+window of a junction shares drop out, and a classifier trained elsewhere meets what it knows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+SMALLEST_LEVEL = 1e-4
+QUIET_SHARE = 0.35
+KINDS = ("mean", "median", "quiet")
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteReference:
+    """Three summaries of the log-levels at one site, none of which needs a label.
+
+    Parameters
+    ----------
+    mean, median : ndarray, shape (features,)
+        Over all windows.
+    quiet : ndarray, shape (features,)
+        Mean over the 35 % of the windows whose loudest feature is the least: close to what the site is like
+        while nobody comes, whatever share of the windows that is.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the shapes differ or a number is not finite.
+
+    Examples
+    --------
+    >>> site_reference(np.log([[1.0, 2.0], [1.0, 4.0], [1.0, 8.0]])).median.round(2)
+    array([0.  , 1.39])
+    """
+
+    mean: Numbers
+    median: Numbers
+    quiet: Numbers
+
+    def __post_init__(self) -> None:
+        for name in KINDS:
+            value = finite_array(name, getattr(self, name), (np.size(self.mean),)).copy()
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    @property
+    def row(self) -> Numbers:
+        """The three summaries one after the other, shape (3 * features,): what stands behind a window."""
+        return np.concatenate([getattr(self, kind) for kind in KINDS])
+
+    @classmethod
+    def from_row(cls, row: ArrayLike) -> "SiteReference":
+        """Return the reference whose `row` this is.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If its length is no multiple of three or a number is not finite.
+        """
+        values = finite_array("reference", row, (None,))
+        if values.size % len(KINDS):
+            raise InvalidArgumentError(f"reference: expected a multiple of three numbers, got {values.size}")
+        return cls(*values.reshape(len(KINDS), -1))
+
+    def shifted(self, offset: ArrayLike) -> "SiteReference":
+        """Return the reference of a site whose log-levels are higher by `offset`, shape (features,)."""
+        return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
+
+
+def log_levels(X: ArrayLike) -> Numbers:
+    """Return the natural logarithm of levels, silence held at 1e-4.
+
+    Examples
+    --------
+    >>> log_levels([[1.0, 0.0]]).round(2)
+    array([[ 0.  , -9.21]])
+    """
+    return np.log(np.maximum(np.asarray(X, dtype=np.float64), SMALLEST_LEVEL))
+
+
+def site_reference(levels: ArrayLike) -> SiteReference:
+    """Return the reference of a site from its windows, shape (windows, features), natural logarithms.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no window or a number is not finite.
+    """
+    windows = finite_array("levels", levels, (None, None))
+    if not len(windows):
+        raise InvalidArgumentError("levels: expected at least one window")
+    loudest = windows.max(axis=1)
+    quiet = windows[loudest <= np.quantile(loudest, QUIET_SHARE)]
+    return SiteReference(windows.mean(axis=0), np.median(windows, axis=0), quiet.mean(axis=0))

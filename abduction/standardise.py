@@ -1,0 +1,19 @@
+"""Mean and scale of training inputs."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Numbers = NDArray[np.float64]
+
+
+def standardisation(inputs: Numbers) -> tuple[Numbers, Numbers]:
+    """Return mean and standard deviation of each column; 1 where a column never changes.
+
+    Examples
+    --------
+    >>> standardisation(np.array([[1.0, 5.0], [3.0, 5.0]]))
+    (array([2., 5.]), array([1., 1.]))
+    """
+    deviation = inputs.std(axis=0)
+    # A column that never changes carries nothing; leave it as it is.
+    return inputs.mean(axis=0), np.where(deviation > 10 * np.finfo(float).eps, deviation, 1.0)

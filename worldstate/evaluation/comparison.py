@@ -1,0 +1,143 @@
+"""One method beside those that it has to beat, figure by figure, with paired intervals."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from scipy.stats import binom
+
+from worldstate.adapters.feature_table import FeatureTable
+from worldstate.errors import InvalidArgumentError
+
+from .bootstrap import FigureDraws, draw_figures, recording_draws
+from .calibration import ABSENT_MISS_RATE
+from .feature_report import group_figures, mean_figures, report_groups, window_figures
+from .features import Predictions
+from .methods import METHODS, ROWS, Passes, evaluate_pass
+from .splits import Protocol
+
+BOOTSTRAP_SEED = 0
+COMPARED = ("baseline", "baseline_absent", "loudest_direction", "commissioning_drive")
+
+
+def run_passes(
+    methods: Sequence[str],
+    table: FeatureTable,
+    protocol: Protocol,
+    *,
+    seeds: int,
+    alpha: float,
+    train: FeatureTable | None = None,
+    jobs: int = 1,
+    on_pass: Callable[[], None] = lambda: None,
+) -> dict[str, Passes]:
+    """Run every seed of every method; the outcome does not depend on the number of jobs.
+
+    Parameters
+    ----------
+    methods : sequence of str
+        Names in `METHODS`.
+    table : FeatureTable
+        Windows to predict.
+    protocol : str
+        ``cv``, ``lojo`` or ``transfer``.
+    seeds : int
+        Seeds 0 to seeds - 1.
+    alpha : float
+        Budget.
+    train : FeatureTable, optional
+        Windows to learn from, under ``transfer``.
+    jobs : int
+        Processes.
+    on_pass : callable
+        Called after each, for progress.
+
+    Returns
+    -------
+    dict of str to list
+        For each method one item a seed.
+    """
+    tasks = [(name, seed) for name in methods for seed in range(seeds)]
+    run = delayed(evaluate_pass)
+    outcomes = Parallel(n_jobs=jobs, return_as="generator")(
+        run(METHODS[name], table, protocol, seed=seed, alpha=alpha, train=train) for name, seed in tasks
+    )
+    passes: dict[str, Passes] = {name: [] for name in methods}
+    for (name, _), outcome in zip(tasks, outcomes, strict=True):
+        passes[name].append(outcome)
+        on_pass()
+    return passes
+
+
+def comparison(table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float) -> dict[str, Any]:
+    """Return the figures of one row, those of all others, and what the one gains on each.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows that were predicted.
+    passes : mapping of str to list
+        From `run_passes`.
+    row : str
+        Name in `ROWS` of the one that the plain keys are of.
+    alpha : float
+        Budget, for the test of the achieved false-positive rate.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are no passes of that row's method.
+    """
+    chosen = {name: _of_row(passes, name) for name in ROWS if ROWS[name].method in passes}
+    if row not in chosen:
+        raise InvalidArgumentError(f"method: expected passes of {row}, got {', '.join(passes)}")
+    samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED))
+    draws = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
+    rows = {name: _row_figures(table, mine, draws[name], alpha) for name, mine in chosen.items()}
+    others = [name for name in rows if name != row]
+    return {
+        **rows[row],
+        "statistic": "absent" if ROWS[row].miss_rate == ABSENT_MISS_RATE else "published",
+        "n_windows": len(table),
+        "n_hazard": int(table.hazards.sum()),
+        "n_hazard_free": int(table.hazard_free.sum()),
+        "n_recordings": len(np.unique(table.recording_keys)),
+        "per_group": report_groups(table, [group_figures(table, one) for one in chosen[row]]),
+        "rows": {name: rows[name] for name in others},
+        "gains": {name: _gains(rows[row], rows[name], draws[row].gains(draws[name])) for name in others},
+    }
+
+
+def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]:
+    """Return the predictions of one row, seed by seed."""
+    return _of_row(passes, row)
+
+
+def _of_row(passes: Mapping[str, Passes], name: str) -> list[Predictions]:
+    return [one[ROWS[name].miss_rate] for one in passes[ROWS[name].method]]
+
+
+def _row_figures(
+    table: FeatureTable, passes: Sequence[Predictions], draws: FigureDraws, alpha: float
+) -> dict[str, Any]:
+    figures = mean_figures([window_figures(table, one) for one in passes])
+    return {
+        **figures,
+        "fpr_p_value": _budget_p_value(figures["fpr"] or 0.0, int(table.hazard_free.sum()), alpha),
+        "intervals": draws.intervals(),
+    }
+
+
+def _budget_p_value(fpr: float, n: int, alpha: float) -> float:
+    """Probability of as many false positives or more, were the true rate the budget."""
+    return float(binom.sf(round(fpr * n) - 1, n, alpha))
+
+
+def _gains(
+    ours: Mapping[str, Any], theirs: Mapping[str, Any], intervals: Mapping[str, tuple[float, float]]
+) -> dict[str, dict[str, float]]:
+    return {
+        figure: {"gain": ours[figure] - theirs[figure], "low": low, "high": high}
+        for figure, (low, high) in intervals.items()
+    }

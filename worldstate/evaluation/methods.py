@@ -1,0 +1,142 @@
+"""What is compared in an evaluation on feature windows: the method, and what it has to beat."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.abduction.ensemble_training import SiteEnsembleClassifier
+from worldstate.abduction.risk_map import fit_isotonic, fit_platt
+from worldstate.abduction.signature_training import Classifier, PublishedClassifier
+from worldstate.adapters.feature_table import FeatureTable
+
+from .calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, FitMap
+from .features import MakeClassifier, Predictions, cross_validate, transfer
+from .loudness import LoudestDirection
+from .site_references import with_site_references
+from .splits import Protocol, Split, junction_folds, recording_folds, split_for
+
+Passes = list[dict[float, Predictions]]
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One way from windows to risk.
+
+    Parameters
+    ----------
+    prepare : callable
+        From the table as read to the table that the classifier sees.
+    make : callable
+        Makes an untrained classifier.
+    fit_map : callable
+        Fits the risk map.
+    two_levels : bool
+        Whether threshold and map stand between junctions left out and recordings left out, where the protocol
+        leaves out junctions; else they come from folds like the outer ones.
+    """
+
+    prepare: Callable[[FeatureTable], FeatureTable]
+    make: MakeClassifier
+    fit_map: FitMap
+    two_levels: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row of the comparison: a method and the statistic that is read from it.
+
+    Parameters
+    ----------
+    method : str
+        Name in `METHODS`.
+    miss_rate : float
+        beta of the statistic.
+    """
+
+    method: str
+    miss_rate: float
+
+
+def evaluate_pass(
+    method: Method,
+    table: FeatureTable,
+    protocol: Protocol,
+    *,
+    seed: int,
+    alpha: float,
+    train: FeatureTable | None = None,
+) -> dict[float, Predictions]:
+    """Run one seed of one method.
+
+    Parameters
+    ----------
+    method : Method
+        What to run.
+    table : FeatureTable
+        Windows to predict, as read.
+    protocol : str
+        ``cv``, ``lojo`` or ``transfer``.
+    seed : int
+        Draws folds and whatever the classifier draws.
+    alpha : float
+        Budget.
+    train : FeatureTable, optional
+        Windows to learn from under ``transfer``.
+
+    Returns
+    -------
+    dict of float to Predictions
+        For each beta.
+    """
+    rng, split = np.random.default_rng(seed), split_for(protocol)
+    prepared = method.prepare(table)
+    inner = _inner_splits(method, protocol)
+    if train is None:
+        return cross_validate(
+            prepared, split, method.make, rng, alpha=alpha, inner_splits=inner, fit_map=method.fit_map
+        )
+    learned = method.prepare(train)
+    return transfer(learned, prepared, inner, method.make, rng, alpha=alpha, fit_map=method.fit_map)
+
+
+def _inner_splits(method: Method, protocol: Protocol) -> tuple[Split, ...]:
+    split = split_for(protocol)
+    return (split, recording_folds) if method.two_levels and split is junction_folds else (split,)
+
+
+def as_read(table: FeatureTable) -> FeatureTable:
+    """Return the table as it is."""
+    return table
+
+
+def with_commissioning_drive(table: FeatureTable) -> FeatureTable:
+    """Append references that come from hazard-free windows of the site only."""
+    return with_site_references(table, table.hazard_free)
+
+
+def site_ensemble(rng: np.random.Generator) -> Classifier:
+    """Make the classifier of the method; it draws nothing."""
+    return SiteEnsembleClassifier()
+
+
+def loudest_direction(rng: np.random.Generator) -> Classifier:
+    """Make the scalar; it draws nothing."""
+    return LoudestDirection()
+
+
+METHODS = {
+    "baseline": Method(as_read, PublishedClassifier, fit_isotonic, two_levels=False),
+    "loudest_direction": Method(as_read, loudest_direction, fit_isotonic, two_levels=False),
+    "worldstate": Method(with_site_references, site_ensemble, fit_platt, two_levels=True),
+    "commissioning_drive": Method(with_commissioning_drive, site_ensemble, fit_platt, two_levels=True),
+}
+
+# What is read from each method, by the name of its row.
+ROWS = {
+    "baseline": Row("baseline", PUBLISHED_MISS_RATE),
+    "baseline_absent": Row("baseline", ABSENT_MISS_RATE),
+    "loudest_direction": Row("loudest_direction", ABSENT_MISS_RATE),
+    "worldstate": Row("worldstate", ABSENT_MISS_RATE),
+    "commissioning_drive": Row("commissioning_drive", ABSENT_MISS_RATE),
+}

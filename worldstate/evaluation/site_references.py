@@ -1,0 +1,54 @@
+"""Windows with their site's reference behind them, taken from other recordings than the one scored."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.site import log_levels, site_reference
+from worldstate.adapters.feature_table import FeatureTable
+from worldstate.errors import InvalidArgumentError
+
+
+def with_site_references(table: FeatureTable, chosen: NDArray[np.bool_] | None = None) -> FeatureTable:
+    """Append to each window the reference of its junction.
+
+    No label is looked at, unless the caller chooses windows by their label: a commissioning drive is
+    ``chosen=table.hazard_free``.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows, shape (n, 60).
+    chosen : ndarray of bool, shape (n,), optional
+        Windows that references may be taken from; all, unless given.
+
+    Returns
+    -------
+    FeatureTable
+        The same windows, shape (n, 240): window, then mean, median and quiet reference over all chosen
+        windows of the junction's other recordings.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a junction has no other recording to take a reference from.
+
+    Examples
+    --------
+    >>> words, here = np.array(["none"] * 3), np.array(["SA1"] * 3)
+    >>> table = FeatureTable(np.ones((3, 60)), words, words, here, np.array(["0", "1", "2"]), (None,) * 3)
+    >>> with_site_references(table).features.shape
+    (3, 240)
+    """
+    levels = log_levels(table.features)
+    allowed = np.ones(len(table), dtype=np.bool_) if chosen is None else chosen
+    keys = table.recording_keys
+    references = np.empty((len(table), 3 * levels.shape[1]))
+    for key in np.unique(keys):
+        mine = keys == key
+        others = (table.environments == table.environments[mine][0]) & ~mine & allowed
+        if not others.any():
+            raise InvalidArgumentError(f"recording {key}: expected another recording of its junction")
+        references[mine] = site_reference(levels[others]).row
+    return replace(table, features=np.hstack([table.features, references]))
