@@ -1,0 +1,318 @@
+r"""Cancelling the own engine: its harmonics are fitted to the spectra of all microphones and subtracted.
+
+A line h f of amplitude c reaches frame t, bin k and microphone m as
+
+.. math:: X_{t,k,m} = c_{h,m}\, g_{t,k,h}, \qquad
+          g_{t,k,h} = (-1)^k\, D\!\big(h f_t N / f_s - k\big)\, e^{j h \varphi_t},
+
+with the phase phi_t and frequency f_t of the fundamental in the middle of the frame and the Hann window's
+kernel D(u) = N [sinc(u) / 2 + sinc(u - 1) / 4 + sinc(u + 1) / 4]. The amplitudes are those of recursive least
+squares with an exponential memory, bins weighted by their inverse power. How far a hop's own amplitudes have
+turned against the remembered ones, an angle h delta that grows with the order, corrects phase, frequency and
+rate of the fundamental: a phase-locked loop over the whole comb, which keeps lock where a speed that is told
+is a little wrong.
+
+A line is subtracted as far as it stands out of the noise: without an engine, next to nothing is taken away.
+
+Sources: B. Widrow et al., "Adaptive noise cancelling: principles and applications", Proc. IEEE 63, 1975;
+H. Vold and J. Leuridan, "High resolution order tracking at extreme slew rates", SAE 931288, 1993 (several
+orders at once); the window's kernel: F. J. Harris, Proc. IEEE 66, 1978.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+ComplexArray = NDArray[np.complexfloating]
+FloatArray = NDArray[np.float64]
+
+# Lines so far outside the bins, in bins, no longer reach them through the window.
+_REACH_BINS = 1.5
+# Gains of the loop, for a hop's phase error: frequency and its rate (phase takes all of it). The first
+# error is all frequency; the rate is left alone until the frequency has settled.
+_FREQUENCY_GAIN, _RATE_GAIN, _SETTLING_HOPS = 0.5, 0.1, 6
+# Orders between lines that are compared, coarse to fine: no order's angle may wrap before it is known.
+_ORDER_STEPS = (1, 2, 4, 8)
+# Evidence of a line against noise at which nothing of it is subtracted; noise alone has 1 on average.
+_NO_LINE = 2.0
+_RIDGE = 1e-3
+_TINY = 1e-30
+
+
+@dataclass(frozen=True, slots=True)
+class EngineState:
+    """Where the fundamental is at the middle of the last frame.
+
+    Parameters
+    ----------
+    phase_rad, frequency_hz, rate_hz_per_s : float
+        Phase, its derivative over 2 pi, and the derivative of that.
+    hops : int
+        Number of hops since it was told.
+    """
+
+    phase_rad: float
+    frequency_hz: float
+    rate_hz_per_s: float = 0.0
+    hops: int = 0
+
+    def phases(self, time_s: FloatArray) -> FloatArray:
+        """Continue the phase to later times, radians."""
+        cycles = self.frequency_hz * time_s + 0.5 * self.rate_hz_per_s * time_s**2
+        return np.asarray(self.phase_rad + 2.0 * np.pi * cycles)
+
+    def frequencies(self, time_s: FloatArray) -> FloatArray:
+        """Continue the frequency to later times, Hz."""
+        return np.asarray(self.frequency_hz + self.rate_hz_per_s * time_s)
+
+    def after(self, time_s: float, phase_error_rad: float) -> "EngineState":
+        """Move on by a hop of this length, in whose middle the phase was found ahead by so much."""
+        frequency_error = phase_error_rad / (2.0 * np.pi * time_s)
+        gain = max(_FREQUENCY_GAIN, 1.0 / max(self.hops, 1))
+        rate_gain = _RATE_GAIN if self.hops >= _SETTLING_HOPS else 0.0
+        end = np.asarray(time_s)
+        return EngineState(
+            phase_rad=float(np.mod(self.phases(end) + phase_error_rad, 2.0 * np.pi)),
+            frequency_hz=float(self.frequencies(end)) + gain * frequency_error,
+            rate_hz_per_s=self.rate_hz_per_s + rate_gain * frequency_error / time_s,
+            hops=self.hops + 1,
+        )
+
+
+class HarmonicCanceller:
+    """Subtracts the harmonics of an engine from the spectra of a stream.
+
+    Parameters
+    ----------
+    bins : range
+        Bins of the spectra.
+    sample_rate_hz : float
+        Samples per second.
+    nfft : int
+        Frame length N; Hann-windowed frames overlap by half.
+    harmonics : int
+        Highest order that is cancelled.
+    memory_s : float
+        Time constant of the amplitudes, seconds.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.stft import StreamingStft
+    >>> t = np.arange(16_000) / 16_000.0
+    >>> engine = sum(np.cos(2 * np.pi * 50.0 * h * t + h) for h in range(1, 30))
+    >>> spectra = StreamingStft(1, 256, range(5, 20)).push(engine[:, None].astype(np.float32))
+    >>> canceller = HarmonicCanceller(range(5, 20), 16_000, 256)
+    >>> canceller.follow(50.2)
+    >>> rest = [canceller.cancel(hop) for hop in np.array_split(spectra, 10)]
+    >>> bool(abs(canceller.fundamental_hz - 50.0) < 0.01)
+    True
+    >>> bool(np.square(np.abs(rest[-1])).mean() < 1e-2 * np.square(np.abs(spectra)).mean())
+    True
+    """
+
+    def __init__(
+        self, bins: range, sample_rate_hz: float, nfft: int, *, harmonics: int = 40, memory_s: float = 0.4
+    ) -> None:
+        rate = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
+        in_range("harmonics", harmonics, 1, 1000)
+        self._memory_s = in_range("memory_s", memory_s, 0.01, 100.0)
+        self._frame_s = 0.5 * nfft / rate
+        self._bin_hz = rate / nfft
+        self._bins = np.arange(bins.start, bins.stop)
+        self._all_orders = np.arange(1, int(harmonics) + 1)
+        self._fit: _Fit | None = None
+        self._engine: EngineState | None = None
+
+    @property
+    def fundamental_hz(self) -> float | None:
+        """Frequency of the fundamental as tracked, or None while nothing is followed."""
+        return None if self._engine is None else self._engine.frequency_hz
+
+    def follow(self, fundamental_hz: float | None, tolerance: float = 0.03) -> None:
+        """Say the fundamental: from the engine's speed, or from `harmonics.track_fundamental`.
+
+        Parameters
+        ----------
+        fundamental_hz : float or None
+            10 to 1000 Hz; None stops cancelling.
+        tolerance : float
+            As long as the tracked frequency is within this share of it, the loop goes on undisturbed.
+
+        Raises
+        ------
+        InvalidArgumentError
+            Out of range.
+        """
+        if fundamental_hz is None:
+            self._engine = self._fit = None
+            return
+        told = in_range("fundamental_hz", fundamental_hz, 10.0, 1000.0)
+        if self._engine is None or abs(self._engine.frequency_hz / told - 1.0) > tolerance:
+            self._engine, self._fit = EngineState(0.0, told), None
+
+    def cancel(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the spectra have another number of bins.
+        """
+        if self._engine is None or not len(spectra):
+            return spectra
+        if spectra.ndim != 3 or spectra.shape[1] != len(self._bins):
+            raise InvalidArgumentError(
+                f"spectra: expected shape (frames, {len(self._bins)}, M), got {spectra.shape}"
+            )
+        orders = self._orders(self._engine.frequency_hz)
+        if not len(orders):
+            return spectra
+        time: FloatArray = self._frame_s * np.arange(1.0, len(spectra) + 1)
+        shapes = _line_shapes(self._engine, time, orders, self._bins, self._bin_hz)
+        scale = _inverse_rms(spectra)
+        now = _Fit.of(shapes, spectra, scale, orders)
+        error = 0.0
+        if self._fit is not None:
+            error = now.phase_ahead(self._fit)
+            now = now.turned(error).joined(self._fit, float(np.exp(-time[-1] / self._memory_s)))
+        self._fit = now
+        self._engine = self._engine.after(float(time[-1]), error)
+        lines = (shapes * np.exp(1j * orders * error).astype(np.complex64)) @ now.evident_amplitudes()
+        return np.asarray(spectra - lines.reshape(spectra.shape))
+
+    def _orders(self, frequency_hz: float) -> NDArray[np.int64]:
+        """Return the orders that reach the bins."""
+        place = self._all_orders * frequency_hz / self._bin_hz
+        near = (place > self._bins[0] - _REACH_BINS) & (place < self._bins[-1] + _REACH_BINS)
+        return np.asarray(self._all_orders[near])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Normal equations of the amplitudes, and their solution.
+
+    Parameters
+    ----------
+    orders : (H,) int
+    gram : (H, H) complex
+    moment : (H, M) complex
+    energy, count : float
+        Weighted sum of |X|^2 per microphone and number of values behind it.
+    amplitudes : (H, M) complex
+    """
+
+    orders: NDArray[np.int64]
+    gram: ComplexArray
+    moment: ComplexArray
+    energy: float
+    count: float
+    amplitudes: ComplexArray
+
+    @classmethod
+    def of(
+        cls,
+        shapes: NDArray[np.complex64],
+        spectra: NDArray[np.complex64],
+        scale: NDArray[np.float32],
+        orders: NDArray[np.int64],
+    ) -> "_Fit":
+        n_frames, n_bins, n_microphones = spectra.shape
+        weights = np.tile(scale, n_frames)[:, None]
+        weighted = weights * spectra.reshape(-1, n_microphones)
+        adjoint = (weights * shapes).conj().T
+        energy = float(np.square(np.abs(weighted)).sum()) / n_microphones
+        gram = adjoint @ adjoint.conj().T
+        return cls._solved(orders, gram, adjoint @ weighted, energy, float(n_frames * n_bins))
+
+    @classmethod
+    def _solved(
+        cls, orders: NDArray[np.int64], gram: ComplexArray, moment: ComplexArray, energy: float, count: float
+    ) -> "_Fit":
+        diagonal = np.einsum("hh->h", gram).real
+        loaded = gram + np.diag(_RIDGE * diagonal + _TINY).astype(gram.dtype)
+        return cls(orders, gram, moment, energy, count, np.linalg.solve(loaded, moment))
+
+    def phase_ahead(self, remembered: "_Fit") -> float:
+        """Angle of the fundamental by which this hop is ahead of what is remembered, radians."""
+        _, mine, theirs = np.intersect1d(self.orders, remembered.orders, return_indices=True)
+        if not len(mine):
+            return 0.0
+        turned = (self.amplitudes[mine] * remembered.amplitudes[theirs].conj()).sum(axis=1)
+        # Lines of like strength say more than one loud one that has no neighbour.
+        turned = turned.astype(np.complex128) / np.sqrt(np.abs(turned) + _TINY)
+        angle = 0.0
+        for step in _ORDER_STEPS:
+            if len(turned) > step:
+                pairs = turned[step:] * turned[:-step].conj()
+                angle += float(np.angle(pairs.sum() * np.exp(-1j * step * angle))) / step
+        orders = self.orders[mine]
+        rest = turned * np.exp(-1j * orders * angle)
+        weight = np.abs(rest) * orders
+        return angle + float((weight * np.angle(rest)).sum() / max((weight * orders).sum(), _TINY))
+
+    def turned(self, angle: float) -> "_Fit":
+        """Refer to a fundamental whose phase is ahead by an angle."""
+        turn = np.exp(-1j * self.orders * angle).astype(self.gram.dtype)
+        gram = turn[:, None] * self.gram * turn.conj()
+        moment, amplitudes = turn[:, None] * self.moment, turn[:, None] * self.amplitudes
+        return _Fit(self.orders, gram, moment, self.energy, self.count, amplitudes)
+
+    def joined(self, remembered: "_Fit", kept: float) -> "_Fit":
+        """Add what is remembered, forgotten by a factor; orders that have left are dropped."""
+        _, mine, theirs = np.intersect1d(self.orders, remembered.orders, return_indices=True)
+        gram, moment = self.gram.copy(), self.moment.copy()
+        gram[np.ix_(mine, mine)] += np.float32(kept) * remembered.gram[np.ix_(theirs, theirs)]
+        moment[mine] += np.float32(kept) * remembered.moment[theirs]
+        energy = self.energy + kept * remembered.energy
+        return self._solved(self.orders, gram, moment, energy, self.count + kept * remembered.count)
+
+    def evident_amplitudes(self) -> ComplexArray:
+        """Amplitudes (H, M), each shrunk by what noise alone would have left of it."""
+        explained = float((self.amplitudes.conj() * self.moment).real.sum()) / self.moment.shape[1]
+        noise = max(self.energy - explained, 1e-6 * self.energy) / self.count
+        power = np.square(np.abs(self.amplitudes)).mean(axis=1) * np.einsum("hh->h", self.gram).real
+        kept = np.maximum(1.0 - _NO_LINE * noise / np.maximum(power, _TINY), 0.0)
+        return np.asarray(self.amplitudes * kept[:, None].astype(np.float32))
+
+
+def _line_shapes(
+    engine: EngineState, time_s: FloatArray, orders: NDArray[np.int64], bins: NDArray[np.int64], bin_hz: float
+) -> NDArray[np.complex64]:
+    """Return g of the module's equation for unit N, (frames * bins, H)."""
+    place = engine.frequencies(time_s)[:, None] * orders / bin_hz
+    distance = (place[:, None, :] - bins[:, None]).astype(np.float32)
+    kernel = _hann_kernel(distance) * np.where(bins % 2, -1.0, 1.0).astype(np.float32)[:, None]
+    angle = np.mod(engine.phases(time_s)[:, None] * orders, 2.0 * np.pi)
+    turn = np.exp(1j * angle).astype(np.complex64)
+    return np.asarray((kernel * turn[:, None, :]).reshape(-1, len(orders)))
+
+
+def _hann_kernel(distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    r"""Spectrum of the Hann window per sample: sinc(u) / (2 (1 - u^2)), cut beyond four bins.
+
+    Examples
+    --------
+    >>> _hann_kernel(np.array([0.0, 1.0, 5.0], np.float32)).round(3)
+    array([0.5 , 0.25, 0.  ], dtype=float32)
+    """
+    below = 1.0 - np.square(distance)
+    # At u = 1 both numerator and denominator vanish: stand a hair beside it.
+    below[np.abs(below) < 1e-4] = 1e-4
+    u = np.sqrt(np.maximum(1.0 - below, 0.0))
+    kernel = 0.5 * np.sinc(u) / below
+    return np.where(u < 4.0, kernel, 0.0).astype(np.float32)
+
+
+def _inverse_rms(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Scale every bin to unit power, (bins,); silent bins get no say."""
+    power = (np.square(spectra.real) + np.square(spectra.imag)).mean(axis=(0, 2))
+    return np.where(power > _TINY, 1.0 / np.sqrt(np.maximum(power, _TINY)), 0.0).astype(np.float32)
