@@ -95,6 +95,9 @@ class VisionQuery:
         Directions in which a visible source can stand at all, known from the occluders of the context; all
         where not given. What sounds from behind an occluder is hidden, or the image of a source in a wall: if
         it is visible, it stands somewhere in line of sight, so that is what is searched.
+    clutter : callable, optional
+        From d to the probability of a false detection in the sector, where it was measured; that of the
+        settings where not given. What a degraded camera reports is then worth less too.
 
     Raises
     ------
@@ -121,6 +124,7 @@ class VisionQuery:
         degradation: float | Callable[[int], float] = 0.0,
         settings: VisionSettings | None = None,
         line_of_sight: Sector | None = None,
+        clutter: Callable[[float], float] | None = None,
     ) -> None:
         self.camera = camera
         self.detections = detections
@@ -131,6 +135,7 @@ class VisionQuery:
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
         self._view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
+        self._clutter = clutter
         if detections is not None:
             _check_size(camera, detections)
 
@@ -167,12 +172,14 @@ class VisionQuery:
         if not labels:
             return Unqueried("the signature predicts no class that a camera would see")
         sector = self._sector(bearing, side)
-        beta = self._expected_miss_rate(sector, stamp_ns, labels)
+        d = self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
+        beta = self._expected_miss_rate(sector, d, labels)
         if beta is None:
             return Unqueried("sector outside the field of view")
+        clutter = self.settings.clutter_rate if self._clutter is None else self._clutter(d)
         if any(_explains(sighting, sector, labels) for sighting in self.sightings(stamp_ns)):
-            return Present(beta, self.settings.clutter_rate)
-        return Absent(beta, self.settings.clutter_rate)
+            return Present(beta, clutter)
+        return Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return all that the filter lets through in the frame at `stamp_ns`, parked ones included."""
@@ -207,12 +214,11 @@ class VisionQuery:
             return sector
         return sector.overlap(self._line_of_sight) or self._line_of_sight
 
-    def _expected_miss_rate(self, sector: Sector, stamp_ns: int, labels: Collection[str]) -> float | None:
+    def _expected_miss_rate(self, sector: Sector, d: float, labels: Collection[str]) -> float | None:
         """Return beta over the sector, None where nothing of it is in view."""
         in_view = sector.overlap(self._view)
         if in_view is None:
             return None
-        d = self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
         angles = self.camera.off_axis(in_view.midpoints(SAMPLES)).tolist()
         seen = float(np.mean([self.miss_rate(angle, d, label) for label in labels for angle in angles]))
         share = in_view.half_width_rad / sector.half_width_rad

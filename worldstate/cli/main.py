@@ -9,7 +9,7 @@ from importlib.metadata import version
 from worldstate.errors import WorldstateError
 
 # Modules are imported when the parser is built; each keeps its heavy imports inside `run`.
-COMMANDS = ("demo", "run", "simulate", "train", "calibrate", "evaluate_features")
+COMMANDS = ("demo", "run", "simulate", "train", "calibrate", "measure_absence", "evaluate_features")
 
 
 def build_parser() -> argparse.ArgumentParser:

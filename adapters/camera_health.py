@@ -1,0 +1,278 @@
+"""How degraded a camera is, read from its own images: nobody has to tell the filter."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.schema import read_number, read_numbers
+from worldstate.adapters.degradation import LEVELS, degrade, level_of
+from worldstate.adapters.image_quality import ImageQuality, image_quality
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+Frame = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Degradation of an image by family, each d in [0, 1] on the scale of `degradation.LEVELS`.
+
+    Examples
+    --------
+    >>> Health(blur=0.1, darkness=0.5, noise=0.0).worst
+    0.5
+    """
+
+    blur: float
+    darkness: float
+    noise: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three."""
+        return max(self.blur, self.darkness, self.noise)
+
+    @property
+    def by_family(self) -> dict[str, float]:
+        """The three by name."""
+        return {"blur": self.blur, "darkness": self.darkness, "noise": self.noise}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraHealth:
+    """What this camera's images measure when clean and at every staged level: the scale that d is read on.
+
+    Parameters
+    ----------
+    brightness : float
+        Mean grey level of clean images, > 0.
+    sharpness : tuple of float
+        At the five levels of blur, not rising.
+    noise : tuple of float
+        At the five levels of noise, not falling.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the numbers do not fit the levels.
+
+    Examples
+    --------
+    >>> health = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
+    >>> seen = health.estimate(ImageQuality(brightness=25.0, noise=1.0, sharpness=2.6))
+    >>> seen.blur, seen.darkness, seen.noise
+    (0.25, 0.5, 0.0)
+    """
+
+    brightness: float
+    sharpness: tuple[float, ...]
+    noise: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        in_range("brightness", self.brightness, 0.0, 255.0, open_low=True)
+        sharpness = finite_array("sharpness", self.sharpness, (len(LEVELS),))
+        noise = finite_array("noise", self.noise, (len(LEVELS),))
+        if (np.diff(sharpness) > 0).any() or (np.diff(noise) < 0).any():
+            raise InvalidArgumentError("expected sharpness that does not rise and noise that does not fall")
+        if sharpness[0] <= 0.0 or noise[0] < 0.0:
+            raise InvalidArgumentError("expected a positive sharpness and a noise >= 0")
+
+    def estimate(self, quality: ImageQuality) -> Health:
+        """Return d of each family.
+
+        Sharpness that the noise drowns says nothing of blur: then the noise is the larger trouble anyway.
+        """
+        blur = 0.0
+        if quality.sharpness is not None:
+            blur = float(np.interp(-quality.sharpness, -np.array(self.sharpness), LEVELS))
+        darkness = level_of("darkness", min(quality.brightness / self.brightness, 1.0))
+        noise = float(np.interp(quality.noise, self.noise, LEVELS))
+        return Health(blur, darkness, noise)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values."""
+        return {
+            "brightness": self.brightness,
+            "sharpness": list(self.sharpness),
+            "noise": list(self.noise),
+        }
+
+    @classmethod
+    def from_dict(cls, data: object) -> "CameraHealth":
+        """Return what `to_dict` wrote; unknown keys are ignored.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If something is missing, of the wrong type or out of range.
+        """
+        if not isinstance(data, Mapping):
+            raise InvalidArgumentError("health: expected an object")
+        return cls(
+            brightness=read_number(data.get("brightness"), "brightness"),
+            sharpness=read_numbers(data.get("sharpness"), "sharpness"),
+            noise=read_numbers(data.get("noise"), "noise"),
+        )
+
+
+def learn_health(clean: Iterable[Frame], rng: np.random.Generator) -> CameraHealth:
+    """Learn the scale of a camera from clean images, by degrading them itself.
+
+    Parameters
+    ----------
+    clean : iterable of ndarray of uint8
+        A few images, taken apart in time; of each quantity the median over them counts.
+    rng : numpy.random.Generator
+        Draws the staged noise.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no image, or none in which sharpness can be measured.
+    MissingExtraError
+        If OpenCV is not installed.
+    """
+    brightness, sharpness, noise = [], [], []
+    for frame in clean:
+        brightness.append(image_quality(frame).brightness)
+        blurred = [image_quality(degrade(frame, "blur", d, rng)).sharpness for d in LEVELS]
+        sharpness.append([np.nan if value is None else value for value in blurred])
+        noise.append([image_quality(degrade(frame, "noise", d, rng)).noise for d in LEVELS])
+    if not brightness or np.isnan(sharpness).all(axis=0).any():
+        raise InvalidArgumentError("clean: expected at least one image with something sharp in it")
+    return CameraHealth(
+        brightness=float(np.median(brightness)),
+        sharpness=tuple(np.minimum.accumulate(np.nanmedian(sharpness, axis=0)).tolist()),
+        noise=tuple(np.maximum.accumulate(np.median(noise, axis=0)).tolist()),
+    )
+
+
+class HealthMonitor:
+    """Follows a camera's health, with a clean reference that moves along with the day.
+
+    While an image is clean (every d at most `clean`) the brightness and sharpness of reference follow it with
+    time constant `follow_s`, but never by more than a factor `most_drift` from what was learned: a lens that
+    soils slowly must not become the measure of cleanliness.
+
+    Parameters
+    ----------
+    health : CameraHealth
+        The camera's scale.
+    follow_s : float
+        Seconds.
+    clean : float
+        In [0, 1].
+    most_drift : float
+        >= 1.
+
+    Examples
+    --------
+    >>> health = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
+    >>> monitor = HealthMonitor(health, follow_s=60.0)
+    >>> for second in range(600):
+    ...     seen = monitor.update(second * 10**9, ImageQuality(90.0, 2.0, 5.0))
+    >>> round(seen.darkness, 3), round(monitor.reference.brightness)
+    (0.0, 90)
+    """
+
+    def __init__(
+        self, health: CameraHealth, follow_s: float = 120.0, clean: float = 0.15, most_drift: float = 1.5
+    ) -> None:
+        self.reference = health
+        self._learned = health
+        self._follow_s = in_range("follow_s", follow_s, 0.0, math.inf, open_low=True)
+        self._clean = in_range("clean", clean, 0.0, 1.0)
+        self._most_drift = in_range("most_drift", most_drift, 1.0, 100.0)
+        self._stamp_ns: int | None = None
+
+    def update(self, stamp_ns: int, quality: ImageQuality) -> Health:
+        """Take in the quality of the next image; return the degradation by family."""
+        seen = self.reference.estimate(quality)
+        elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) / 1e9
+        self._stamp_ns = stamp_ns
+        if seen.worst <= self._clean:
+            self._follow(quality, 1.0 - math.exp(-elapsed_s / self._follow_s))
+        return seen
+
+    def _follow(self, quality: ImageQuality, weight: float) -> None:
+        held, learned = self.reference, self._learned
+        brightness = self._moved(held.brightness, quality.brightness, learned.brightness, weight)
+        sharpest = held.sharpness[0]
+        if quality.sharpness is not None:
+            sharpest = self._moved(sharpest, quality.sharpness, learned.sharpness[0], weight)
+        scale = sharpest / learned.sharpness[0]
+        curve = tuple(value * scale for value in learned.sharpness)
+        self.reference = replace(held, brightness=min(brightness, 255.0), sharpness=curve)
+
+    def _moved(self, held: float, seen: float, learned: float, weight: float) -> float:
+        value = held + weight * (seen - held)
+        return min(max(value, learned / self._most_drift), learned * self._most_drift)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DegradationLog:
+    """Degradation over time, callable as `VisionQuery` wants it.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int, shape (n,)
+        Increasing.
+    degradation : ndarray, shape (n,)
+        d in [0, 1].
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is empty, lengths differ, or a number is out of range.
+
+    Examples
+    --------
+    >>> log = DegradationLog(np.array([0, 10**9]), np.array([0.0, 0.5]))
+    >>> log(-5), log(999_999_999), log(10**12)
+    (0.0, 0.0, 0.5)
+    """
+
+    stamps_ns: NDArray[np.int64]
+    degradation: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        d = finite_array("degradation", self.degradation, (np.size(self.stamps_ns),))
+        if not d.size or (np.diff(self.stamps_ns) <= 0).any() or d.min() < 0.0 or d.max() > 1.0:
+            raise InvalidArgumentError("degradation: expected numbers in [0, 1] at increasing time stamps")
+
+    def __call__(self, stamp_ns: int) -> float:
+        """Return d at the last stamp at or before `stamp_ns`, the first one before that."""
+        index = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right")) - 1
+        return float(self.degradation[max(index, 0)])
+
+
+def degradation_log(
+    frames: Iterable[tuple[int, Frame]],
+    health: CameraHealth,
+    level: Callable[[Health], float] = lambda health: health.worst,
+) -> DegradationLog:
+    """Read the degradation of every frame of a video.
+
+    Parameters
+    ----------
+    frames : iterable of (int, ndarray of uint8)
+        Stamp and image, in the order of time.
+    health : CameraHealth
+        The camera's scale.
+    level : callable
+        From the degradation by family to the one d of a table; `MissRates.level` is one.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no frame.
+    """
+    monitor, stamps, levels = HealthMonitor(health), [], []
+    for stamp_ns, frame in frames:
+        stamps.append(stamp_ns)
+        levels.append(level(monitor.update(stamp_ns, image_quality(frame))))
+    return DegradationLog(np.array(stamps, dtype=np.int64), np.array(levels))

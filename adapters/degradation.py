@@ -1,0 +1,133 @@
+"""Staged degradation of camera frames: blur, darkness, sensor noise, four levels each."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.vision_extra import opencv
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+Family = Literal["blur", "darkness", "noise", "all"]
+FAMILIES: tuple[Family, ...] = get_args(Family)
+
+# d at which the table is measured: clean, then the four levels of each family.
+LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
+# Gaussian blur in pixels, factor on the brightness, noise in grey levels of 255.
+STRENGTHS: Mapping[str, tuple[float, ...]] = MappingProxyType(
+    {
+        "blur": (0.0, 2.0, 4.0, 8.0, 16.0),
+        "darkness": (1.0, 0.5, 0.25, 0.12, 0.06),
+        "noise": (0.0, 10.0, 25.0, 50.0, 100.0),
+    }
+)
+
+Frame = NDArray[np.uint8]
+
+
+def strength(family: str, degradation: float) -> float:
+    """Return the strength of one of the three families at a degradation d in [0, 1].
+
+    Linear between the levels, darkness in the logarithm.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another family, or d outside [0, 1].
+
+    Examples
+    --------
+    >>> strength("blur", 0.5), round(strength("darkness", 0.125), 3), strength("noise", 1.0)
+    (4.0, 0.707, 100.0)
+    """
+    level = in_range("degradation", degradation, 0.0, 1.0)
+    if family not in STRENGTHS:
+        raise InvalidArgumentError(f"family: expected {', '.join(STRENGTHS)}, got {family!r:.40}")
+    knots = np.array(STRENGTHS[family])
+    if family == "darkness":
+        return float(np.exp(np.interp(level, LEVELS, np.log(knots))))
+    return float(np.interp(level, LEVELS, knots))
+
+
+def level_of(family: str, staged: float) -> float:
+    """Return the d in [0, 1] of a strength, the inverse of `strength`; beyond the last level it is 1.
+
+    Examples
+    --------
+    >>> level_of("blur", 4.0), level_of("darkness", 0.5), level_of("noise", 300.0)
+    (0.5, 0.25, 1.0)
+    """
+    knots = np.array(STRENGTHS[family])
+    if family == "darkness":
+        return float(np.interp(-np.log(max(staged, 1e-6)), -np.log(knots), LEVELS))
+    return float(np.interp(staged, knots, LEVELS))
+
+
+def degrade(frame: Frame, family: Family, degradation: float, rng: np.random.Generator) -> Frame:
+    r"""Return a frame as a degraded camera would have taken it.
+
+    .. math:: y = \mathrm{clip}(\mathrm{round}(a\,(G_\sigma * x) + n)), \qquad n \sim N(0, s^2)
+
+    with :math:`\sigma`, a and s those of the family at d; ``"all"`` takes the three together: optics first,
+    exposure next, the sensor last.
+
+    Parameters
+    ----------
+    frame : ndarray of uint8, shape (height, width) or (height, width, 3)
+        Untouched.
+    family : {"blur", "darkness", "noise", "all"}
+        What is staged.
+    degradation : float
+        d in [0, 1]; 0 returns the frame itself.
+    rng : numpy.random.Generator
+        Draws the noise.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another family, type or range.
+    MissingExtraError
+        If blur is asked for and OpenCV is not installed.
+
+    Examples
+    --------
+    >>> grey = np.full((4, 4), 100, dtype=np.uint8)
+    >>> degrade(grey, "darkness", 0.5, np.random.default_rng(0))[0, 0]
+    np.uint8(25)
+    """
+    if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
+        raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
+    if family not in FAMILIES:
+        raise InvalidArgumentError(f"family: expected {', '.join(FAMILIES)}, got {family!r:.40}")
+    level = in_range("degradation", degradation, 0.0, 1.0)
+    if level == 0.0:
+        return frame
+    staged = tuple(STRENGTHS) if family == "all" else (family,)
+    for name in staged:
+        frame = _STAGES[name](frame, strength(name, level), rng)
+    return frame
+
+
+def _blurred(frame: Frame, sigma_px: float, rng: np.random.Generator) -> Frame:
+    cv2 = opencv()
+    blurred: Frame = cv2.GaussianBlur(frame, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101)
+    return blurred
+
+
+def _darkened(frame: Frame, factor: float, rng: np.random.Generator) -> Frame:
+    table = np.round(np.arange(256) * factor).astype(np.uint8)
+    return table[frame]
+
+
+def _noisy(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
+    values = rng.standard_normal(frame.shape, dtype=np.float32)
+    values *= sigma
+    values += frame
+    np.rint(values, out=values)
+    return np.clip(values, 0.0, 255.0, out=values).astype(np.uint8)
+
+
+_STAGES = {"blur": _blurred, "darkness": _darkened, "noise": _noisy}

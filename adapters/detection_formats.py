@@ -1,0 +1,255 @@
+"""Detections as other tools write them: COCO results and YOLO text, beside OVAD's JSON."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.detections import (
+    MAX_BOXES_A_FRAME,
+    MAX_BYTES,
+    MAX_FRAMES,
+    DetectionFrame,
+    DetectionLog,
+    read_detections,
+)
+from worldstate.checks import in_range
+from worldstate.errors import InputFileError, InvalidArgumentError
+
+# The road users among COCO's categories, by the number that results files carry, and by their place in the
+# list of eighty names that YOLO text counts through.
+COCO_CATEGORIES: Mapping[int, str] = {
+    1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 7: "train", 8: "truck",
+}  # fmt: skip
+YOLO_CLASSES: Mapping[int, str] = {
+    0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck",
+}  # fmt: skip
+_FRAME_NUMBER = re.compile(r"(\d{1,9})\.txt$", re.ASCII)
+
+Row = tuple[tuple[float, float, float, float], float, str]
+
+
+def read_any_detections(
+    path: str | Path, frame_rate_hz: float = 10.0, size_px: tuple[int, int] | None = None
+) -> DetectionLog:
+    """Read detections of whichever form stands at `path`.
+
+    A folder holds YOLO text, a JSON list COCO results, a JSON object OVAD's detections per frame.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder.
+    frame_rate_hz : float
+        Frames a second, where the frames carry no stamp.
+    size_px : tuple of int, optional
+        Width and height of the image, which YOLO text is relative to.
+
+    Raises
+    ------
+    InputFileError
+        As the reader of that form, or if YOLO text is read without a size.
+    """
+    name = Path(path)
+    if name.is_dir():
+        if size_px is None:
+            raise InputFileError(name, "expected the size of the image beside YOLO text")
+        return read_yolo_text(name, size_px, frame_rate_hz)
+    try:
+        with name.open("rb") as file:
+            first = file.read(64).lstrip()[:1]
+    except OSError as error:
+        raise InputFileError(name, f"expected a detections file ({error.strerror})") from error
+    reader = read_coco_results if first == b"[" else read_detections
+    return reader(name, frame_rate_hz)
+
+
+def read_coco_results(
+    path: str | Path,
+    frame_rate_hz: float = 10.0,
+    categories: Mapping[int, str] = COCO_CATEGORIES,
+    first_image: int = 0,
+    frames: int | None = None,
+) -> DetectionLog:
+    """Read a COCO results file: ``[{"image_id", "category_id", "bbox": [x, y, w, h], "score"}, ...]``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; at most 64 MiB.
+    frame_rate_hz : float
+        Image `first_image` + i shows the time i / rate.
+    categories : mapping of int to str
+        Names of the numbers; others are called by their number.
+    first_image : int
+        `image_id` of the first frame.
+    frames : int, optional
+        How many there are; such a file says nothing of images without boxes, so those after the last box are
+        only counted where this is given.
+
+    Raises
+    ------
+    InputFileError
+        If it is missing, too large, no such list, or a number is out of range.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "results.json"
+    ...     _ = name.write_text('[{"image_id": 2, "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}]')
+    ...     log = read_coco_results(name, frames=4)
+    >>> [(frame.labels, frame.boxes_px.tolist()) for frame in log.frames[2:]]
+    [(('car',), [[1.0, 2.0, 4.0, 6.0]]), ((), [])]
+    """
+    name = Path(path)
+    found = _decoded(name)
+    if not isinstance(found, list) or len(found) > MAX_FRAMES * 10:
+        raise InputFileError(name, "expected a list of COCO results")
+    rows: dict[int, list[Row]] = {}
+    for i, item in enumerate(found):
+        try:
+            number, row = _coco_row(item, categories)
+            rows.setdefault(number - first_image, []).append(row)
+        except InvalidArgumentError as error:
+            raise InputFileError(name, f"result {i}: {error}") from error
+    return _log(name, rows, frames, frame_rate_hz)
+
+
+def read_yolo_text(
+    path: str | Path,
+    size_px: tuple[int, int],
+    frame_rate_hz: float = 10.0,
+    classes: Mapping[int, str] = YOLO_CLASSES,
+    first_image: int = 0,
+    frames: int | None = None,
+) -> DetectionLog:
+    """Read a folder of YOLO text: ``street_17.txt`` with lines ``class x y w h [score]`` in parts of the image.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder; the number before ``.txt`` is that of the frame. A frame without a file has no boxes.
+    size_px : tuple of int
+        Width and height of the image.
+    frame_rate_hz, first_image, frames
+        As for `read_coco_results`.
+    classes : mapping of int to str
+        Names of the numbers; others are called by their number.
+
+    Raises
+    ------
+    InputFileError
+        If there is no such file, one is too large, or a line is none of these.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / "street_0.txt").write_text("2 0.5 0.5 0.2 0.4 0.9")
+    ...     read_yolo_text(folder, (100, 50)).frames[0].boxes_px.tolist()
+    [[40.0, 15.0, 60.0, 35.0]]
+    """
+    folder = Path(path)
+    numbered = [(file, match) for file in folder.glob("*.txt") if (match := _FRAME_NUMBER.search(file.name))]
+    if not numbered or len(numbered) > MAX_FRAMES:
+        problem = f"expected 1 to {MAX_FRAMES} files that end in a frame number and .txt, got {len(numbered)}"
+        raise InputFileError(folder, problem)
+    rows: dict[int, list[Row]] = {}
+    for file, match in numbered:
+        number = int(match.group(1)) - first_image
+        if number in rows:
+            raise InputFileError(file, "expected every frame once, another file has the same number")
+        rows[number] = _yolo_rows(file, size_px, classes)
+    return _log(folder, rows, frames, frame_rate_hz)
+
+
+def _decoded(path: Path) -> Any:
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputFileError(path, f"expected a detections file ({error.strerror})") from error
+    if len(text) > MAX_BYTES:
+        raise InputFileError(path, f"expected a detections file of at most {MAX_BYTES} bytes")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputFileError(path, f"expected JSON, it does not parse: {error}") from error
+
+
+def _coco_row(item: Any, categories: Mapping[int, str]) -> tuple[int, Row]:
+    if not isinstance(item, dict):
+        raise InvalidArgumentError("expected an object")
+    image, category = item.get("image_id"), item.get("category_id")
+    if type(image) is not int or type(category) is not int:
+        raise InvalidArgumentError("image_id, category_id: expected integers")
+    box = item.get("bbox")
+    if not isinstance(box, list) or len(box) != 4:
+        raise InvalidArgumentError("bbox: expected four numbers, x y w h")
+    left, top, width, height = (_number("bbox", value) for value in box)
+    if width < 0.0 or height < 0.0:
+        raise InvalidArgumentError("bbox: expected a width and a height >= 0")
+    score = in_range("score", _number("score", item.get("score")), 0.0, 1.0)
+    label = categories.get(category, str(category))
+    return image, ((left, top, left + width, top + height), score, label)
+
+
+def _yolo_rows(path: Path, size_px: tuple[int, int], classes: Mapping[int, str]) -> list[Row]:
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+        if len(text) > MAX_BYTES:
+            raise InputFileError(path, f"expected a text file of at most {MAX_BYTES} bytes")
+        lines = text.decode("utf-8").splitlines()
+        return [_yolo_row(line, size_px, classes) for line in lines if line.strip()]
+    except OSError as error:
+        raise InputFileError(path, f"expected a text file ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, "expected text in UTF-8") from error
+    except InvalidArgumentError as error:
+        raise InputFileError(path, str(error)) from error
+
+
+def _yolo_row(line: str, size_px: tuple[int, int], classes: Mapping[int, str]) -> Row:
+    words = line.split()
+    if len(words) not in (5, 6) or not (words[0].isascii() and words[0].isdecimal() and len(words[0]) < 6):
+        raise InvalidArgumentError(f"expected class x y w h [score], got {line!r:.60}")
+    x, y, width, height, score = (_number("line", _float(word)) for word in [*words[1:], "1"][:5])
+    if min(width, height) < 0.0:
+        raise InvalidArgumentError(f"expected a width and a height >= 0, got {line!r:.60}")
+    centre, half = (x * size_px[0], y * size_px[1]), (width * size_px[0] / 2, height * size_px[1] / 2)
+    box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
+    return box, in_range("score", score, 0.0, 1.0), classes.get(int(words[0]), words[0])
+
+
+def _float(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError as error:
+        raise InvalidArgumentError(f"expected a number, got {word!r:.40}") from error
+
+
+def _number(name: str, value: Any) -> float:
+    if type(value) not in (int, float) or not abs(value) < 1e9 or not math.isfinite(value):
+        raise InvalidArgumentError(f"{name}: expected a finite number, got {value!r:.40}")
+    return float(value)
+
+
+def _log(path: Path, rows: Mapping[int, list[Row]], frames: int | None, frame_rate_hz: float) -> DetectionLog:
+    count = max(rows, default=-1) + 1 if frames is None else frames
+    if count > MAX_FRAMES or any(not 0 <= number < count for number in rows):
+        raise InputFileError(path, f"expected frame numbers from 0 to {min(count, MAX_FRAMES) - 1}")
+    if max(map(len, rows.values()), default=0) > MAX_BOXES_A_FRAME:
+        raise InputFileError(path, f"expected at most {MAX_BOXES_A_FRAME} boxes a frame")
+    found = [_frame(rows.get(number, [])) for number in range(count)]
+    return DetectionLog.at_rate(found, frame_rate_hz, source=str(path))
+
+
+def _frame(rows: list[Row]) -> DetectionFrame:
+    boxes = np.array([row[0] for row in rows], dtype=np.float64).reshape(-1, 4)
+    return DetectionFrame(boxes, np.array([row[1] for row in rows]), tuple(row[2] for row in rows))

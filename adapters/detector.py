@@ -1,0 +1,78 @@
+"""What a detector must offer, and how well its boxes fit others."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.detections import DetectionFrame
+
+
+class Detector(Protocol):
+    """Finds objects in frames, given in the order of time.
+
+    A detector may keep a state, as one of motion must; a new one is made for every video.
+
+    Examples
+    --------
+    >>> class Blind:
+    ...     def detect(self, frame): return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    >>> detector: Detector = Blind()
+    >>> len(detector.detect(np.zeros((4, 4, 3), dtype=np.uint8)))
+    0
+    """
+
+    def detect(self, frame: NDArray[np.uint8], /) -> DetectionFrame:
+        """Return boxes in pixels, scores in [0, 1] and labels of a frame (height, width, 3), blue first."""
+        ...
+
+
+def overlaps(boxes_px: NDArray[np.float64], others_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    r"""Return the intersection over union of every box with every other one.
+
+    .. math:: IoU = |A \cap B| / |A \cup B|
+
+    Parameters
+    ----------
+    boxes_px, others_px : ndarray, shapes (n, 4) and (m, 4)
+        Left, top, right, bottom.
+
+    Returns
+    -------
+    ndarray, shape (n, m)
+        In [0, 1]; 0 where both are empty.
+
+    Examples
+    --------
+    >>> overlaps(np.array([[0.0, 0.0, 2.0, 2.0]]), np.array([[1.0, 0.0, 3.0, 2.0]])).round(3)
+    array([[0.333]])
+    """
+    low = np.maximum(boxes_px[:, None, :2], others_px[None, :, :2])
+    high = np.minimum(boxes_px[:, None, 2:], others_px[None, :, 2:])
+    common = np.clip(high - low, 0.0, None).prod(axis=2)
+    union = _areas(boxes_px)[:, None] + _areas(others_px)[None, :] - common
+    return np.asarray(np.divide(common, union, out=np.zeros_like(common), where=union > 0))
+
+
+def suppress(
+    boxes_px: NDArray[np.float64], scores: NDArray[np.float64], most_overlap: float
+) -> NDArray[np.int64]:
+    """Return the indices of boxes that no better one overlaps by more, the best first.
+
+    Examples
+    --------
+    >>> boxes = np.array([[0.0, 0.0, 2.0, 2.0], [0.1, 0.0, 2.0, 2.0], [5.0, 5.0, 6.0, 6.0]])
+    >>> suppress(boxes, np.array([0.5, 0.9, 0.4]), most_overlap=0.5)
+    array([1, 2])
+    """
+    left = np.argsort(-scores, kind="stable")
+    kept = []
+    while left.size:
+        kept.append(left[0])
+        rest = left[1:]
+        left = rest[overlaps(boxes_px[left[:1]], boxes_px[rest])[0] <= most_overlap]
+    return np.array(kept, dtype=np.int64)
+
+
+def _areas(boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.clip(boxes_px[:, 2:] - boxes_px[:, :2], 0.0, None).prod(axis=1))

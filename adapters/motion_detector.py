@@ -1,0 +1,145 @@
+"""A detector of whatever moves before a standing camera, by background subtraction."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.detections import DetectionFrame
+from worldstate.adapters.vision_extra import opencv
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+Background = Literal["mog2", "knn"]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSettings:
+    """What counts as a moving object.
+
+    Parameters
+    ----------
+    background : {"mog2", "knn"}
+        Model of the background: Gaussian mixtures or nearest neighbours, both OpenCV's.
+    width_px : int
+        Frames are reduced to this width first.
+    history : int
+        Frames that the background remembers.
+    warm_up : int
+        First frames, in which nothing is reported.
+    min_area : float
+        Smallest object as a share of the image, in (0, 1).
+    max_area : float
+        Larger regions are changes of the light.
+    label : str
+        Motion knows no classes: everything is called this.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> MotionSettings(label="road user").background
+    'mog2'
+    """
+
+    background: Background = "mog2"
+    width_px: int = 640
+    history: int = 100
+    warm_up: int = 5
+    min_area: float = 0.0015
+    max_area: float = 0.6
+    label: str = "car"
+
+    def __post_init__(self) -> None:
+        if self.background not in get_args(Background):
+            raise InvalidArgumentError(f"background: expected mog2 or knn, got {self.background!r:.40}")
+        in_range("width_px", self.width_px, 16, 8192)
+        in_range("history", self.history, 1, 100_000)
+        in_range("warm_up", self.warm_up, 0, 100_000)
+        in_range("min_area", self.min_area, 0.0, self.max_area, open_low=True)
+        in_range("max_area", self.max_area, 0.0, 1.0)
+
+
+class MotionDetector:
+    """Finds moving objects in the frames of a standing camera.
+
+    Parameters
+    ----------
+    settings : MotionSettings, optional
+        What counts.
+
+    Raises
+    ------
+    MissingExtraError
+        If OpenCV is not installed.
+
+    Examples
+    --------
+    >>> detector = MotionDetector(MotionSettings(width_px=64, warm_up=2))
+    >>> street = np.random.default_rng(0).integers(90, 110, (48, 64, 3)).astype(np.uint8)
+    >>> for _ in range(10): empty = detector.detect(street)
+    >>> street[20:40, 10:30] = 220
+    >>> len(empty), detector.detect(street).boxes_px.tolist()
+    (0, [[10.0, 20.0, 30.0, 40.0]])
+    """
+
+    def __init__(self, settings: MotionSettings | None = None) -> None:
+        self.settings = settings or MotionSettings()
+        self._cv2 = opencv()
+        self._background = self._make_background()
+        self._seen = 0
+
+    def detect(self, frame: NDArray[np.uint8], /) -> DetectionFrame:
+        """Return what moves; the score is the share of its box that does.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the frame is no image of uint8.
+        """
+        if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or not frame.size:
+            raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
+        height, width = frame.shape[:2]
+        small = self._reduced(frame)
+        mask = self._moving(small)
+        self._seen += 1
+        if self._seen <= self.settings.warm_up:
+            return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+        scale = np.array([width, height] * 2) / np.array([small.shape[1], small.shape[0]] * 2)
+        return self._objects(mask, scale)
+
+    def _make_background(self) -> Any:
+        chosen = self.settings
+        if chosen.background == "knn":
+            return self._cv2.createBackgroundSubtractorKNN(chosen.history, detectShadows=False)
+        return self._cv2.createBackgroundSubtractorMOG2(chosen.history, detectShadows=False)
+
+    def _reduced(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        height, width = frame.shape[:2]
+        if width <= self.settings.width_px:
+            return frame
+        size = (self.settings.width_px, max(round(height * self.settings.width_px / width), 1))
+        reduced: NDArray[np.uint8] = self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
+        return reduced
+
+    def _moving(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Mask of what moves: specks removed, parts of one object joined."""
+        mask = self._background.apply(frame)
+        speck = np.ones((3, 3), dtype=np.uint8)
+        joint = np.ones((frame.shape[1] // 80 * 2 + 1,) * 2, dtype=np.uint8)
+        mask = self._cv2.morphologyEx(mask, self._cv2.MORPH_OPEN, speck)
+        joined: NDArray[np.uint8] = self._cv2.morphologyEx(mask, self._cv2.MORPH_CLOSE, joint)
+        return joined
+
+    def _objects(self, mask: NDArray[np.uint8], scale: NDArray[np.float64]) -> DetectionFrame:
+        _, _, stats, _ = self._cv2.connectedComponentsWithStats(mask, connectivity=8)
+        left, top, width, height, area = stats[1:].T.astype(np.float64)
+        share = area / mask.size
+        kept = (share >= self.settings.min_area) & (share <= self.settings.max_area)
+        boxes = np.stack([left, top, left + width, top + height], axis=1)[kept] * scale
+        filled = (area / (width * height))[kept]
+        return DetectionFrame(boxes, filled, (self.settings.label,) * int(kept.sum()))

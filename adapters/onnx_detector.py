@@ -1,0 +1,226 @@
+"""A user's own detector: an ONNX model whose output is of YOLO's form."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.detections import MAX_BOXES_A_FRAME, DetectionFrame
+from worldstate.adapters.detector import suppress
+from worldstate.adapters.vision_extra import opencv
+from worldstate.checks import in_range
+from worldstate.errors import InputFileError, InvalidArgumentError, MissingExtraError
+
+MAX_BYTES = 2 << 30
+# What a letterbox is filled up with.
+GREY = 114
+
+Floats = NDArray[np.float64]
+
+
+class Session(Protocol):
+    """What is used of an `onnxruntime.InferenceSession`."""
+
+    def get_inputs(self) -> Sequence[Any]:
+        """Descriptions of the inputs."""
+        ...
+
+    def run(self, output_names: None, feed: dict[str, NDArray[np.float32]], /) -> Sequence[Any]:
+        """All outputs."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class OnnxSettings:
+    """How the output of a model is read.
+
+    Parameters
+    ----------
+    labels : tuple of str
+        Names of the classes in the order of the model.
+    min_score : float
+        Lowest score that is reported.
+    most_overlap : float
+        Of two boxes that overlap by more, the better one is kept.
+    size_px : int
+        Side of the square that the model takes, where it does not say.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are no labels or a number is out of range.
+
+    Examples
+    --------
+    >>> OnnxSettings(labels=("car", "bicycle")).min_score
+    0.25
+    """
+
+    labels: tuple[str, ...]
+    min_score: float = 0.25
+    most_overlap: float = 0.5
+    size_px: int = 640
+
+    def __post_init__(self) -> None:
+        if not self.labels:
+            raise InvalidArgumentError("labels: expected at least one class name")
+        in_range("min_score", self.min_score, 0.0, 1.0)
+        in_range("most_overlap", self.most_overlap, 0.0, 1.0)
+        in_range("size_px", self.size_px, 1, 8192)
+
+
+class OnnxDetector:
+    """Runs an ONNX model of YOLO's form on frames.
+
+    The frame is fitted into a square, the rest filled with grey, and handed over as (1, 3, side, side), red
+    first, in [0, 1]. For the output see `decode_yolo`.
+
+    Parameters
+    ----------
+    session : Session
+        An open model; `open_onnx` opens one from a file.
+    settings : OnnxSettings
+        How its output is read.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the model does not take one image.
+    """
+
+    def __init__(self, session: Session, settings: OnnxSettings) -> None:
+        inputs = session.get_inputs()
+        if len(inputs) != 1 or len(inputs[0].shape) != 4:
+            raise InvalidArgumentError("model: expected one input of shape (1, 3, height, width)")
+        self.settings = settings
+        self._session = session
+        self._input = str(inputs[0].name)
+        self._size = tuple(
+            side if isinstance(side, int) and side > 0 else settings.size_px for side in inputs[0].shape[2:]
+        )
+
+    def detect(self, frame: NDArray[np.uint8], /) -> DetectionFrame:
+        """Return the model's boxes in pixels of the frame.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the frame is no colour image or the model's output is not of YOLO's form.
+        """
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise InvalidArgumentError(f"frame: expected a colour image, got {frame.dtype} {frame.shape}")
+        tensor, scale = self._letterbox(frame)
+        outputs = self._session.run(None, {self._input: tensor})
+        boxes, scores, classes = decode_yolo(outputs[0], len(self.settings.labels))
+        limits = np.array([frame.shape[1], frame.shape[0]] * 2, dtype=np.float64)
+        return self._best(np.clip(boxes / scale, 0.0, limits), scores, classes)
+
+    def _letterbox(self, frame: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
+        cv2 = opencv()
+        height, width = frame.shape[:2]
+        scale = min(self._size[0] / height, self._size[1] / width)
+        fitted = cv2.resize(frame, (max(round(width * scale), 1), max(round(height * scale), 1)))
+        square = np.full((*self._size, 3), GREY, dtype=np.uint8)
+        square[: fitted.shape[0], : fitted.shape[1]] = fitted
+        planes = np.ascontiguousarray(square[:, :, ::-1].transpose(2, 0, 1), dtype=np.float32)
+        return planes[None] / np.float32(255.0), scale
+
+    def _best(self, boxes: Floats, scores: Floats, classes: NDArray[np.int64]) -> DetectionFrame:
+        kept = np.flatnonzero(scores >= self.settings.min_score)
+        kept = kept[np.argsort(-scores[kept], kind="stable")][: 10 * MAX_BOXES_A_FRAME]
+        # Boxes of different classes never suppress each other: each class lies in a plane of its own.
+        planes = boxes[kept] + 1e5 * classes[kept, None]
+        kept = kept[suppress(planes, scores[kept], self.settings.most_overlap)][:MAX_BOXES_A_FRAME]
+        names = tuple(self.settings.labels[c] for c in classes[kept])
+        return DetectionFrame(boxes[kept], scores[kept], names)
+
+
+def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
+    """Open a model file with onnxruntime, on the processor.
+
+    Raises
+    ------
+    InputFileError
+        If it is missing, larger than 2 GiB, or no model that onnxruntime takes.
+    MissingExtraError
+        If onnxruntime is not installed.
+    """
+    name = Path(path)
+    try:
+        if name.stat().st_size > MAX_BYTES:
+            raise InputFileError(name, f"expected a model of at most {MAX_BYTES >> 30} GiB")
+    except OSError as error:
+        raise InputFileError(name, f"expected an ONNX model ({error.strerror})") from error
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MissingExtraError("onnxruntime", "onnx") from error
+    try:
+        session = onnxruntime.InferenceSession(str(name), providers=["CPUExecutionProvider"])
+        return OnnxDetector(session, settings)
+    except Exception as error:  # onnxruntime raises bare classes of its own
+        raise InputFileError(name, f"expected an ONNX detector, it does not open: {error}") from error
+
+
+def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    r"""Turn the raw output of a YOLO model into boxes.
+
+    Three forms are told apart by their shape, with C classes and n candidates: (1, 4 + C, n), centre and size
+    with a score a class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6), corners,
+    score and class, of a model that suppresses doubles itself. Six columns with one class are read as the
+    second.
+
+    Parameters
+    ----------
+    output : ndarray
+        As the model gives it.
+    classes : int
+        C.
+
+    Returns
+    -------
+    boxes, scores, classes : ndarray, shapes (n, 4), (n,), (n,)
+        Corners in pixels of the model's input; scores cut to [0, 1].
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, a class out of range, or numbers that are not finite.
+
+    Examples
+    --------
+    >>> one = np.array([[[50.0], [40.0], [20.0], [10.0], [0.1], [0.9]]])
+    >>> boxes, scores, labels = decode_yolo(one, classes=2)
+    >>> boxes.tolist(), scores.tolist(), labels.tolist()
+    ([[40.0, 35.0, 60.0, 45.0]], [0.9], [1])
+    """
+    array = np.asarray(output, dtype=np.float64)
+    if array.ndim != 3 or array.shape[0] != 1 or not np.isfinite(array).all():
+        raise InvalidArgumentError(f"output: expected finite numbers of shape (1, ., .), got {array.shape}")
+    rows, columns = array.shape[1:]
+    if columns == 5 + classes:
+        per_class = array[0, :, 5:] * array[0, :, 4:5]
+        return _from_centres(array[0, :, :4], per_class)
+    if rows == 4 + classes:
+        return _from_centres(array[0, :4].T, array[0, 4:].T)
+    if columns == 6:
+        return _from_corners(array[0], classes)
+    expected = f"(1, {4 + classes}, n), (1, n, {5 + classes}) or (1, n, 6)"
+    raise InvalidArgumentError(f"output: expected {expected} for {classes} classes, got {array.shape}")
+
+
+def _from_centres(centres: Floats, per_class: Floats) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    half = centres[:, 2:] / 2
+    boxes = np.concatenate([centres[:, :2] - half, centres[:, :2] + half], axis=1)
+    best = per_class.argmax(axis=1)
+    return boxes, np.clip(per_class.max(axis=1), 0.0, 1.0), best.astype(np.int64)
+
+
+def _from_corners(rows: Floats, classes: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    found = rows[:, 5].astype(np.int64)
+    if ((found < 0) | (found >= classes)).any():
+        raise InvalidArgumentError(f"output: expected classes 0 to {classes - 1}")
+    return rows[:, :4], np.clip(rows[:, 4], 0.0, 1.0), found

@@ -1,0 +1,101 @@
+"""Frames of a video file."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.detections import MAX_FRAMES
+from worldstate.adapters.vision_extra import opencv
+from worldstate.errors import InputFileError
+
+# OVAD's name for the video beside a recording's sound.
+VIDEO_NAME = "ueye_stereo_vid.mp4"
+MAX_SIDE_PX = 8192
+
+Frame = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Video:
+    """A video file that was opened once and found readable.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    width_px, height_px : int
+        Size of a frame.
+    frame_rate_hz : float
+        As the file says.
+    count : int
+        Frames, as the file says; the truth is what `frames` yields.
+    """
+
+    path: Path
+    width_px: int
+    height_px: int
+    frame_rate_hz: float
+    count: int
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield frames of shape (height, width, 3), uint8, blue first, from the beginning.
+
+        Raises
+        ------
+        InputFileError
+            If no frame can be decoded or there are more than 100,000.
+        """
+        capture = _open(self.path)
+        number = 0
+        try:
+            while True:
+                found, frame = capture.read()
+                if not found:
+                    break
+                number += 1
+                if number > MAX_FRAMES:
+                    raise InputFileError(self.path, f"expected a video of at most {MAX_FRAMES} frames")
+                yield frame
+        finally:
+            capture.release()
+        if not number:
+            raise InputFileError(self.path, "expected a video, no frame of it can be decoded")
+
+
+def open_video(path: str | Path) -> Video:
+    """Open a video file.
+
+    Raises
+    ------
+    InputFileError
+        If it is missing, no video, or its frames are larger than 8192 px.
+    MissingExtraError
+        If OpenCV is not installed.
+    """
+    name = Path(path)
+    capture = _open(name)
+    try:
+        cv2 = opencv()
+        width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        rate, count = (float(capture.get(p)) for p in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
+    finally:
+        capture.release()
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
+        raise InputFileError(name, f"expected frames of at most {MAX_SIDE_PX} px, got {width} x {height}")
+    if not 0.0 < rate <= 1000.0:
+        raise InputFileError(name, f"expected a frame rate up to 1000 Hz, got {rate}")
+    return Video(name, width, height, rate, max(int(count), 0))
+
+
+def _open(path: Path) -> Any:
+    if not path.is_file():
+        raise InputFileError(path, "expected a video file, nothing is there")
+    capture = opencv().VideoCapture(str(path))
+    if not capture.isOpened():
+        capture.release()
+        raise InputFileError(path, "expected a video file, it cannot be opened as one")
+    return capture

@@ -1,0 +1,150 @@
+"""`worldstate measure-absence`: the miss rate of a camera's detector on staged-degraded frames."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.output import print_summary
+from worldstate.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.adapters.miss_rates import MissRates
+    from worldstate.evaluation.absence import MakeDetector, Scene
+
+DESCRIPTION = """\
+Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
+blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
+detector has to find the reference boxes again (IoU >= 0.3). False detections are counted apart, as clutter.
+
+INPUT is a video, or a data set or recording folder in the OVAD layout with ueye_stereo_vid.mp4 beside the
+sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON or a folder of
+YOLO text. Without any, what the detector itself reports on clean frames is the reference, and its miss rate
+on those is zero by definition.
+
+The file also holds the scale by which d is read from this camera's own images."""
+
+EXAMPLE = """\
+examples:
+  worldstate measure-absence sim --detector motion --out beta.json --figure beta.png
+  worldstate measure-absence street.mp4 --reference boxes.json --detector onnx --onnx-model m.onnx \\
+      --labels person bicycle car --out beta.json"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "measure-absence",
+        help="measure how often a camera's detector misses what is there",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
+    parser.add_argument("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
+    parser.add_argument(
+        "--detector", choices=("motion", "knn", "onnx"), default="motion",
+        help="background subtraction by mixtures or neighbours, or a model (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--onnx-model", type=Path, metavar="ONNX", help="model in YOLO's output form")
+    parser.add_argument("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of the model")
+    parser.add_argument(
+        "--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)"
+    )
+    parser.add_argument("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
+    parser.add_argument("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
+    parser.add_argument("--out", type=Path, required=True, metavar="JSON", help="exactly this file")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw beta over d")
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    import numpy as np
+
+    from worldstate.adapters.miss_rates import save_miss_rates
+    from worldstate.evaluation.absence import AbsenceSettings, measure_absence, passes
+    from worldstate.evaluation.absence_figure import write_absence_figure
+    from worldstate.evaluation.absence_input import find_videos
+
+    make, settings = _maker(arguments), AbsenceSettings()
+    scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
+    with progress_bar("measuring", passes(len(scenes), settings)) as bar:
+        rates = measure_absence(
+            scenes,
+            make,
+            np.random.default_rng(arguments.seed),
+            settings,
+            provenance=_provenance(arguments, len(scenes)),
+            on_video=bar.advance,
+        )
+    save_miss_rates(arguments.out, rates)
+    if arguments.figure is not None:
+        write_absence_figure(rates, arguments.figure)
+    print_summary(_summary(arguments, rates), as_json=arguments.json)
+    return 0
+
+
+def _maker(arguments: argparse.Namespace) -> "MakeDetector":
+    from worldstate.adapters.motion_detector import MotionDetector, MotionSettings
+    from worldstate.adapters.onnx_detector import OnnxSettings, open_onnx
+    from worldstate.errors import InvalidArgumentError
+
+    if arguments.detector == "onnx":
+        if arguments.onnx_model is None:
+            raise InvalidArgumentError("--onnx-model: expected a model for --detector onnx")
+        model = open_onnx(arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
+        return lambda: model
+    settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
+    return lambda: MotionDetector(settings)
+
+
+def _scene(
+    arguments: argparse.Namespace, make: "MakeDetector", path: Path, reference: Path | None
+) -> "Scene":
+    from dataclasses import replace
+    from math import radians
+
+    from worldstate.adapters.camera import PinholeCamera
+    from worldstate.adapters.detection_formats import read_any_detections
+    from worldstate.adapters.video import open_video
+    from worldstate.evaluation.absence import Scene, reference_by
+
+    video = open_video(path)
+    camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
+    if arguments.half_angle is not None:
+        camera = replace(camera, half_angle_rad=radians(arguments.half_angle))
+    boxes = arguments.reference or reference
+    if boxes is None:
+        return Scene(video, reference_by(make(), video), camera)
+    size = (video.width_px, video.height_px)
+    return Scene(video, read_any_detections(boxes, video.frame_rate_hz, size), camera)
+
+
+def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
+    from importlib.metadata import version
+
+    model = "" if arguments.onnx_model is None else f" {arguments.onnx_model.name}"
+    return {
+        "data": arguments.input.name,
+        "videos": str(videos),
+        "detector": arguments.detector + model,
+        "seed": str(arguments.seed),
+        "worldstate": version("worldstate"),
+    }
+
+
+def _summary(arguments: argparse.Namespace, rates: "MissRates") -> dict[str, object]:
+    table = rates.table
+    summary: dict[str, object] = {
+        "out": str(arguments.out),
+        **rates.provenance,
+        "looks": sum(sum(row[:1]) for row in next(iter(rates.families.values())).looks),
+        "beta_clean_boresight": table(0.0, 0.0),
+        "beta_harshest_boresight": table(0.0, 1.0),
+        "clutter_clean": rates.clutter_rate(0.0),
+    }
+    for name, family in rates.tables.items():
+        summary[f"beta_{name}_boresight"] = list(family.beta[0])
+        summary[f"beta_{name}_edge"] = list(family.beta[-1])
+    return summary

@@ -1,0 +1,44 @@
+"""Videos to measure absence on, with the boxes that belong to them."""
+
+from pathlib import Path
+
+from worldstate.adapters.ovad import LOG_NAME, OvadDataset, Recording
+from worldstate.adapters.video import VIDEO_NAME
+from worldstate.errors import InputFileError
+
+
+def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:
+    """Return videos with the files of their reference boxes, None for a video that stands alone.
+
+    Of a data set the recordings with a vehicle count that have both.
+
+    Parameters
+    ----------
+    path : Path
+        Video, recording folder or data set.
+    most : int, optional
+        Of a data set take the first so many.
+
+    Raises
+    ------
+    InputFileError
+        If nothing stands there, or no recording has a video and detections.
+    """
+    if path.is_file():
+        return [(path, None)]
+    if not path.is_dir():
+        raise InputFileError(path, "expected a video, a recording folder or a data set")
+    if not (path / LOG_NAME).is_file():
+        return [_of_recording(Recording.open(path))]
+    approaches = [r for r in OvadDataset(path).recordings if r.label != "none"]
+    found = [_of_recording(r) for r in approaches if (r.path / VIDEO_NAME).is_file() and r.detections_path]
+    if not found:
+        raise InputFileError(path, f"expected recordings of a vehicle with {VIDEO_NAME} and detections")
+    return found[:most]
+
+
+def _of_recording(recording: Recording) -> tuple[Path, Path | None]:
+    video = recording.path / VIDEO_NAME
+    if not video.is_file():
+        raise InputFileError(recording.path, f"expected a recording with {VIDEO_NAME}")
+    return video, recording.detections_path
