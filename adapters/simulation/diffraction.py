@@ -1,13 +1,13 @@
 """Screen attenuation behind a corner: Maekawa's chart as Kurze and Anderson put it into a formula."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 SPEED_OF_SOUND_MPS = 343.0
 
 
 def screen_attenuation_db(
-    detour_m: NDArray[np.floating], frequency_hz: NDArray[np.floating], cap_db: float = 40.0
+    detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: float = 40.0
 ) -> NDArray[np.float64]:
     r"""Attenuation by a thin screen beyond spherical spreading.
 
@@ -18,9 +18,9 @@ def screen_attenuation_db(
 
     Parameters
     ----------
-    detour_m : ndarray
+    detour_m : array_like
         Path round the edge minus straight path, m; negative where the receiver sees the source.
-    frequency_hz : ndarray
+    frequency_hz : array_like
         Broadcast against `detour_m`.
     cap_db : float
         Largest attenuation: scattering and turbulence fill the deepest shadow.
@@ -39,10 +39,10 @@ def screen_attenuation_db(
     >>> screen_attenuation_db(np.array([0.0, 1.0, -1.0]), np.array(1000.0)).round(1)
     array([ 5. , 20.6,  0. ])
     """
-    fresnel = 2.0 * np.asarray(detour_m) * frequency_hz / SPEED_OF_SOUND_MPS
+    fresnel = 2.0 * np.asarray(detour_m) * np.asarray(frequency_hz) / SPEED_OF_SOUND_MPS
     root = np.sqrt(2.0 * np.pi * np.maximum(np.abs(fresnel), 1e-9))
     shadow = 20.0 * np.log10(root / np.tanh(root))
     # tan is only needed down to N = -0.2; clipping keeps its argument far from the pole.
     light = 20.0 * np.log10(root / np.tan(np.minimum(root, 1.2)))
     attenuation = 5.0 + np.where(fresnel >= 0.0, shadow, np.where(root < 1.2, light, -5.0))
-    return np.clip(attenuation, 0.0, cap_db)
+    return np.asarray(np.clip(attenuation, 0.0, cap_db))
