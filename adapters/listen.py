@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from worldstate.abduction.any_signature import AnySignature
 from worldstate.abduction.cueing import CueingPolicy
-from worldstate.abduction.signature import SignatureModel
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.array_xml import read_array_xml
 from worldstate.adapters.audio import open_audio
@@ -37,7 +37,7 @@ class Source:
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
         What the camera reported; None counts as not asked.
-    model : SignatureModel
+    model : SignatureModel or EnsembleModel
         From features to likelihoods.
     policy : CueingPolicy
         Threshold, sustained rule and risk map.
@@ -50,7 +50,7 @@ class Source:
     audio_path: Path
     array: MicrophoneArray
     detections: DetectionLog | None
-    model: SignatureModel
+    model: AnySignature
     policy: CueingPolicy
     context: Context
     t0_s: float | None = None

@@ -7,15 +7,15 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
+from worldstate.abduction.any_signature import AnySignature, signature_from_dict
 from worldstate.abduction.cueing import CueingPolicies, CueingPolicy
 from worldstate.abduction.schema import check_schema, read_number, schema_stamp
-from worldstate.abduction.signature import SignatureModel
 from worldstate.adapters.atomic import write_text
 from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.state.reading import decode_json
 
 SCHEMA = "worldstate.Model"
-VERSION = "1.0.0"
+VERSION = "1.1.0"
 MAX_BYTES = 16 << 20
 MOST_POLICIES = 1000
 MOST_NAMES = 1_000_000
@@ -66,7 +66,7 @@ class Model:
 
     Parameters
     ----------
-    signature : SignatureModel
+    signature : SignatureModel or EnsembleModel
         From features to likelihoods.
     policies : CueingPolicies
         Threshold, sustained rule and risk map for each budget.
@@ -74,12 +74,12 @@ class Model:
         Where it comes from.
     """
 
-    signature: SignatureModel
+    signature: AnySignature
     policies: CueingPolicies
     provenance: Provenance
 
 
-def load_model(path: str | Path | None = None) -> tuple[SignatureModel, CueingPolicies]:
+def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPolicies]:
     """Read what inference needs; without a path, of the model that ships with the package.
 
     Raises
@@ -157,7 +157,7 @@ def model_from_dict(data: object, source: object) -> Model:
     try:
         policies = _list(fields.get("policies"), "policies", MOST_POLICIES)
         return Model(
-            SignatureModel.from_dict(fields.get("signature")),
+            signature_from_dict(fields.get("signature")),
             CueingPolicies(tuple(CueingPolicy.from_dict(policy) for policy in policies)),
             _provenance(_mapping(fields.get("provenance"), "provenance")),
         )

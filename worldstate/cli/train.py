@@ -7,9 +7,12 @@ from worldstate.cli.output import print_summary
 from worldstate.cli.progress import progress_bar
 
 DESCRIPTION = """\
-Train the published signature classifier (standardise, linear SVC, left/right mirroring) on labelled feature
-windows, and set its thresholds gamma(alpha) and risk maps on scores of windows that it was not trained on
-(5-fold cross-validation by recording). The model file is JSON: coefficients, no rows of the data."""
+Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
+scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data.
+
+  --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
+  --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
+                       thresholds half-way between recordings left out and junctions left out"""
 
 EXAMPLE = """\
 example:
@@ -31,6 +34,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         choices=("static", "dynamic", "all"),
         default="static",
         help="standing ego, moving ego or both (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--method", choices=("baseline", "worldstate"), default="baseline", help="(default: %(default)s)"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     parser.add_argument(
@@ -57,7 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     table = read_features(arguments.table).group(arguments.group)
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
-    settings = TrainingSettings(seed=arguments.seed, sustain_hops=arguments.sustain_hops)
+    settings = TrainingSettings(
+        seed=arguments.seed, sustain_hops=arguments.sustain_hops, method=arguments.method
+    )
     with progress_bar("training", settings.steps) as bar:
         model = train_model(
             kept,

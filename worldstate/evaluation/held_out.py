@@ -2,16 +2,20 @@
 
 import numpy as np
 
+from worldstate.abduction.ensemble import EnsembleModel
 from worldstate.adapters.feature_table import FeatureTable
 from worldstate.adapters.model_file import Model
 from worldstate.errors import InvalidArgumentError
 
 from .calibration import MISS_RATES, WindowCalibration
 from .features import Predictions, predict_with
+from .site_references import with_site_references
 
 
 def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[float, Predictions]:
     """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does.
+
+    A model that compares windows with their site is given the reference from the site's other recordings.
 
     Raises
     ------
@@ -19,7 +23,9 @@ def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[fl
         If a recording was in the training set, or the model was not calibrated for `alpha`.
     """
     check_unseen(model, table)
-    probabilities = model.signature.predict_proba(table.features)
+    compares = isinstance(model.signature, EnsembleModel)
+    inputs = with_site_references(table).features if compares else table.features
+    probabilities = model.signature.predict_proba(inputs)
     predictions = {}
     for miss_rate in MISS_RATES:
         policy = model.policies.for_alpha(alpha, miss_rate)

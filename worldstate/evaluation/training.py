@@ -3,23 +3,38 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.abduction.any_signature import AnySignature
 from worldstate.abduction.cueing import CueingPolicies, CueingPolicy
-from worldstate.abduction.signature import SignatureModel, hazard_statistic
+from worldstate.abduction.ensemble_training import RECIPES, SiteEnsembleClassifier
+from worldstate.abduction.risk_map import fit_isotonic, fit_platt
+from worldstate.abduction.signature import hazard_statistic
 from worldstate.abduction.signature_training import PublishedClassifier
 from worldstate.adapters.feature_table import FeatureTable, Group
 from worldstate.adapters.model_file import Model, Provenance
 
-from .calibration import ABSENT_MISS_RATE, MISS_RATES, PUBLISHED_MISS_RATE, calibrate_windows
-from .features import out_of_fold
+from .calibration import (
+    ABSENT_MISS_RATE,
+    MISS_RATES,
+    PUBLISHED_MISS_RATE,
+    WindowCalibration,
+    between,
+    calibrate_windows,
+)
+from .features import MakeClassifier, out_of_fold
+from .methods import site_ensemble
 from .metrics import auroc
-from .splits import N_FOLDS, recording_folds
+from .site_references import with_site_references
+from .splits import N_FOLDS, junction_folds, recording_folds
 
 ALPHAS = (0.01, 0.02, 0.05)
 CLASSIFIER = "standardise, linear SVC C=1, left/right mirroring, sigmoid per pair, pairwise coupling"
+ENSEMBLE = "softmax regressions, all classes mirrored: " + ", ".join(f"{r.view} {r.ridge:g}" for r in RECIPES)
+TrainingMethod = Literal["baseline", "worldstate"]
 
 Numbers = NDArray[np.float64]
 
@@ -38,6 +53,9 @@ class TrainingSettings:
         k of the sustained rule. Single windows cannot tell it; the threshold keeps its budget at any k.
     alphas : tuple of float
         Budgets.
+    method : str
+        ``baseline``: as published; ``worldstate``: mirror-symmetric ensemble on windows compared with their
+        site, thresholds half-way between recordings left out and junctions left out.
 
     Examples
     --------
@@ -49,6 +67,7 @@ class TrainingSettings:
     repeats: int = 5
     sustain_hops: int = 3
     alphas: tuple[float, ...] = ALPHAS
+    method: TrainingMethod = "baseline"
 
     @property
     def steps(self) -> int:
@@ -65,7 +84,7 @@ def train_model(
     excluded_lists: Sequence[str] = (),
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
-    """Train the published classifier and calibrate its cueing.
+    """Train a classifier and calibrate its cueing.
 
     Parameters
     ----------
@@ -84,34 +103,44 @@ def train_model(
         If a class is missing or there are fewer recordings than folds.
     """
     rng = np.random.default_rng(settings.seed)
+    compares = settings.method == "worldstate"
+    inputs = with_site_references(table) if compares else table
+    make: MakeClassifier = site_ensemble if compares else PublishedClassifier
     passes = []
     for _ in range(settings.repeats):
-        passes.append(out_of_fold(table, recording_folds(table, rng), PublishedClassifier, rng))
+        passes.append(out_of_fold(inputs, recording_folds(table, rng), make, rng))
         on_step()
-    signature = PublishedClassifier(rng).fit(table.features, table.labels).model_
+    levels = [passes]
+    if compares and len(np.unique(table.environments)) > 1:
+        levels.append([out_of_fold(inputs, junction_folds(table), make, rng)])
+    signature = _trained(inputs, rng, compares=compares)
     on_step()
     provenance = Provenance(
         dataset=dataset,
         group=group,
-        classifier=CLASSIFIER,
+        classifier=ENSEMBLE if compares else CLASSIFIER,
         scikit_learn=version("scikit-learn"),
         seed=settings.seed,
         training_recordings=tuple(np.unique(table.recording_keys).tolist()),
         excluded_lists=tuple(excluded_lists),
         figures=_figures(table, signature, passes),
     )
-    return Model(signature, _policies(table, signature, passes, settings), provenance)
+    return Model(signature, _policies(table, signature, levels, settings), provenance)
+
+
+def _trained(inputs: FeatureTable, rng: np.random.Generator, *, compares: bool) -> AnySignature:
+    if compares:
+        return SiteEnsembleClassifier().fit(inputs.features, inputs.labels).model_
+    return PublishedClassifier(rng).fit(inputs.features, inputs.labels).model_
 
 
 def _policies(
-    table: FeatureTable, signature: SignatureModel, passes: list[Numbers], settings: TrainingSettings
+    table: FeatureTable, signature: AnySignature, levels: list[list[Numbers]], settings: TrainingSettings
 ) -> CueingPolicies:
-    pooled = np.concatenate(passes)
-    hazards, hazard_free = (np.tile(flags, len(passes)) for flags in (table.hazards, table.hazard_free))
     policies = []
     for miss_rate in sorted(MISS_RATES):
         for alpha in settings.alphas:
-            learned = calibrate_windows(pooled, hazards, hazard_free, alpha=alpha, miss_rate=miss_rate)
+            learned = between([_calibrated(table, one, alpha, miss_rate, settings) for one in levels])
             policy = CueingPolicy(
                 gamma=learned.gamma,
                 sustain_hops=settings.sustain_hops,
@@ -124,7 +153,16 @@ def _policies(
     return CueingPolicies(tuple(policies))
 
 
-def _figures(table: FeatureTable, signature: SignatureModel, passes: list[Numbers]) -> dict[str, float]:
+def _calibrated(
+    table: FeatureTable, passes: list[Numbers], alpha: float, miss_rate: float, settings: TrainingSettings
+) -> WindowCalibration:
+    hazards, hazard_free = (np.tile(flags, len(passes)) for flags in (table.hazards, table.hazard_free))
+    fit_map = fit_platt if settings.method == "worldstate" else fit_isotonic
+    pooled = np.concatenate(passes)
+    return calibrate_windows(pooled, hazards, hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_map)
+
+
+def _figures(table: FeatureTable, signature: AnySignature, passes: list[Numbers]) -> dict[str, float]:
     """Out-of-fold figures, mean over the repeats."""
     scored = table.hazards | table.hazard_free
     classes = np.array(signature.classes)

@@ -1,0 +1,28 @@
+"""The signature models that a file may hold, told apart by their kind."""
+
+from collections.abc import Mapping
+
+from .ensemble import KIND, EnsembleModel
+from .signature import SignatureModel
+
+AnySignature = SignatureModel | EnsembleModel
+
+
+def signature_from_dict(data: object) -> AnySignature:
+    """Return the model that a `to_dict` wrote: an ensemble where it says so, else the published classifier.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If something is missing, of the wrong type or out of range.
+
+    Examples
+    --------
+    >>> signature_from_dict({"kind": "ensemble"})
+    Traceback (most recent call last):
+        ...
+    worldstate.errors.InvalidArgumentError: signature: expected an object of classes front, left, none, right
+    """
+    if isinstance(data, Mapping) and data.get("kind") == KIND:
+        return EnsembleModel.from_dict(data)
+    return SignatureModel.from_dict(data)
