@@ -13,6 +13,7 @@ from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.motion import MotionBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
+from worldstate.belief.trail import Heard, Trail
 from worldstate.errors import InvalidArgumentError
 from worldstate.memory import Memory
 from worldstate.state import ANSWERS, Priors, Record
@@ -20,7 +21,7 @@ from worldstate.state import ANSWERS, Priors, Record
 T = TypeVar("T")
 
 SCHEMA_NAME = "worldstate.Filter"
-SCHEMA_VERSION = "1.0.0"
+SCHEMA_VERSION = "2.0.0"
 
 
 def memory_to_dict(memory: Memory) -> dict[str, Any]:
@@ -28,6 +29,7 @@ def memory_to_dict(memory: Memory) -> dict[str, Any]:
     return {
         "stamp_ns": memory.stamp_ns,
         "log_explanations": list(memory.explanation.log_probabilities),
+        "trail": _trail_to_dict(memory.trail),
         "rule_run": memory.rule.run,
         "births": list(memory.births),
         "handover_ns": [{"stamp_ns": stamp_ns} for stamp_ns in memory.handover_ns],
@@ -53,6 +55,7 @@ def memory_from_record(record: Record, directions: tuple[str, ...], policy: Cuei
     return Memory(
         stamp_ns=record.integer("stamp_ns"),
         explanation=ExplanationBelief(directions, _sized(record, "log_explanations", 2 * k + 2)),
+        trail=_trail_from_record(record.record("trail"), directions),
         rule=SustainedRule(policy.sustain_hops, _counted(record, "rule_run", policy.sustain_hops)),
         births=_births(record, k),
         handover_ns=_handovers(record, k),
@@ -89,6 +92,36 @@ def policy_from_record(record: Record) -> CueingPolicy:
         return CueingPolicy.from_dict(record.raw)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InvalidArgumentError(f"{record.where}: expected a cueing policy ({error!r})") from error
+
+
+def _trail_to_dict(trail: Trail) -> dict[str, Any]:
+    return {
+        "beliefs": [
+            {"stamp_ns": stamp_ns, "log_explanations": list(belief.log_probabilities)}
+            for stamp_ns, belief in trail.beliefs
+        ],
+        "heard": [
+            {"source": h.source, "stamp_ns": h.stamp_ns, "log_likelihoods": list(h.log_likelihoods)}
+            for h in trail.heard
+        ],
+    }
+
+
+def _trail_from_record(record: Record, directions: tuple[str, ...]) -> Trail:
+    k = len(directions)
+    beliefs = tuple(
+        (item.integer("stamp_ns"), ExplanationBelief(directions, _sized(item, "log_explanations", 2 * k + 2)))
+        for item in record.records("beliefs")
+    )
+    if not beliefs:
+        raise InvalidArgumentError(f"{record.where}.beliefs: expected at least one")
+    return Trail(
+        beliefs,
+        tuple(
+            Heard(item.text("source"), item.integer("stamp_ns"), _sized(item, "log_likelihoods", k + 2))
+            for item in record.records("heard")
+        ),
+    )
 
 
 def _track_to_dict(track: Track) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from worldstate.abduction.cueing import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.track import Track
+from worldstate.belief.trail import Trail
 from worldstate.state import Context, Priors
 
 
@@ -20,6 +21,8 @@ class Memory:
         Time of the belief.
     explanation : ExplanationBelief
         Which explanation holds.
+    trail : Trail
+        Its past of one window.
     rule : SustainedRule
         Run of the statistic above its threshold.
     births : tuple of int
@@ -44,6 +47,7 @@ class Memory:
 
     stamp_ns: int
     explanation: ExplanationBelief
+    trail: Trail
     rule: SustainedRule
     births: tuple[int, ...]
     handover_ns: tuple[int | None, ...]
@@ -58,10 +62,11 @@ class Memory:
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:
     """Return the memory of a filter that has measured nothing."""
-    directions = context.directions
+    directions, explanation = context.directions, _first_explanation(context)
     return Memory(
         stamp_ns=start_ns,
-        explanation=_first_explanation(context),
+        explanation=explanation,
+        trail=Trail(((start_ns, explanation),)),
         rule=policy.rule(),
         births=(0,) * len(directions),
         handover_ns=(None,) * len(directions),

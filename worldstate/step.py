@@ -1,22 +1,25 @@
 """One step of the filter as pure functions: listen, watch, alert, renew."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing import CueingPolicy
 from worldstate.abduction.posterior import abduce
+from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.hearing import hear, hidden_share
 from worldstate.belief.lifecycle import renew_hidden
 from worldstate.belief.seeing import log_co_evidence, look, surviving
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side import Scene, Side
 from worldstate.belief.track import predict_track
+from worldstate.belief.trail import Heard
 from worldstate.measurement import Measurement
 from worldstate.memory import Memory, priors_of
 from worldstate.state import Context
-from worldstate.values import NANOSECONDS_PER_SECOND, seconds
+from worldstate.values import NANOSECONDS_PER_SECOND, nanoseconds, seconds
 
 # Sides whose probabilities differ by rounding only are equally likely.
 _TIE = 1e-9
@@ -33,7 +36,7 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """How much of a measurement is news: that of the sound, and that of the look, in [0, 1]."""
+    """How much of a measurement is news to the entities: of the sound, and of the look, in [0, 1]."""
 
     sound: float
     look: float
@@ -72,12 +75,21 @@ def advance(memory: Memory, stamp_ns: int, ground: Ground) -> Memory:
 
 def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
-    explanation, predicted = memory.explanation, priors_of(memory.explanation)
-    if weights.sound > 0.0:
-        answer = log_co_evidence(measurement.co_evidence, len(ground.scene.sides), weights.look)
-        explanation = explanation.update(measurement.signature, weights.sound, answer)
-    tracks = hear(memory.tracks, measurement, explanation, weights.sound, ground.scene.settings)
-    return replace(memory, explanation=explanation, tracks=tracks, predicted=predicted)
+    settings, source, stamp_ns = ground.scene.settings, measurement.source, measurement.stamp_ns
+    window_ns = nanoseconds(settings.window_s)
+    base = memory.trail.base(source, stamp_ns, window_ns)
+    prior = base.belief.predict(ground.context.rates.values_hz, stamp_ns - base.stamp_ns)
+    answer = log_co_evidence(measurement.co_evidence, len(ground.scene.sides))
+    explanation = prior.update(measurement.signature, answer + base.log_likelihoods)
+    said = np.maximum(measurement.signature.log_likelihoods + answer, LOG_FLOOR)
+    heard = Heard(source, stamp_ns, tuple(said.tolist()))
+    return replace(
+        memory,
+        explanation=explanation,
+        trail=memory.trail.add(heard, explanation, window_ns),
+        tracks=hear(memory.tracks, measurement, explanation, weights.sound, settings),
+        predicted=priors_of(prior),
+    )
 
 
 def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:
@@ -94,10 +106,14 @@ def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Gr
         measurement.stamp_ns if k in seen.handed_over else before_ns
         for k, before_ns in enumerate(memory.handover_ns)
     )
+    residual, trail = ground.scene.settings.handover_residual, memory.trail
+    for side in seen.handed_over:
+        trail = trail.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
     return replace(
         memory,
         tracks=surviving(seen.tracks, ground.scene.settings),
         explanation=seen.explanation,
+        trail=trail,
         handover_ns=handover_ns,
         sighted=seen.born,
     )
@@ -145,11 +161,15 @@ def renew(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
         measurement,
         ground.scene,
     )
+    trail = memory.trail
+    for side in hidden.begun:
+        trail = trail.map(partial(ExplanationBelief.disown, direction=side))
     last_ns = dict(memory.last_ns) | {measurement.source: measurement.stamp_ns}
     return replace(
         memory,
         tracks=hidden.tracks,
         explanation=hidden.explanation,
+        trail=trail,
         births=hidden.births,
         seq=memory.seq + 1,
         last_ns=tuple(sorted(last_ns.items())),

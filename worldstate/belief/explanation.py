@@ -92,7 +92,6 @@ class ExplanationBelief:
     def update(
         self,
         evidence: SignatureEvidence,
-        evidence_weight: float,
         log_co_evidence: NDArray[np.float64],
     ) -> "ExplanationBelief":
         """Return the belief after one look.
@@ -101,8 +100,6 @@ class ExplanationBelief:
         ----------
         evidence : SignatureEvidence
             Log-likelihoods of the signature.
-        evidence_weight : float
-            kappa in (0, 1].
         log_co_evidence : array, shape (K + 2,)
             log p(V | hidden_1 .. hidden_K, visible, none); -inf where impossible.
         """
@@ -110,7 +107,7 @@ class ExplanationBelief:
         parts = np.array(self.log_probabilities[k:-1])
         visible = np.logaddexp.reduce(parts)
         prior = np.array([*self.log_probabilities[:k], visible, self.log_probabilities[-1]])
-        seen: Posterior = abduce(prior + log_co_evidence, evidence, _FOLDED_IN, evidence_weight)
+        seen: Posterior = abduce(prior + log_co_evidence, evidence, _FOLDED_IN)
         posterior = np.array(seen.log_probabilities)
         spread = np.concatenate([posterior[:k], parts + (posterior[-2] - visible), posterior[-1:]])
         return replace(self, log_probabilities=tuple(np.maximum(spread, LOG_FLOOR).tolist()))

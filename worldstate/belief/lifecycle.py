@@ -15,11 +15,12 @@ HIDDEN_LABEL = "vehicle"
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """Outcome: the tracks, the explanations, and how many entities each side has brought forth."""
+    """Outcome: tracks, explanations, entities that each side has brought forth, sides that began one."""
 
     tracks: tuple[Track, ...]
     explanation: ExplanationBelief
     births: tuple[int, ...]
+    begun: tuple[int, ...]
 
 
 def renew_hidden(
@@ -43,12 +44,14 @@ def renew_hidden(
         Whether the side may bring forth an entity again after a hand-over.
     """
     settings, kept, counts = scene.settings, list(tracks), list(births)
+    begun = []
     for k in range(len(scene.sides)):
         current = next((track for track in kept if not track.seen and track.side == k), None)
         if current is None:
             heard = explanation.hidden[k] >= settings.birth_probability or alarmed[k]
             if heard and rearmed[k]:
                 explanation = explanation.disown(k)
+                begun.append(k)
                 returning = _returning(kept, k, measurement.stamp_ns, scene)
                 if returning is None:
                     kept.append(_born(k, counts[k], explanation.hidden[k], measurement, scene))
@@ -61,7 +64,7 @@ def renew_hidden(
             existence = explanation.hidden[k] + explanation.emerged[k]
             if existence >= settings.death_probability or alarmed[k]:
                 kept.append(replace(current, existence=existence))
-    return Hidden(tuple(kept), explanation, tuple(counts))
+    return Hidden(tuple(kept), explanation, tuple(counts), tuple(begun))
 
 
 def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: Scene) -> Track | None:

@@ -33,17 +33,15 @@ class Seen:
     born: int
 
 
-def log_co_evidence(answer: CoEvidence, directions: int, weight: float) -> NDArray[np.float64]:
-    """Return w log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats.
+def log_co_evidence(answer: CoEvidence, directions: int) -> NDArray[np.float64]:
+    """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats.
 
     Examples
     --------
-    >>> log_co_evidence(Absent(miss_rate=0.04), 2, weight=0.5).round(2)
-    array([ 0.  ,  0.  , -1.61,  0.  ])
+    >>> log_co_evidence(Absent(miss_rate=0.04), 2).round(2)
+    array([ 0.  ,  0.  , -3.22,  0.  ])
     """
-    if weight <= 0.0:
-        return np.zeros(directions + 2)
-    hidden, visible, none = (weight * answer.log_likelihoods()).tolist()
+    hidden, visible, none = answer.log_likelihoods().tolist()
     return np.array([*[hidden] * directions, visible, none])
 
 

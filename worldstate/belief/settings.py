@@ -14,11 +14,12 @@ class FilterSettings:
     ----------
     window_s : float
         Length of the window that a signature is computed on. Windows that overlap repeat most of their
-        samples, so a signature weighs kappa = (time since the last one) / window, at most 1: 0.1 at a
-        0.1-s hop. Counted in full, one second of sound would be believed ten times over.
+        samples: explanations build on the belief of one window ago (`trail`), and a bearing or approach rate
+        weighs kappa = (time since the last one) / window, at most 1.
     look_interval_s : float
         Looks of the co-evidence channel closer in time than this repeat each other's misses (same object,
-        same light, same detector), so a look weighs (time since the last one) / interval, at most 1.
+        same light, same detector), so to the existence of a visible entity a look weighs (time since the
+        last one) / interval, at most 1.
     birth_probability, death_probability : float
         A hidden entity is born when P(hidden on its side) reaches the first, or an advisory names its
         side, and dropped when its existence falls below the second.
