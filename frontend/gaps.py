@@ -28,6 +28,7 @@ _MIN_SPLICE_CHANNELS = 6
 _ANCHOR_BITS = np.uint64(31)
 _MIN_ANCHORS = 4
 _GENERATION_HOPS = 10
+_TINY = np.finfo(np.float32).tiny
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class GapFinder:
         self._n_seen = 0
         self._tail = np.zeros((0, n_channels), np.float32)
         self._still = StillRuns()
-        self._repeats = RepeatFinder(n_channels)
+        self._repeats = RepeatFinder()
 
     def push(self, samples: NDArray[np.float32], alive: NDArray[np.bool_]) -> list[Gap]:
         """Take the samples (n, M) of a hop and the channels that are not constant in it.
@@ -85,19 +86,27 @@ class GapFinder:
         list of Gap
             Those that end or show within this hop.
         """
-        picks = np.flatnonzero(alive)
-        picks = picks[:: max(-(-len(picks) // _PICKED), 1)]
         start = self._n_seen - len(self._tail)
-        sound = np.concatenate([self._tail[:, picks], samples[:, picks]])
+        sound = self._picked(samples, alive)
         self._tail = samples[-2:].copy()
         self._n_seen += len(samples)
-        change = sound[1:] - sound[:-1]
-        still = ~change.any(axis=1) if len(picks) else np.ones(len(change), bool)
+        change = sound[:, 1:] - sound[:, :-1]
+        still = ~change.any(axis=0)
         gaps = self._still.push(still[-len(samples) :], self._n_seen)
-        if len(picks) >= _MIN_SPLICE_CHANNELS:
-            gaps += find_splices(sound, start, still)
-        gaps += self._repeats.push(samples, picks, self._n_seen)
+        if len(sound) >= _MIN_SPLICE_CHANNELS:
+            gaps += find_splices(change, start + 1, still)
+        gaps += self._repeats.push(sound[:, -len(samples) :], self._n_seen)
         return sorted(gaps, key=lambda gap: gap.sample)
+
+    def _picked(self, samples: NDArray[np.float32], alive: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Give a few living channels, channel by channel: what follows runs along time."""
+        every = max(-(-int(np.count_nonzero(alive)) // _PICKED), 1)
+        picks = slice(None, None, every) if alive.all() else np.flatnonzero(alive)[::every]
+        heard = samples.T[picks]
+        sound = np.empty((len(heard), len(self._tail) + len(samples)), np.float32)
+        sound[:, : len(self._tail)] = self._tail.T[picks]
+        sound[:, len(self._tail) :] = heard
+        return sound
 
 
 class StillRuns:
@@ -125,43 +134,40 @@ class StillRuns:
         return gaps
 
 
-def find_splices(sound: NDArray[np.float32], start: int, still: NDArray[np.bool_]) -> list[Gap]:
-    """Find samples at which all channels leave the line that their last two samples foretell.
+def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool_]) -> list[Gap]:
+    """Find samples at which the sound of all channels at once is not what its last samples foretell.
 
     Parameters
     ----------
-    sound : ndarray of float32, shape (n, channels)
-        The first being sample `start`.
+    change : ndarray of float32, shape (channels, n)
+        First differences, so that offsets do not matter; the first is that into sample `start`.
     start : int
         Of the stream.
-    still : ndarray of bool, shape (n - 1,)
+    still : ndarray of bool, shape (n,)
         Where no channel changes; the edges of such runs are no splices.
     """
-    error = np.abs(_prediction_error(sound))
-    error /= np.maximum(error.mean(axis=0) * np.float32(np.sqrt(np.pi / 2)), np.finfo(np.float32).tiny)
-    np.minimum(error, _JUMP_CEILING, out=error)
-    jump = np.square(np.maximum(error[1:], error[:-1])).mean(axis=1)
+    error = _prediction_error(change)
+    np.square(error, out=error)
+    error /= np.maximum(error.mean(axis=1, keepdims=True), _TINY)
+    # What no ceiling lowers is the most that a jump can be: a clean hop ends here.
+    if 2.0 * float(error.mean(axis=0).max()) < _JUMP_LIMIT:
+        return []
+    np.minimum(error, _JUMP_CEILING**2, out=error)
+    jump = np.maximum(error[:, 1:], error[:, :-1]).mean(axis=0)
     limit = max(_JUMP_LIMIT, _JUMP_CONTRAST * float(np.partition(jump, -5)[-5]))
-    found = np.flatnonzero(jump > limit)
-    near_still = np.convolve(still, np.ones(9), "same")[2:] > 2
-    found = found[~near_still[np.minimum(found, len(near_still) - 1)]]
+    near_still = np.convolve(still, np.ones(9), "same")[1:-1] > 2
+    found = np.flatnonzero((jump > limit) & ~near_still)
     apart = found[np.diff(found, prepend=-100) > 50]
-    return [Gap("splice", int(start + 2 + index), None) for index in apart]
+    return [Gap("splice", int(start + 1 + index), None) for index in apart]
 
 
-def _prediction_error(sound: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Remainder of the best prediction of every sample from the two before it, one for all channels."""
-    level: NDArray[np.float32] = sound - sound.mean(axis=0)
-    level /= np.maximum(np.abs(level).max(axis=0), np.finfo(np.float32).tiny)
-    r0, r1, r2 = (
-        np.einsum("nm,nm->", level[: len(level) - lag], level[lag:], dtype=np.float64) for lag in range(3)
-    )
-    determinant = r0 * r0 - r1 * r1
-    if determinant <= 0.0:
-        return level[2:]
-    first = np.float32(r1 * (r0 - r2) / determinant)
-    second = np.float32((r0 * r2 - r1 * r1) / determinant)
-    return np.asarray(level[2:] - first * level[1:-1] - second * level[:-2])
+def _prediction_error(change: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Remainder of the best prediction of every difference from the one before, one rule for all channels."""
+    # A product or two reach from one channel into the next: nothing among thousands.
+    flat = change.ravel()
+    power, product = float(flat @ flat), float(flat[1:] @ flat[:-1])
+    rule = np.float32(product / power if power > 0.0 else 0.0)
+    return np.asarray(change[:, 1:] - rule * change[:, :-1])
 
 
 class RepeatFinder:
@@ -172,8 +178,8 @@ class RepeatFinder:
     a second each.
     """
 
-    def __init__(self, n_channels: int) -> None:
-        odd = np.random.default_rng(0).integers(1, 2**62, n_channels, dtype=np.uint64)
+    def __init__(self) -> None:
+        odd = np.random.default_rng(0).integers(1, 2**62, _PICKED, dtype=np.uint64)
         self._factors = 2 * odd + np.uint64(1)
         self._now: dict[int, int] = {}
         self._before: dict[int, int] = {}
@@ -181,14 +187,14 @@ class RepeatFinder:
         self._lag = 0
         self._end = 0
 
-    def push(self, samples: NDArray[np.float32], picks: NDArray[np.intp], end: int) -> list[Gap]:
-        """Take a hop (n, M) and the channels to look at; `end` is the number of samples so far."""
-        if len(picks) < 2:
+    def push(self, sound: NDArray[np.float32], end: int) -> list[Gap]:
+        """Take a hop of a few channels (channels, n); `end` is the number of samples so far."""
+        if len(sound) < 2:
             return []
         if self._hops % _GENERATION_HOPS == 0:
             self._before, self._now = self._now, {}
         self._hops += 1
-        keys, places = self._anchors(samples, picks, end - len(samples))
+        keys, places = self._anchors(sound, end - sound.shape[1])
         lags = [
             (place - before, place)
             for key, place in zip(keys, places, strict=True)
@@ -197,11 +203,9 @@ class RepeatFinder:
         self._now.update(zip(keys, places, strict=True))
         return self._repeat(lags)
 
-    def _anchors(
-        self, samples: NDArray[np.float32], picks: NDArray[np.intp], start: int
-    ) -> tuple[list[int], list[int]]:
-        bits = np.ascontiguousarray(samples[:, picks]).view(np.uint32)
-        hashes: NDArray[np.uint64] = (bits * self._factors[: len(picks)]).sum(axis=1, dtype=np.uint64)
+    def _anchors(self, sound: NDArray[np.float32], start: int) -> tuple[list[int], list[int]]:
+        bits = np.ascontiguousarray(sound).view(np.uint32)
+        hashes: NDArray[np.uint64] = (bits * self._factors[: len(bits), None]).sum(axis=0, dtype=np.uint64)
         # High bits are the well-mixed ones of a product.
         anchored = (hashes >> np.uint64(40)) & _ANCHOR_BITS == 0
         anchored[1:] &= hashes[1:] != hashes[:-1]

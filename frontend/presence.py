@@ -73,5 +73,7 @@ class Presence:
 
     def faults(self) -> list[ChannelFault]:
         """Say which channels are dead or intermittent."""
+        if not self._share.any():
+            return []
         dead = faults_where(Fault.DEAD, self._dead, self._share)
         return dead + faults_where(Fault.INTERMITTENT, self._intermittent, self._share)

@@ -13,8 +13,8 @@ class RailCounter:
     """Count samples at and just below the highest and the lowest value of every channel.
 
     An unclipped sound meets its extreme once, and more often the values just below it; a clipped one stays at
-    it. Only channels that reach their extreme in a hop are counted there, so that a clean stream costs
-    nothing; a new extreme starts the count anew, because what was below it was no rail.
+    it. Only hops that reach an extreme again are counted, so that a clean stream costs nothing; a new extreme
+    starts the count anew, because what was below it was no rail.
 
     Parameters
     ----------
@@ -26,9 +26,10 @@ class RailCounter:
     >>> sound = np.random.default_rng(0).standard_normal((4800, 2)).astype(np.float32)
     >>> sound[:, 1] = sound[:, 1].clip(-1.5, 1.5)
     >>> rails = RailCounter(2)
-    >>> rails.push(sound, sound.min(axis=0), sound.max(axis=0))
+    >>> for _ in range(2):
+    ...     rails.push(sound, sound.min(axis=0), sound.max(axis=0))
     >>> rails.clipped_share().round(2)
-    array([0.  , 0.13])
+    array([0.  , 0.06])
     """
 
     def __init__(self, n_channels: int) -> None:
@@ -42,19 +43,26 @@ class RailCounter:
     ) -> None:
         """Take the samples (n, M) of a hop and their extremes (M,)."""
         self._n_samples += len(samples)
-        self._side(0, samples, highest, highest - lowest)
-        self._side(1, -samples, -lowest, highest - lowest)
+        span = highest - lowest
+        self._side(0, np.float32(1.0), samples, highest, span)
+        self._side(1, np.float32(-1.0), samples, -lowest, span)
 
     def _side(
-        self, side: int, samples: NDArray[np.float32], top: NDArray[np.float32], span: NDArray[np.float32]
+        self,
+        side: int,
+        sign: np.float32,
+        samples: NDArray[np.float32],
+        top: NDArray[np.float32],
+        span: NDArray[np.float32],
     ) -> None:
         extreme, at, below = self._extreme[side], self._at[side], self._below[side]
+        reached = np.flatnonzero((top == extreme) & (span > 0.0))
         higher = top > extreme
         extreme[higher], at[higher], below[higher] = top[higher], 0, 0
-        reached = np.flatnonzero((top == extreme) & (span > 0.0))
         if len(reached):
-            near = samples[:, reached] >= extreme[reached] - np.float32(0.5 * _SHELL) * span[reached]
-            n_at = (samples[:, reached] == extreme[reached]).sum(axis=0)
+            values = sign * samples[:, reached]
+            near = values >= extreme[reached] - np.float32(0.5 * _SHELL) * span[reached]
+            n_at = (values == extreme[reached]).sum(axis=0)
             at[reached] += n_at
             below[reached] += near.sum(axis=0) - n_at
 

@@ -12,31 +12,31 @@ class SlowMean:
 
     Parameters
     ----------
-    n_channels : int
-        Number of channels M.
+    shape : (int, int)
+        Number of statistics and of channels M.
 
     Attributes
     ----------
-    mean : ndarray, shape (M,)
+    mean : ndarray, of this shape
         0 where nothing was added.
     count : ndarray of int, shape (M,)
         Hops added.
 
     Examples
     --------
-    >>> slow = SlowMean(2)
-    >>> slow.add([1.0, 5.0], np.array([True, True]))
-    >>> slow.add([3.0, 7.0], np.array([True, False]))
+    >>> slow = SlowMean((1, 2))
+    >>> slow.add([[1.0, 5.0]], np.array([True, True]))
+    >>> slow.add([[3.0, 7.0]], np.array([True, False]))
     >>> slow.mean, slow.count
-    (array([2., 5.]), array([2, 1]))
+    (array([[2., 5.]]), array([2, 1]))
     """
 
-    def __init__(self, n_channels: int) -> None:
-        self.mean = np.zeros(n_channels)
-        self.count = np.zeros(n_channels, np.int64)
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.mean = np.zeros(shape)
+        self.count = np.zeros(shape[1], np.int64)
 
     def add(self, values: ArrayLike, good: NDArray[np.bool_]) -> None:
-        """Take one value per channel (M,), of those that are good."""
+        """Take the values of a hop, of this shape, and the channels that are good (M,)."""
         self.count += good
         weight = good / np.clip(self.count, 1, _HOPS)
         self.mean += weight * (np.asarray(values) - self.mean)
