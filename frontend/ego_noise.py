@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
+from .harmonic_cancellation import HarmonicCanceller
 from .phat import whiten
 from .prewhitening import shrunk_inverse_root
 from .steering import Steering, cross_spectra
@@ -52,6 +53,8 @@ class EgoNoiseSettings:
     refresh_hops : int
         Every so many hops the whitening of one bin, in turn, is brought up to date; every hop until all
         bins have been. It costs an M x M eigendecomposition.
+    harmonics : int
+        Lines of the engine that are cancelled before, once `FrontEnd.follow_engine` says its speed.
     feature : bool
         Compute the published feature from prewhitened sound too. Off, because its classifier was trained
         without.
@@ -72,6 +75,7 @@ class EgoNoiseSettings:
     min_weight: float = 0.5
     min_shrinkage: float = 0.03
     refresh_hops: int = 3
+    harmonics: int = 40
     feature: bool = False
 
     def __post_init__(self) -> None:
@@ -79,6 +83,7 @@ class EgoNoiseSettings:
         in_range("min_weight", self.min_weight, 0.0, 1.0)
         in_range("min_shrinkage", self.min_shrinkage, 1e-4, 1.0)
         _whole("guard_hops", self.guard_hops, 0, 100)
+        _whole("harmonics", self.harmonics, 1, 1000)
         _whole("refresh_hops", self.refresh_hops, 1, 1000)
 
 
@@ -122,7 +127,8 @@ class WhitenedBeams:
     r"""Beams for whitened spectra, brought up to date bin by bin.
 
     With :math:`W = B C` of `Steering`, the weights for :math:`y = R^{-1/2} x` are
-    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction.
+    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the living
+    microphones: those with any noise).
 
     Parameters
     ----------
@@ -155,7 +161,8 @@ class WhitenedBeams:
             basis = root.conj() @ plain.basis[bin_index]
             ours.basis[bin_index] = basis
             gram = (weights.conj() * ((basis.conj().T @ basis) @ weights)).real.sum(axis=0)
-        scaled = weights * np.sqrt(np.float32(len(root)) / np.maximum(gram, _TINY))
+        alive = np.float32(np.count_nonzero(np.einsum("mm->m", root)))
+        scaled = weights * np.sqrt(alive / np.maximum(gram, _TINY))
         ours.weights[bin_index], ours.conjugate[bin_index] = scaled, scaled.conj()
 
 
@@ -175,6 +182,8 @@ class EgoNoise:
         M.
     beams : sequence of (Steering, slice)
         Beams to keep whitened, each with its bins among those of the spectra.
+    engine : HarmonicCanceller, optional
+        For the same spectra.
 
     Examples
     --------
@@ -195,8 +204,10 @@ class EgoNoise:
         frames_per_s: float,
         n_microphones: int,
         beams: Sequence[tuple[Steering, slice]],
+        engine: HarmonicCanceller | None = None,
     ) -> None:
         self.weight = 0.0
+        self.engine = engine
         self._beams = [WhitenedBeams(plain) for plain, _ in beams]
         first, last = min(bins.start for _, bins in beams), max(bins.stop for _, bins in beams)
         self._bins = slice(first, last)
@@ -218,14 +229,15 @@ class EgoNoise:
         return self._covariance.n_frames
 
     def process(self, spectra: NDArray[np.complex64]) -> list[tuple[NDArray[np.complex64], Steering]]:
-        """Learn and whiten the frames of a hop (frames, bins, M), phase transform included.
+        """Cancel, learn and whiten the frames of a hop (frames, bins, M), phase transform included.
 
         Returns
         -------
         list of (ndarray of complex64, shape (frames, its bins, M), Steering)
             For each set of beams.
         """
-        heard = spectra[:, self._bins]
+        rest = spectra if self.engine is None else self.engine.cancel(spectra)
+        heard = rest[:, self._bins]
         self._learn(heard)
         self._refresh()
         whitened = self._whitened(heard)

@@ -19,7 +19,7 @@ H. Vold and J. Leuridan, "High resolution order tracking at extreme slew rates",
 orders at once); the window's kernel: F. J. Harris, Proc. IEEE 66, 1978.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,12 @@ class EngineState:
             hops=self.hops + 1,
         )
 
+    def within(self, low_hz: float, high_hz: float) -> "EngineState":
+        """Keep the frequency between two limits; one that has to be moved keeps no rate."""
+        if low_hz <= self.frequency_hz <= high_hz:
+            return self
+        return replace(self, frequency_hz=min(max(self.frequency_hz, low_hz), high_hz), rate_hz_per_s=0.0)
+
 
 class HarmonicCanceller:
     """Subtracts the harmonics of an engine from the spectra of a stream.
@@ -131,13 +137,14 @@ class HarmonicCanceller:
         self._all_orders = np.arange(1, int(harmonics) + 1)
         self._fit: _Fit | None = None
         self._engine: EngineState | None = None
+        self._limits_hz = (0.0, np.inf)
 
     @property
     def fundamental_hz(self) -> float | None:
         """Frequency of the fundamental as tracked, or None while nothing is followed."""
         return None if self._engine is None else self._engine.frequency_hz
 
-    def follow(self, fundamental_hz: float | None, tolerance: float = 0.03) -> None:
+    def follow(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
         """Say the fundamental: from the engine's speed, or from `harmonics.track_fundamental`.
 
         Parameters
@@ -145,7 +152,8 @@ class HarmonicCanceller:
         fundamental_hz : float or None
             10 to 1000 Hz; None stops cancelling.
         tolerance : float
-            As long as the tracked frequency is within this share of it, the loop goes on undisturbed.
+            How wrong it may be, as a share; the loop stays within. Half a per cent for an engine's own speed
+            signal.
 
         Raises
         ------
@@ -156,8 +164,11 @@ class HarmonicCanceller:
             self._engine = self._fit = None
             return
         told = in_range("fundamental_hz", fundamental_hz, 10.0, 1000.0)
-        if self._engine is None or abs(self._engine.frequency_hz / told - 1.0) > tolerance:
-            self._engine, self._fit = EngineState(0.0, told), None
+        share = in_range("tolerance", tolerance, 0.0, 0.5)
+        if self._engine is None:
+            self._engine = EngineState(0.0, told)
+        self._limits_hz = told * (1.0 - share), told * (1.0 + share)
+        self._engine = self._engine.within(*self._limits_hz)
 
     def cancel(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
@@ -185,7 +196,7 @@ class HarmonicCanceller:
             error = now.phase_ahead(self._fit)
             now = now.turned(error).joined(self._fit, float(np.exp(-time[-1] / self._memory_s)))
         self._fit = now
-        self._engine = self._engine.after(float(time[-1]), error)
+        self._engine = self._engine.after(float(time[-1]), error).within(*self._limits_hz)
         lines = (shapes * np.exp(1j * orders * error).astype(np.complex64)) @ now.evident_amplitudes()
         return np.asarray(spectra - lines.reshape(spectra.shape))
 
@@ -246,7 +257,8 @@ class _Fit:
         _, mine, theirs = np.intersect1d(self.orders, remembered.orders, return_indices=True)
         if not len(mine):
             return 0.0
-        turned = (self.amplitudes[mine] * remembered.amplitudes[theirs].conj()).sum(axis=1)
+        known = remembered.evident_amplitudes()[theirs]
+        turned = (self.amplitudes[mine] * known.conj()).sum(axis=1)
         # Lines of like strength say more than one loud one that has no neighbour.
         turned = turned.astype(np.complex128) / np.sqrt(np.abs(turned) + _TINY)
         angle = 0.0
@@ -257,7 +269,10 @@ class _Fit:
         orders = self.orders[mine]
         rest = turned * np.exp(-1j * orders * angle)
         weight = np.abs(rest) * orders
-        return angle + float((weight * np.angle(rest)).sum() / max((weight * orders).sum(), _TINY))
+        angle += float((weight * np.angle(rest)).sum() / max((weight * orders).sum(), _TINY))
+        agreement = np.abs((turned * np.exp(-1j * orders * angle)).sum()) / max(np.abs(turned).sum(), _TINY)
+        # Orders that disagree are noise: the loop coasts.
+        return angle * float(agreement) ** 2
 
     def turned(self, angle: float) -> "_Fit":
         """Refer to a fundamental whose phase is ahead by an angle."""
@@ -287,29 +302,31 @@ class _Fit:
 def _line_shapes(
     engine: EngineState, time_s: FloatArray, orders: NDArray[np.int64], bins: NDArray[np.int64], bin_hz: float
 ) -> NDArray[np.complex64]:
-    """Return g of the module's equation for unit N, (frames * bins, H)."""
-    place = engine.frequencies(time_s)[:, None] * orders / bin_hz
-    distance = (place[:, None, :] - bins[:, None]).astype(np.float32)
-    kernel = _hann_kernel(distance) * np.where(bins % 2, -1.0, 1.0).astype(np.float32)[:, None]
+    """Return g of the module's equation for unit N, (frames * bins, H).
+
+    Over a hop the kernel is that of its middle: the frequency moves by a small part of a bin.
+    """
+    place = engine.frequencies(time_s.mean()) * orders / bin_hz
+    kernel = _hann_kernel(place - bins[:, None]) * np.where(bins % 2, -1.0, 1.0)[:, None]
     angle = np.mod(engine.phases(time_s)[:, None] * orders, 2.0 * np.pi)
     turn = np.exp(1j * angle).astype(np.complex64)
-    return np.asarray((kernel * turn[:, None, :]).reshape(-1, len(orders)))
+    return np.asarray((kernel.astype(np.float32) * turn[:, None, :]).reshape(-1, len(orders)))
 
 
-def _hann_kernel(distance: NDArray[np.float32]) -> NDArray[np.float32]:
+def _hann_kernel(distance: FloatArray) -> FloatArray:
     r"""Spectrum of the Hann window per sample: sinc(u) / (2 (1 - u^2)), cut beyond four bins.
 
     Examples
     --------
-    >>> _hann_kernel(np.array([0.0, 1.0, 5.0], np.float32)).round(3)
-    array([0.5 , 0.25, 0.  ], dtype=float32)
+    >>> _hann_kernel(np.array([0.0, 1.0, 5.0])).round(3)
+    array([0.5 , 0.25, 0.  ])
     """
     below = 1.0 - np.square(distance)
     # At u = 1 both numerator and denominator vanish: stand a hair beside it.
-    below[np.abs(below) < 1e-4] = 1e-4
+    below = np.where(np.abs(below) < 1e-6, 1e-6, below)
     u = np.sqrt(np.maximum(1.0 - below, 0.0))
     kernel = 0.5 * np.sinc(u) / below
-    return np.where(u < 4.0, kernel, 0.0).astype(np.float32)
+    return np.where(u < 4.0, kernel, 0.0)
 
 
 def _inverse_rms(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:

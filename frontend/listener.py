@@ -12,6 +12,7 @@ from .channel_health import ArrayHealth
 from .channel_monitor import ChannelMonitor
 from .ego_noise import EgoNoise
 from .feature import feature_steering, pair_sum, pair_sum_of
+from .harmonic_cancellation import HarmonicCanceller
 from .masking import ChannelMask
 from .phat import power, whiten
 from .settings import FrontEndSettings
@@ -83,7 +84,7 @@ class Listener:
         self._n_frames = 0
         self._unwatched = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
-        self.ego_noise = self._ego_noise(array.n_microphones, 2.0 * sample_rate_hz / nfft, settings)
+        self.ego_noise = self._ego_noise(array.n_microphones, sample_rate_hz, bins, settings)
 
     def push(self, samples: NDArray[np.float32]) -> HopSums:
         """Sum over the frames that these samples (n, M) complete; at least one frame."""
@@ -134,14 +135,16 @@ class Listener:
         return ChannelMonitor(array, frequencies, sample_rate_hz, settings.speed_of_sound_m_s)
 
     def _ego_noise(
-        self, n_microphones: int, frame_rate_hz: float, settings: FrontEndSettings
+        self, n_microphones: int, sample_rate_hz: float, bins: range, settings: FrontEndSettings
     ) -> EgoNoise | None:
-        if settings.ego_noise is None:
+        chosen, nfft = settings.ego_noise, settings.nfft
+        if chosen is None:
             return None
         beams = [(self._beams, self._srp)]
-        if settings.ego_noise.feature:
+        if chosen.feature:
             beams.append((self._feature_beams, self._feature))
-        return EgoNoise(settings.ego_noise, frame_rate_hz, n_microphones, beams)
+        engine = HarmonicCanceller(bins, sample_rate_hz, nfft, harmonics=chosen.harmonics)
+        return EgoNoise(chosen, 2.0 * sample_rate_hz / nfft, n_microphones, beams, engine)
 
     def _centre(self, n_new: int) -> float:
         """Middle of the new frames; frame t covers samples t N/2 .. t N/2 + N."""

@@ -12,6 +12,7 @@ from worldstate.values import NotUsable, nanoseconds
 from .array import MicrophoneArray
 from .bands import SILENCE
 from .bearing import strongest_bearing
+from .ego_noise import EgoNoise
 from .feature import FEATURE_SEGMENTS, segment_feature
 from .frame import AcousticFrame
 from .hops import Hop, HopCutter
@@ -123,9 +124,35 @@ class FrontEnd:
         InvalidArgumentError
             Out of range, or `settings.ego_noise` is None.
         """
+        self._ego_noise().weight = in_range("none_probability", none_probability, 0.0, 1.0)
+
+    def follow_engine(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
+        """Say the fundamental of the own engine, whose lines are then cancelled; None stops it.
+
+        It holds for every hop that ends from now on. Between two calls it is tracked, so that a call a hop
+        follows a changing speed best and a call now and then will do while it is steady.
+
+        Parameters
+        ----------
+        fundamental_hz : float or None
+            Engine speed times the number of lines a turn (the firing frequency: revolutions a second times
+            half the number of cylinders), or the last value of `harmonics.track_fundamental`.
+        tolerance : float
+            How wrong it may be, as a share.
+
+        Raises
+        ------
+        InvalidArgumentError
+            Out of range, or `settings.ego_noise` is None.
+        """
+        engine = self._ego_noise().engine
+        if engine is not None:
+            engine.follow(fundamental_hz, tolerance)
+
+    def _ego_noise(self) -> EgoNoise:
         if self._listener.ego_noise is None:
             raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")
-        self._listener.ego_noise.weight = in_range("none_probability", none_probability, 0.0, 1.0)
+        return self._listener.ego_noise
 
     def _checked(self, block: ArrayLike) -> NDArray[np.float32]:
         try:
