@@ -1,0 +1,323 @@
+r"""How much an observation says of a hidden state, in bits, and what no detector can do better than."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import check_shape, finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+Numbers = NDArray[np.float64]
+_BITS = 1.0 / math.log(2.0)
+_SMALLEST = 1e-12
+
+
+class Information(NamedTuple):
+    """Estimates of I(z; x) from the posteriors of a classifier, bits.
+
+    `lower` holds for any classifier on windows that it was not trained on, in expectation; `plug_in` for a
+    calibrated one, and is too high for one that is too sure of itself.
+    """
+
+    lower: float
+    plug_in: float
+
+
+def entropy_bits(probabilities: ArrayLike) -> float:
+    r"""Return :math:`H = -\sum_k p_k \log_2 p_k`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is no distribution.
+
+    Examples
+    --------
+    >>> entropy_bits([0.5, 0.25, 0.25])
+    1.5
+    """
+    p = _distribution("probabilities", finite_array("probabilities", probabilities, (None,)))
+    positive = p[p > 0.0]
+    return max(float(-(positive * np.log2(positive)).sum()), 0.0)
+
+
+def mutual_information_bits(joint: ArrayLike) -> float:
+    r"""Return :math:`I(z; x) = \sum p(z, x) \log_2 \frac{p(z, x)}{p(z) p(x)}` of a joint table.
+
+    Parameters
+    ----------
+    joint : array_like, shape (states, observations)
+        Probabilities that sum to one.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is no distribution.
+
+    Examples
+    --------
+    >>> mutual_information_bits([[0.5, 0.0], [0.0, 0.5]])
+    1.0
+    """
+    p = _distribution("joint", finite_array("joint", joint, (None, None)))
+    independent = p.sum(axis=1, keepdims=True) * p.sum(axis=0, keepdims=True)
+    there = p > 0.0
+    return max(float((p[there] * np.log2(p[there] / independent[there])).sum()), 0.0)
+
+
+def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Information:
+    r"""Estimate I(z; x) from posteriors q(z | x) of windows that the classifier was not trained on.
+
+    .. math::
+        I(z; x) \ge H(z) + \overline{\log_2 q(z_i | x_i)}, \qquad
+        \hat I_{plug} = H(z) - \overline{H(q(\cdot | x_i))}.
+
+    The first is the variational lower bound of Barber and Agakov, tight where q is the true posterior; the
+    second is tight there too, but nothing bounds it elsewhere. H(z) is that of the labels given; its plug-in
+    bias of :math:`(K - 1) / 2n` nats is added back (Miller and Madow).
+
+    Parameters
+    ----------
+    posteriors : array_like, shape (n, K)
+        Rows that sum to one.
+    states : array_like of int, shape (n,)
+        True states, 0 to K - 1.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If shapes differ, a row is no distribution or a state is none.
+
+    Examples
+    --------
+    >>> sure = information_from_posteriors([[1.0, 0.0], [0.0, 1.0]] * 500, [0, 1] * 500)
+    >>> round(sure.lower, 2), round(sure.plug_in, 2)
+    (1.0, 1.0)
+    """
+    q, z = _checked(posteriors, states)
+    own = np.log2(np.maximum(q[np.arange(z.size), z], _SMALLEST))
+    spread = -(q * np.log2(np.maximum(q, _SMALLEST))).sum(axis=1)
+    prior = state_entropy_bits(z, q.shape[1])
+    return Information(prior + float(own.mean()), prior - float(spread.mean()))
+
+
+def state_entropy_bits(states: ArrayLike, count: int) -> float:
+    """Return the entropy of labels, its small-sample bias added back, at most log2 of their number.
+
+    Examples
+    --------
+    >>> round(state_entropy_bits([0, 1, 0, 1], 2), 3)
+    1.0
+    """
+    z = np.asarray(states)
+    shares = np.bincount(z, minlength=count) / z.size
+    bias = ((shares > 0).sum() - 1) / (2.0 * z.size) * _BITS
+    return min(entropy_bits(shares) + float(bias), math.log2(max(count, 1)))
+
+
+def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike, neighbours: int = 3) -> float:
+    r"""Estimate I(z; x) from distances alone, without a classifier.
+
+    .. math:: \hat I = \psi(n) + \psi(k) - \overline{\psi(n_{z_i})} - \overline{\psi(m_i)},
+
+    with n_z windows of the state of i and m_i windows of any state within the distance of the k-th neighbour
+    of its own state. Consistent, with a bias downward that grows with the dimension: reduce features to a few
+    components first. Distances are the largest difference of any component, so bring those to one scale.
+
+    Parameters
+    ----------
+    features : array_like, shape (n, d)
+        Continuous values.
+    states : array_like of int, shape (n,)
+        True states; those with no more than `neighbours` windows are left out.
+    neighbours : int
+        k >= 1.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If shapes differ or no state has enough windows.
+
+    References
+    ----------
+    Ross, "Mutual information between discrete and continuous data sets", 2014.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> z = rng.integers(0, 2, 2000)
+    >>> round(nearest_neighbour_information_bits(rng.normal(size=(2000, 1)) + 8.0 * z[:, None], z), 1)
+    1.0
+    """
+    from scipy.spatial import cKDTree
+    from scipy.special import digamma
+
+    x = finite_array("features", features, (None, None))
+    z = np.asarray(states)
+    check_shape("states", z.shape, (len(x),))
+    k = int(in_range("neighbours", neighbours, 1, 1000))
+    names, counts = np.unique(z, return_counts=True)
+    kept = np.isin(z, names[counts > k])
+    x, z = x[kept], z[kept]
+    if not z.size:
+        raise InvalidArgumentError(f"states: expected more than {k} windows of some state")
+    radius, own = np.empty(z.size), np.empty(z.size)
+    for name in np.unique(z):
+        rows = np.flatnonzero(z == name)
+        distance, _ = cKDTree(x[rows]).query(x[rows], k=k + 1, p=np.inf)
+        radius[rows], own[rows] = np.nextafter(distance[:, -1], 0.0), rows.size
+    within = cKDTree(x).query_ball_point(x, radius, p=np.inf, return_length=True)
+    nats = digamma(z.size) + digamma(k) - digamma(own).mean() - digamma(np.maximum(within, 1)).mean()
+    return max(float(nats) * _BITS, 0.0)
+
+
+def fano_bound(entropy: float, information: float, states: int) -> float:
+    r"""Return the paper's lower bound on the error probability of any detector, in [0, 1].
+
+    .. math:: P_e \ge \frac{H(z) - I(z; x) - 1}{\log_2 K}
+
+    It is a statement on all detectors only with an I that is not below the true one: from the lower bound of
+    `information_from_posteriors` it becomes an estimate. With H of two bits and less it is often void; see
+    `sharp_fano_bound`.
+
+    Parameters
+    ----------
+    entropy, information : float
+        H(z) and I(z; x), bits.
+    states : int
+        K >= 2.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> fano_bound(entropy=2.0, information=0.2, states=4)
+    0.4
+    """
+    h, i, k = _fano_numbers(entropy, information, states)
+    return min(max((h - i - 1.0) / math.log2(k), 0.0), 1.0)
+
+
+def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
+    r"""Return the smallest error probability that Fano's inequality allows, without loosening it.
+
+    .. math:: h(P_e) + P_e \log_2 (K - 1) \ge H(z) - I(z; x),
+
+    with the binary entropy h, solved for the smallest P_e. Never below `fano_bound`, and attained by the
+    symmetric channel.
+
+    Parameters and errors are those of `fano_bound`.
+
+    Examples
+    --------
+    >>> round(sharp_fano_bound(entropy=1.0, information=0.5310, states=2), 3)
+    0.1
+    """
+    from scipy.optimize import brentq
+
+    h, i, k = _fano_numbers(entropy, information, states)
+    remaining, largest = h - i, (k - 1.0) / k
+    if remaining <= 0.0:
+        return 0.0
+    if remaining >= math.log2(k) - 1e-12:
+        return largest
+    return float(brentq(lambda p: _fano_function(p, k) - remaining, 0.0, largest))
+
+
+def conditional_information(acoustic: ArrayLike, both: ArrayLike, states: ArrayLike) -> float:
+    r"""Estimate the vision-unique part I(z; x_vis | x_ac), bits.
+
+    .. math:: \hat I = \overline{\log_2 \frac{q(z_i | x_{ac,i}, x_{vis,i})}{q(z_i | x_{ac,i})}}
+
+    It is what is lost with vision, and no acoustic detector can bring it back at run time. A difference of
+    two lower bounds, so itself no bound; negative where the posteriors of both are the worse ones.
+
+    Parameters
+    ----------
+    acoustic, both : array_like, shape (n, K)
+        Posteriors without and with vision; `fuse` forms the second under (A1).
+    states : array_like of int, shape (n,)
+        True states.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As `information_from_posteriors`.
+
+    Examples
+    --------
+    >>> round(conditional_information([[0.5, 0.5]] * 2, [[0.9, 0.1], [0.1, 0.9]], [0, 1]), 3)
+    0.848
+    """
+    without, z = _checked(acoustic, states)
+    with_vision, _ = _checked(both, states)
+    check_shape("both", with_vision.shape, without.shape)
+    rows = np.arange(z.size)
+    ratio = np.maximum(with_vision[rows, z], _SMALLEST) / np.maximum(without[rows, z], _SMALLEST)
+    return float(np.log2(ratio).mean())
+
+
+def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> Numbers:
+    r"""Return posteriors of both channels under (A1), independence given the state, shape (n, K).
+
+    .. math:: q(z | x_{ac}, x_{vis}) \propto q(z | x_{ac})\, q(z | x_{vis}) / p(z)
+
+    Parameters
+    ----------
+    acoustic, visual : array_like, shape (n, K)
+        Posteriors of each at the same prior.
+    prior : array_like, shape (K,)
+        p(z), positive.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If shapes differ or a row is no distribution.
+
+    Examples
+    --------
+    >>> fuse([[0.8, 0.2]], [[0.5, 0.5]], [0.5, 0.5])
+    array([[0.8, 0.2]])
+    """
+    a = finite_array("acoustic", acoustic, (None, None))
+    v = finite_array("visual", visual, a.shape)
+    p = _distribution("prior", finite_array("prior", prior, (a.shape[1],)))
+    if (p <= 0.0).any():
+        raise InvalidArgumentError("prior: expected positive numbers")
+    joint = np.maximum(a, _SMALLEST) * np.maximum(v, _SMALLEST) / p
+    return np.asarray(joint / joint.sum(axis=1, keepdims=True))
+
+
+def _fano_numbers(entropy: float, information: float, states: int) -> tuple[float, float, int]:
+    k = int(in_range("states", states, 2, 1_000_000))
+    h = in_range("entropy", entropy, 0.0, math.log2(k) + 1e-9)
+    return h, max(in_range("information", information, -math.inf, math.inf), 0.0), k
+
+
+def _fano_function(error: float, states: int) -> float:
+    spread = 0.0
+    for p in (error, 1.0 - error):
+        spread -= p * math.log2(p) if p > 0.0 else 0.0
+    return spread + error * math.log2(states - 1) if states > 2 else spread
+
+
+def _distribution(name: str, values: Numbers) -> Numbers:
+    if not values.size or (values < 0.0).any() or not math.isclose(float(values.sum()), 1.0, abs_tol=1e-6):
+        raise InvalidArgumentError(f"{name}: expected probabilities that sum to one")
+    return values
+
+
+def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[Numbers, NDArray[np.intp]]:
+    q = finite_array("posteriors", posteriors, (None, None))
+    z = np.asarray(states)
+    check_shape("states", z.shape, (len(q),))
+    if not z.size or (q < 0.0).any() or not np.allclose(q.sum(axis=1), 1.0, atol=1e-6):
+        raise InvalidArgumentError("posteriors: expected at least one row, each of them a distribution")
+    if z.dtype.kind not in "iu" or z.min() < 0 or z.max() >= q.shape[1]:
+        raise InvalidArgumentError(f"states: expected integers from 0 to {q.shape[1] - 1}")
+    return q, z.astype(np.intp)
