@@ -15,6 +15,8 @@ from .slow_mean import SlowMean
 
 # Mean square of the band against the median channel's below which a channel counts as silent: -30 dB.
 _SILENT = 1e-3
+# The same within one frame: no interference of sounds goes so deep.
+_DROPPED = 1e-5
 # A peak-to-peak that grows so much more than the other channels' is a crackle: seven times the usual noise.
 _CRACKLE = 4.0
 # A mean above a tenth of the peak-to-peak sound (0.7 of its standard deviation), judged after two seconds.
@@ -24,6 +26,7 @@ _LEVEL_DB = 10.0
 _CLIPPED_SHARE = 1e-4
 _KEPT_GAPS = 16
 _ROWS = 16
+_TINY = np.finfo(np.float64).tiny
 # Slow statistics are judged once in so many hops.
 _EVERY_HOPS = 10
 
@@ -46,7 +49,7 @@ class ChannelMonitor:
     >>> monitor = ChannelMonitor(array, np.array([500.0]), 48_000.0)
     >>> sound = np.random.default_rng(0).standard_normal((4800, 1)).astype(np.float32) * [1.0, 1.0, 0.0]
     >>> for _ in range(2):
-    ...     health = monitor.push(sound.astype(np.float32), np.array([1.0, 1.0, 0.0]), np.ones((1, 3, 3)), 18)
+    ...     health = monitor.push(sound.astype(np.float32), np.array([[1.0, 1.0, 0.0]]), np.ones((1, 3, 3)))
     >>> health.mask.keep, [(fault.channel, fault.fault.value) for fault in health.faults]
     (array([ True,  True, False]), [(2, 'dead')])
     """
@@ -75,19 +78,16 @@ class ChannelMonitor:
         samples: NDArray[np.float32],
         energies: NDArray[np.float64],
         matrices: NDArray[np.complex64],
-        n_frames: int,
     ) -> ArrayHealth:
         """Take one hop, say which channels count in it and why.
 
         Parameters
         ----------
         samples : ndarray of float32, shape (n, M)
-        energies : ndarray, shape (M,)
-            Mean square of each channel in the band that bearings are read from.
+        energies : ndarray, shape (frames, M)
+            Mean square of each channel in some band within the frames of the hop.
         matrices : ndarray of complex64, shape (K, M, M)
-            Sums of Z_i conj(Z_j) over frames, Z being whitened spectra.
-        n_frames : int
-            Number of these frames.
+            Sums of Z_i conj(Z_j) over these frames, Z being whitened spectra.
         """
         lowest, highest = _extremes(samples)
         span = highest - lowest
@@ -95,7 +95,7 @@ class ChannelMonitor:
         self._rails.push(samples, lowest, highest)
         self._remember(self._gap_finder.push(samples, alive))
         bad = self._judge_hop(samples, energies, span)
-        self._places.push(matrices, n_frames, ~self._presence.suspects)
+        self._places.push(matrices, len(energies), ~self._presence.suspects)
         return self._report(bad)
 
     def _remember(self, gaps: list[Gap]) -> None:
@@ -109,16 +109,16 @@ class ChannelMonitor:
         alive = span > 0.0
         if not alive.any():
             return self._presence.all_silent()
-        typical = max(float(np.median(energies[alive])), np.finfo(np.float64).tiny)
-        bad = ~alive | (energies < _SILENT * typical)
+        typical = np.maximum(np.median(energies[:, alive], axis=1, keepdims=True), _TINY)
+        level = (energies / typical).mean(axis=0)
+        bad = ~alive | (level < _SILENT) | (energies < _DROPPED * typical).any(axis=0)
         usual_span = self._usual.mean[0]
         known = alive & (usual_span > 0.0)
         if known.any():
             growth = np.divide(span, usual_span, out=np.zeros(len(span)), where=known)
             bad |= growth > _CRACKLE * np.median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)
-        level = np.log(np.maximum(energies / typical, _SILENT))
-        self._usual.add(np.stack([span, level, share @ samples]), ~bad)
+        self._usual.add(np.stack([span, np.log(np.maximum(level, _SILENT)), share @ samples]), ~bad)
         return self._presence.push(bad)
 
     def _report(self, bad: NDArray[np.bool_]) -> ArrayHealth:
@@ -144,7 +144,7 @@ class ChannelMonitor:
         heard = self._usual.count >= _SETTLED_HOPS
         level_db = 10.0 / np.log(10.0) * level
         return [
-            *faults_where(Fault.CLIPPED, usable & (clipped > _CLIPPED_SHARE), clipped),
+            *faults_where(Fault.CLIPPED, clipped > _CLIPPED_SHARE, clipped),
             *faults_where(Fault.OFFSET, usable & heard & (offset > _OFFSET), offset),
             *faults_where(Fault.LEVEL, usable & heard & (np.abs(level_db) > _LEVEL_DB), level_db),
         ]

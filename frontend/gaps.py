@@ -15,8 +15,9 @@ GapKind = Literal["still", "splice", "repeat"]
 
 # Channels looked at, evenly picked: a few say what all would.
 _PICKED = 8
-# Samples without any change on any channel.
+# Samples without any change on any channel: so many, and more than coarse quantisation makes by chance.
 _SHORTEST_STILL = 16
+_STILL_CHANCE = 1e-12
 # Splice: mean squared jump over the channels, in units of each channel's own, a single one counting 25 at
 # most; clean simulated streets stay below 7.5 and nine in ten cuts are above 15.
 _JUMP_CEILING = 5.0
@@ -91,7 +92,7 @@ class GapFinder:
         self._tail = samples[-2:].copy()
         self._n_seen += len(samples)
         change = sound[:, 1:] - sound[:, :-1]
-        still = ~change.any(axis=0)
+        still = np.asarray(~change.any(axis=0))
         gaps = self._still.push(still[-len(samples) :], self._n_seen)
         if len(sound) >= _MIN_SPLICE_CHANNELS:
             gaps += find_splices(change, start + 1, still)
@@ -115,6 +116,7 @@ class StillRuns:
     def __init__(self) -> None:
         self._length = 0
         self._heard = False
+        self._n_still, self._n_moving = 0, 0
 
     def push(self, still: NDArray[np.bool_], end: int) -> list[Gap]:
         """Take one flag per sample, the last being sample `end` - 1; give the runs that end here."""
@@ -125,13 +127,21 @@ class StillRuns:
         first = end - len(still)
         edges = np.concatenate([[-1 - self._length], moving])
         lengths = np.diff(edges) - 1
-        found = np.flatnonzero(lengths >= _SHORTEST_STILL)
+        found = np.flatnonzero(lengths >= self._shortest(lengths))
         gaps = [Gap("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
         if not self._heard:
             gaps = [gap for gap in gaps if gap.sample > 0 and gap.sample >= first + moving[0]]
         self._heard = True
         self._length = int(len(still) - 1 - moving[-1])
         return gaps
+
+
+    def _shortest(self, lengths: NDArray[np.intp]) -> float:
+        """Length that single samples which do not change, as often as they come, hardly make."""
+        self._n_still += int(lengths[lengths < _SHORTEST_STILL].sum())
+        self._n_moving += len(lengths)
+        share = self._n_still / (self._n_still + self._n_moving)
+        return max(_SHORTEST_STILL, np.log(_STILL_CHANCE) / np.log(share)) if share else _SHORTEST_STILL
 
 
 def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool_]) -> list[Gap]:
@@ -158,7 +168,7 @@ def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool
     near_still = np.convolve(still, np.ones(9), "same")[1:-1] > 2
     found = np.flatnonzero((jump > limit) & ~near_still)
     apart = found[np.diff(found, prepend=-100) > 50]
-    return [Gap("splice", int(start + 1 + index), None) for index in apart]
+    return [Gap("splice", int(start + 2 + index), None) for index in apart]
 
 
 def _prediction_error(change: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .array import MicrophoneArray
-from .bands import mean_square_per_bin
 from .bins import band_bins, bin_frequencies_hz
 from .channel_health import ArrayHealth
 from .channel_monitor import ChannelMonitor
@@ -91,26 +90,26 @@ class Listener:
         spectra = self._stft.push(samples)
         powers = power(spectra)
         whitened = whiten(spectra, powers)
-        energies = self._energies(powers)
+        energies = self._frame_energies(powers)
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
-        health = self._watch(samples, energies, matrices, len(spectra))
+        health = self._watch(samples, energies, matrices)
         health.mask.silence(spectra)
         health.mask.silence(whitened)
         srp, pairs = self._sums(spectra, whitened, matrices, health.mask)
         centre = self._centre(len(spectra))
-        return HopSums(len(spectra), centre, srp, pairs, energies, health)
+        return HopSums(len(spectra), centre, srp, pairs, energies.mean(axis=0), health)
 
-    def _energies(self, powers: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Mean square in the looming band per microphone: the mean over its bins, times their number."""
-        band = powers[:, self._looming]
-        return np.asarray(mean_square_per_bin(band.swapaxes(1, 2), self._nfft) * band.shape[1])
+    def _frame_energies(self, powers: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`."""
+        total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
+        return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
 
     def _watch(
-        self, samples: NDArray[np.float32], energies: NDArray[np.float64], matrices: Spectra, n_frames: int
+        self, samples: NDArray[np.float32], energies: NDArray[np.float64], matrices: Spectra
     ) -> ArrayHealth:
         if self.monitor is None:
             return self._unwatched
-        return self.monitor.push(samples, energies, matrices, n_frames)
+        return self.monitor.push(samples, energies, matrices)
 
     def _sums(
         self, spectra: Spectra, whitened: Spectra, matrices: Spectra, mask: ChannelMask

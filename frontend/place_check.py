@@ -90,7 +90,7 @@ class PlaceCheck:
             self.coherence = NotUsable(f"nothing coherent sounds ({typical:.2f})")
         else:
             self.coherence = typical
-            found = self._incoherent(own / typical, there) + self._swapped(scores, there)
+            found = self._find(scores, typical, there)
         self._confirm(found)
 
     def _use(self, usable: NDArray[np.bool_]) -> None:
@@ -100,25 +100,51 @@ class PlaceCheck:
             self._usable = usable
             self._weights = place_weights(array, frequencies_hz, usable, speed)
 
-    def _incoherent(self, share: NDArray[np.float64], there: NDArray[np.bool_]) -> list[ChannelFault]:
-        limit = np.where(self._suspects, _WELL, _SUSPECT)
-        inverted = there & (share < -limit)
-        noisy = there & ~inverted & (share < limit)
+    def _find(
+        self, scores: NDArray[np.float64], typical: float, there: NDArray[np.bool_]
+    ) -> list[ChannelFault]:
+        limit = typical * np.where(self._suspects, _WELL, _SUSPECT)
+        own = scores.diagonal()
+        inverted = there & (own < -limit)
+        swapped = displaced(scores, there & ~inverted & (scores.max(axis=1) > limit))
+        noisy = there & ~inverted & (own < limit)
+        noisy[[fault.channel for fault in swapped]] = False
         self._suspects = noisy | inverted
-        return faults_where(Fault.NOISY, noisy, share) + faults_where(Fault.INVERTED, inverted, share)
-
-    def _swapped(self, scores: NDArray[np.float64], there: NDArray[np.bool_]) -> list[ChannelFault]:
-        """Seat the healthy channels where they fit best together; a few microphones trade places."""
-        seated = np.flatnonzero(there & ~self._suspects)
-        table = scores[np.ix_(seated, seated)]
-        best = linear_sum_assignment(table, maximize=True)[1]
-        gain = table[np.arange(len(seated)), best] - table.diagonal()
-        return [
-            ChannelFault(int(seated[i]), Fault.SWAPPED, float(gain[i]), looks_like=int(seated[best[i]]))
-            for i in np.flatnonzero(gain > _MARGIN)
-        ]
+        self._suspects[[fault.channel for fault in swapped]] = True
+        share = own / typical
+        return (
+            swapped
+            + faults_where(Fault.NOISY, noisy, share)
+            + faults_where(Fault.INVERTED, inverted, share)
+        )
 
     def _confirm(self, found: list[ChannelFault]) -> None:
         before = {(fault.channel, fault.fault) for fault in self._once}
         self._faults = [fault for fault in found if (fault.channel, fault.fault) in before]
         self._once = set(found)
+
+
+def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> list[ChannelFault]:
+    """Seat channels where they fit best together, a place for each, and list those that gain by it.
+
+    Parameters
+    ----------
+    scores : ndarray, shape (M, M)
+        From `place_scores`.
+    candidates : ndarray of bool, shape (M,)
+        Channels that fit anywhere at all; they share their places among themselves.
+
+    Examples
+    --------
+    >>> scores = np.array([[0.1, 0.9, 0.1], [0.8, 0.2, 0.1], [0.1, 0.1, 0.7]])
+    >>> [(fault.channel, fault.looks_like) for fault in displaced(scores, np.ones(3, bool))]
+    [(0, 1), (1, 0)]
+    """
+    seated = np.flatnonzero(candidates)
+    table = scores[np.ix_(seated, seated)]
+    best = linear_sum_assignment(table, maximize=True)[1]
+    gain = table[np.arange(len(seated)), best] - table.diagonal()
+    return [
+        ChannelFault(int(seated[i]), Fault.SWAPPED, float(gain[i]), looks_like=int(seated[best[i]]))
+        for i in np.flatnonzero(gain > _MARGIN)
+    ]

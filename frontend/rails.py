@@ -4,7 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Width of the shell below an extreme that an unclipped distribution fills more than the extreme itself.
-_SHELL = 0.1
+_SHELL = np.float32(0.1)
+# A step to the next value, in halves of the span, above which quantisation looks like clipping.
+_COARSE = np.float32(0.02)
 # Fewer samples at the extreme are chance.
 _MIN_COUNT = 16
 
@@ -61,10 +63,14 @@ class RailCounter:
         extreme[higher], at[higher], below[higher] = top[higher], 0, 0
         if len(reached):
             values = sign * samples[:, reached]
-            near = values >= extreme[reached] - np.float32(0.5 * _SHELL) * span[reached]
-            n_at = (values == extreme[reached]).sum(axis=0)
-            at[reached] += n_at
-            below[reached] += near.sum(axis=0) - n_at
+            is_at = values == extreme[reached]
+            n_at = is_at.sum(axis=0)
+            half = np.float32(0.5) * span[reached]
+            n_below = (values >= extreme[reached] - _SHELL * half).sum(axis=0) - n_at
+            next_level = values.max(axis=0, where=~is_at, initial=-np.inf)
+            fine = extreme[reached] - next_level < _COARSE * half
+            at[reached] += n_at * fine
+            below[reached] += n_below * fine
 
     def clipped_share(self) -> NDArray[np.float64]:
         """Share of all samples that stand at a rail, (M,); 0 for channels without one."""
