@@ -87,20 +87,43 @@ def stream_statistic(
     0.8
     """
     chosen = switches or StatisticSwitches()
-    prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
-    joint = np.log(prior) + stream.log_likelihoods
-    with np.errstate(divide="ignore"):
-        joint[:, -2] += _log_visible(stream, chosen)
+    joint = _log_joint(stream, reference_prior, chosen)
     hidden = np.logaddexp.reduce(joint[:, :-2], axis=1)
     log_odds = hidden - np.logaddexp(joint[:, -2], joint[:, -1])
     log_odds += chosen.approach_weight * approach_score(stream)
     return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
 
 
+def presence_statistic(
+    stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
+) -> Numbers:
+    """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,).
+
+    Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
+
+    Examples
+    --------
+    >>> presence_statistic(HopStream.blank("a", 1), (0.25,) * 4)
+    array([0.75])
+    """
+    joint = _log_joint(stream, reference_prior, switches or StatisticSwitches())
+    something = np.logaddexp.reduce(joint[:, :-1], axis=1)
+    return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))
+
+
 def approach_score(stream: HopStream) -> Numbers:
     """Return the approach rate in standard deviations within three, 0 where it is not usable, shape (n,)."""
     usable = np.isfinite(stream.approach)
     return np.where(usable, np.clip(stream.approach, -LARGEST_SCORE, LARGEST_SCORE), 0.0)
+
+
+def _log_joint(stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches) -> Numbers:
+    """Log of prior, signature and answer, up to a constant of each hop, shape (n, K + 2)."""
+    prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
+    joint = np.log(prior) + stream.log_likelihoods
+    with np.errstate(divide="ignore"):
+        joint[:, -2] += _log_visible(stream, switches)
+    return np.asarray(joint)
 
 
 def _log_visible(stream: HopStream, switches: StatisticSwitches) -> Numbers:
