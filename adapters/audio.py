@@ -36,6 +36,8 @@ class AudioSource:
         Number of microphones M.
     frames : int
         Samples per channel.
+    silent_channels : tuple of int
+        Channels, from 1, that hold one constant value through the first second.
     """
 
     def __init__(self, path: Path, file: Any) -> None:
@@ -45,6 +47,7 @@ class AudioSource:
         self.sample_rate_hz = int(file.samplerate)
         self.channels = int(file.channels)
         self.frames = int(file.frames)
+        self.silent_channels: tuple[int, ...] = ()
 
     @property
     def duration_s(self) -> float:
@@ -120,7 +123,25 @@ class AudioSource:
         return block
 
 
-def open_audio(path: str | Path, expect_channels: int | None = None) -> AudioSource:
+class SilentChannelsError(InputFileError):
+    """Channels of a recording hold one constant value through its first second.
+
+    Attributes
+    ----------
+    channels : tuple of int
+        From 1, as in the file.
+    """
+
+    def __init__(self, path: Path, channels: tuple[int, ...], expected: str) -> None:
+        numbers = ", ".join(map(str, channels))
+        got = f"got one constant value for a second on channel {numbers}"
+        super().__init__(path, f"expected sound on {expected}, {got}")
+        self.channels = channels
+
+
+def open_audio(
+    path: str | Path, expect_channels: int | None = None, *, strict: bool = True
+) -> AudioSource:
     """Open a WAV, RF64, W64 or FLAC recording and check what can be checked before the first block.
 
     FLAC holds 8 channels at most and WAV 4 GiB, nine minutes of 56 channels: use RF64 or W64 beyond.
@@ -131,6 +152,9 @@ def open_audio(path: str | Path, expect_channels: int | None = None) -> AudioSou
         The file.
     expect_channels : int, optional
         Number of microphones of the array that it shall fit.
+    strict : bool
+        True: a silent channel is an error. False: so is only a recording with more silent channels than
+        others; `AudioSource.silent_channels` lists them, and the front-end leaves them out.
 
     Returns
     -------
@@ -142,7 +166,9 @@ def open_audio(path: str | Path, expect_channels: int | None = None) -> AudioSou
     InputFileError
         Names the file, for: missing, not audio, lossy, empty, shorter than one second, cut short (the header
         promises more than the file holds), another number of channels, a sample in the first second that is
-        NaN or infinite, and channels constant over the first second (numbered from 1 as in the file).
+        NaN or infinite.
+    SilentChannelsError
+        Channels constant over the first second (numbered from 1 as in the file).
 
     Examples
     --------
@@ -158,6 +184,7 @@ def open_audio(path: str | Path, expect_channels: int | None = None) -> AudioSou
     source = AudioSource(name, _open_file(name))
     try:
         _check(source, expect_channels)
+        _refuse_silent(source, strict)
     except BaseException:
         source.close()
         raise
@@ -191,7 +218,8 @@ def _check(source: AudioSource, expect_channels: int | None) -> None:
     source.check_end()
     first = source.first_second()
     _refuse_non_finite(source.path, first, 0)
-    _refuse_silent(source.path, first)
+    constant = (first == first[0]).all(axis=0)
+    source.silent_channels = tuple(int(channel) + 1 for channel in np.flatnonzero(constant))
 
 
 def _refuse_cut_file(source: AudioSource) -> None:
@@ -213,9 +241,9 @@ def _refuse_non_finite(path: Path, block: Samples, start: int) -> None:
         raise InputFileError(path, f"expected finite samples, got {block[sample, channel]} in {where}")
 
 
-def _refuse_silent(path: Path, first: Samples) -> None:
-    silent = np.flatnonzero((first == first[0]).all(axis=0)) + 1
-    if silent.size:
-        numbers = ", ".join(map(str, silent))
-        problem = f"expected sound on every channel, got one constant value for a second on channel {numbers}"
-        raise InputFileError(path, problem)
+def _refuse_silent(source: AudioSource, strict: bool) -> None:
+    silent = source.silent_channels
+    if silent and strict:
+        raise SilentChannelsError(source.path, silent, "every channel")
+    if 2 * len(silent) > source.channels:
+        raise SilentChannelsError(source.path, silent, f"at least half of {source.channels} channels")

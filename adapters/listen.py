@@ -45,6 +45,8 @@ class Source:
         Rates, occluders, ego motion.
     t0_s : float or None
         Line-of-sight entry where the recording knows it, seconds from its start.
+    mask_dead : bool
+        Listen without silent channels instead of refusing them.
     """
 
     audio_path: Path
@@ -54,6 +56,7 @@ class Source:
     policy: CueingPolicy
     context: Context
     t0_s: float | None = None
+    mask_dead: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +76,7 @@ def open_source(
     model: Path | str | None = None,
     alpha: float | None = 0.02,
     context: Context | None = None,
+    mask_dead: bool = False,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
@@ -91,6 +95,8 @@ def open_source(
         the first one, for those who only measure.
     context : Context, optional
         Rates, occluders and ego motion; defaults where not given.
+    mask_dead : bool
+        Listen without silent channels, as long as half of them are left, instead of refusing them.
 
     Raises
     ------
@@ -111,6 +117,7 @@ def open_source(
         policy=policies.policies[0] if alpha is None else policies.for_alpha(alpha),
         context=context or Context(),
         t0_s=recording.t0_s if recording and recording.label != "none" else None,
+        mask_dead=mask_dead,
     )
 
 
@@ -156,7 +163,8 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
     InputFileError
         If the sound file is damaged or does not fit the array.
     """
-    with open_audio(source.audio_path, expect_channels=source.array.positions_m.shape[0]) as audio:
+    strict, n_microphones = not source.mask_dead, source.array.n_microphones
+    with open_audio(source.audio_path, expect_channels=n_microphones, strict=strict) as audio:
         sight = line_of_sight(source.context)
         vision = VisionQuery(PinholeCamera(), source.detections, line_of_sight=sight)
         adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.model, vision=vision)

@@ -10,7 +10,7 @@ from worldstate.evaluation.recording import RecordingReport, run_recording
 
 def listen_with_progress(source: Source, *, title: str, states_path: Path | None) -> RecordingReport:
     """Listen to `source` to its end while a bar on standard error counts seconds of audio."""
-    with open_audio(source.audio_path) as audio:
+    with open_audio(source.audio_path, strict=not source.mask_dead) as audio:
         hops = 10.0 * audio.frames / audio.sample_rate_hz
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
         return run_recording(

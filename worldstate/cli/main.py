@@ -9,7 +9,17 @@ from importlib.metadata import version
 from worldstate.errors import WorldstateError
 
 # Modules are imported when the parser is built; each keeps its heavy imports inside `run`.
-COMMANDS = ("demo", "run", "simulate", "train", "calibrate", "measure_absence", "evaluate_features")
+COMMANDS = (
+    "demo",
+    "run",
+    "doctor",
+    "simulate",
+    "train",
+    "calibrate",
+    "measure_absence",
+    "evaluate_features",
+    "extract_features",
+)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from worldstate.cli.output import print_summary
+from worldstate.errors import InputFileError
 
 DESCRIPTION = """\
 Listen to a recording and keep the world-state.
@@ -34,6 +35,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
     )
+    parser.add_argument(
+        "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
+    )
     parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
@@ -42,6 +46,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
+    from worldstate.adapters.audio import SilentChannelsError
     from worldstate.adapters.listen import open_source
     from worldstate.cli.listening import listen_with_progress
     from worldstate.evaluation.timeline import write_timeline
@@ -52,8 +57,14 @@ def run(arguments: argparse.Namespace) -> int:
         detections=arguments.detections,
         model=arguments.model,
         alpha=arguments.alpha,
+        mask_dead=arguments.mask_dead,
     )
-    report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
+    try:
+        report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
+    except SilentChannelsError as error:
+        if arguments.mask_dead:
+            raise
+        raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.figure is not None:
         write_timeline(report.timeline, arguments.figure)
     print_summary(report.to_dict(), as_json=arguments.json)

@@ -10,6 +10,7 @@ import numpy as np
 
 from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.listen import Source, Step, listen_steps
+from worldstate.evaluation.health import HealthLog, RecordingHealth
 from worldstate.evaluation.timeline import Timeline
 from worldstate.evaluation.warning import WarningMeter, WarningSummary
 from worldstate.state import Entity, WorldState
@@ -32,6 +33,8 @@ class RecordingReport:
         Largest risk of all hops.
     realtime_factor : float
         Seconds of audio per second of wall time, the whole chain.
+    health : RecordingHealth
+        What was wrong with the microphones.
     """
 
     warning: WarningSummary
@@ -39,11 +42,13 @@ class RecordingReport:
     hops: int
     peak_risk: float
     realtime_factor: float
+    health: RecordingHealth
 
     def to_dict(self) -> dict[str, object]:
-        """Return the summary as JSON-able values; unknown is None."""
+        """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
         figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
-        return asdict(self.warning) | figures
+        masked = {"masked_microphones": [channel + 1 for channel in self.health.masked_channels]}
+        return asdict(self.warning) | figures | masked
 
 
 def run_recording(
@@ -85,6 +90,7 @@ def run_recording(
         hops=len(log.time_s),
         peak_risk=max(log.risk, default=0.0),
         realtime_factor=(log.time_s[-1] if log.time_s else 0.0) / elapsed_s,
+        health=log.health.summary(),
     )
 
 
@@ -102,6 +108,7 @@ class _HopLog:
     """A few numbers a hop: an hour of audio stays within some ten megabytes."""
 
     meter: WarningMeter
+    health: HealthLog = field(default_factory=HealthLog)
     time_s: list[float] = field(default_factory=list)
     statistic: list[float] = field(default_factory=list)
     risk: list[float] = field(default_factory=list)
@@ -114,6 +121,7 @@ class _HopLog:
     def add(self, step: Step) -> None:
         state, now_s = step.state, seconds(step.state.stamp_ns)
         self.meter.update(state)
+        self.health.add(step.frame)
         self.time_s.append(now_s)
         self.statistic.append(max((cue.statistic for cue in state.cues), default=0.0))
         self.risk.append(state.risk)

@@ -1,0 +1,100 @@
+"""`worldstate doctor`: which microphones of a recording misbehave, and what to do about it."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from worldstate.adapters.audio import AudioSource
+    from worldstate.evaluation.health import RecordingHealth
+    from worldstate.frontend.array import MicrophoneArray
+
+DESCRIPTION = """\
+Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
+or clipped ones, offsets, levels, missing or repeated samples, the sample rate. Channels are counted from 1.
+
+Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted and noisy
+microphones show only in sound that all of them hear: two seconds of traffic do."""
+
+EXAMPLE = """\
+examples:
+  worldstate doctor some.wav --array mics.xml
+  worldstate doctor some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "doctor",
+        help="what is wrong with the microphones of a recording",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="INPUT", help="sound file or recording folder")
+    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
+    parser.add_argument("--duration", type=float, metavar="S", help="its length by another clock, seconds")
+    parser.add_argument(
+        "--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)"
+    )
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
+    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    import json
+
+    from worldstate.adapters.array_xml import read_array_xml
+    from worldstate.adapters.audio import open_audio
+    from worldstate.adapters.ovad import Recording
+    from worldstate.cli.doctor_report import as_json, as_text
+    from worldstate.evaluation.array_figure import write_array_figure
+    from worldstate.frontend.array import roof_array_56
+
+    path: Path = arguments.input
+    sound = Recording.open(path).audio_path if path.is_dir() else path
+    array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
+    with open_audio(sound, expect_channels=array.n_microphones, strict=False) as audio:
+        health = examine(audio, array, arguments.duration, arguments.duration_error)
+        if arguments.json:
+            print(json.dumps(as_json(health, audio, array), allow_nan=False))
+        else:
+            print(*as_text(health, audio, array), sep="\n")
+    if arguments.figure is not None:
+        write_array_figure(array, health, arguments.figure)
+    return 0 if health.is_healthy else 1
+
+
+def examine(
+    audio: "AudioSource", array: "MicrophoneArray", duration_s: float | None, duration_std_s: float
+) -> "RecordingHealth":
+    """Listen to a recording to its end.
+
+    Parameters
+    ----------
+    audio : AudioSource
+        Open.
+    array : MicrophoneArray
+        One microphone a channel.
+    duration_s : float or None
+        Length of the recording by another clock, where one is known.
+    duration_std_s : float
+        Standard deviation of that.
+    """
+    from dataclasses import replace
+
+    from worldstate.evaluation.health import HealthLog
+    from worldstate.frontend.sample_clock import rate_from_duration
+    from worldstate.frontend.stream import FrontEnd
+
+    front_end, log = FrontEnd(array, audio.sample_rate_hz), HealthLog()
+    for block in audio.blocks(audio.sample_rate_hz):
+        for frame in front_end.process(block):
+            log.add(frame)
+    health = log.summary()
+    if duration_s is None:
+        return health
+    rate = rate_from_duration(audio.frames, duration_s, duration_std_s, float(audio.sample_rate_hz))
+    return replace(health, sample_rate=rate)

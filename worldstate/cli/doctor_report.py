@@ -1,0 +1,101 @@
+"""What `worldstate doctor` says, for people and for machines; channels are counted from 1, as in the file."""
+
+from collections.abc import Iterator
+
+from worldstate.adapters.audio import AudioSource
+from worldstate.evaluation.health import ChannelVerdict, RecordingHealth
+from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.channel_health import Fault
+from worldstate.frontend.sample_clock import RateEstimate
+from worldstate.values import NotUsable
+
+
+def as_json(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray) -> dict[str, object]:
+    """Return the report as JSON-able values; channels are counted from 1, unknown is None."""
+    rate = health.sample_rate if isinstance(health.sample_rate, RateEstimate) else None
+    return {
+        "path": str(audio.path),
+        "healthy": health.is_healthy,
+        "channels": audio.channels,
+        "sample_rate_hz": audio.sample_rate_hz,
+        "duration_s": audio.duration_s,
+        "ambiguity": array.ambiguity,
+        "coherence": None if isinstance(health.coherence, NotUsable) else health.coherence,
+        "masked_microphones": [channel + 1 for channel in health.masked_channels],
+        "faults": [_fault_json(verdict) for verdict in health.verdicts],
+        "n_gaps": health.n_gaps,
+        "gaps": [{"kind": g.kind, "sample": g.sample, "n_samples": g.n_samples} for g in health.gaps],
+        "measured_rate_hz": rate and rate.rate_hz,
+        "measured_rate_std_hz": rate and rate.std_hz,
+    }
+
+
+def _fault_json(verdict: ChannelVerdict) -> dict[str, object]:
+    return {
+        "channel": verdict.channel + 1,
+        "fault": verdict.fault.value,
+        "share": verdict.share,
+        "first_s": verdict.first_s,
+        "value": verdict.value,
+        "looks_like": None if verdict.looks_like is None else verdict.looks_like + 1,
+        "masked": verdict.masked,
+    }
+
+
+def as_text(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray) -> Iterator[str]:
+    """Yield the lines of the report."""
+    alias = array.alias_hz()
+    yield f"{audio.path}: {audio.channels} channels, {audio.sample_rate_hz} Hz, {audio.duration_s:.1f} s"
+    yield f"array: ambiguity {array.ambiguity}, alias-free to {alias:.0f} Hz"
+    if health.verdicts:
+        yield ""
+        yield from _table(health.verdicts)
+    yield from _other_lines(health)
+    yield ""
+    yield "healthy" if health.is_healthy else _conclusion(health)
+
+
+def _table(verdicts: tuple[ChannelVerdict, ...]) -> Iterator[str]:
+    yield f"{'channel':>7}  {'fault':<12}  {'since':>6}  {'hops':>5}  what and what to do"
+    for verdict in verdicts:
+        when = f"{verdict.first_s:5.1f}s  {100 * verdict.share:4.0f}%"
+        yield f"{verdict.channel + 1:>7}  {verdict.fault.value:<12}  {when}  {_advice(verdict)}"
+
+
+def _advice(verdict: ChannelVerdict) -> str:
+    value = verdict.value
+    other = (verdict.looks_like or 0) + 1
+    return {
+        Fault.DEAD: "silent: check plug, cable, phantom power",
+        Fault.INTERMITTENT: f"out or crackling in {100 * value:.0f} % of the time: check plug and cable",
+        Fault.NOISY: f"{100 * max(value, 0):.0f} % of the usual coherence: own noise, or another place",
+        Fault.INVERTED: "polarity is reversed: cross its two leads",
+        Fault.SWAPPED: f"fits the place of channel {other}: exchange plugs, or the lines of the array file",
+        Fault.CLIPPED: f"{100 * value:.2g} % of samples at its limit: lower the gain",
+        Fault.OFFSET: f"mean is {100 * value:.0f} % of the peak-to-peak sound: check bias and coupling",
+        Fault.LEVEL: f"{value:+.0f} dB against the median channel: check gain and sensitivity",
+    }[verdict.fault]
+
+
+def _other_lines(health: RecordingHealth) -> Iterator[str]:
+    if health.n_gaps:
+        shown = ", ".join(f"{gap.kind} at sample {gap.sample}" for gap in health.gaps[:5])
+        more = ", ..." if health.n_gaps > 5 else ""
+        gaps = "1 gap" if health.n_gaps == 1 else f"{health.n_gaps} gaps"
+        yield f"{gaps} ({shown}{more}): check the recorder's buffers"
+    if isinstance(health.sample_rate, RateEstimate):
+        rate = health.sample_rate
+        ppm = f"{rate.rate_hz:.2f} +- {rate.std_hz:.2f} Hz, {1e6 * rate.error:+.0f} millionths off"
+        yield f"sample rate by the other clock: {ppm}" + (": the header is wrong, or samples are missing" if rate.is_wrong else "")
+    if isinstance(health.coherence, NotUsable):
+        yield f"swapped, inverted and noisy microphones not judged: {health.coherence.reason}"
+
+
+def _conclusion(health: RecordingHealth) -> str:
+    kinds: dict[str, set[int]] = {}
+    for verdict in health.verdicts:
+        kinds.setdefault(verdict.fault.value, set()).add(verdict.channel + 1)
+    parts = [f"{kind} {', '.join(map(str, sorted(found)))}" for kind, found in kinds.items()]
+    masked = len(health.masked_channels)
+    left_out = f"; {masked} left out by the front-end" if masked else ""
+    return f"not healthy: {'; '.join(parts) or 'see above'}{left_out}"

@@ -1,0 +1,167 @@
+"""What was wrong with the microphones of a recording, over all of its hops."""
+
+from dataclasses import dataclass
+
+from worldstate.frontend.channel_health import MASKED_FAULTS, ArrayHealth, Fault
+from worldstate.frontend.frame import AcousticFrame
+from worldstate.frontend.gaps import Gap
+from worldstate.frontend.sample_clock import RateEstimate
+from worldstate.values import NotUsable, seconds
+
+# Gaps beyond these are counted, not listed.
+_LISTED_GAPS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelVerdict:
+    """One fault of one channel over a recording.
+
+    Parameters
+    ----------
+    channel : int
+        From 0.
+    fault : Fault
+        What is wrong.
+    share : float
+        Of the hops in which it was seen.
+    first_s : float
+        End of the first of these hops, seconds.
+    value : float
+        How wrong, when last seen: see `worldstate.frontend.channel_health.ChannelFault`.
+    looks_like : int or None
+        Swapped: the channel whose place it fits.
+
+    Examples
+    --------
+    >>> ChannelVerdict(2, Fault.DEAD, 1.0, 1.0, 1.0).masked
+    True
+    """
+
+    channel: int
+    fault: Fault
+    share: float
+    first_s: float
+    value: float
+    looks_like: int | None = None
+
+    @property
+    def masked(self) -> bool:
+        """Whether the front-end leaves such a channel out."""
+        return self.fault in MASKED_FAULTS
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingHealth:
+    """Everything that was wrong with a recording.
+
+    Parameters
+    ----------
+    verdicts : tuple of ChannelVerdict
+        By channel; empty where nothing was wrong.
+    gaps : tuple of Gap
+        The first hundred.
+    n_gaps : int
+        All of them.
+    n_hops : int
+        Hops listened to.
+    coherence : float or NotUsable
+        At the end: see `worldstate.frontend.channel_health.ArrayHealth`.
+    sample_rate : RateEstimate or NotUsable
+        By another clock.
+
+    Examples
+    --------
+    >>> HealthLog().summary().is_healthy
+    True
+    """
+
+    verdicts: tuple[ChannelVerdict, ...]
+    gaps: tuple[Gap, ...]
+    n_gaps: int
+    n_hops: int
+    coherence: float | NotUsable
+    sample_rate: RateEstimate | NotUsable
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether nothing was wrong."""
+        rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
+        return not (self.verdicts or self.n_gaps or rate_is_wrong)
+
+    @property
+    def masked_channels(self) -> tuple[int, ...]:
+        """Channels, from 0, that the front-end left out, most of the time or now and then."""
+        return tuple(sorted({verdict.channel for verdict in self.verdicts if verdict.masked}))
+
+
+class HealthLog:
+    """Collect what the frames of a recording say about its microphones.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.stream import FrontEnd
+    >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0], [0, -0.1, 0]])
+    >>> sound = np.random.default_rng(0).standard_normal((24_000, 1)) * [1.0, 1.0, 0.0]
+    >>> log = HealthLog()
+    >>> for frame in FrontEnd(array, 16_000).process(sound):
+    ...     log.add(frame)
+    >>> [(verdict.channel, verdict.fault.value) for verdict in log.summary().verdicts]
+    [(2, 'dead')]
+    """
+
+    def __init__(self) -> None:
+        self._n_hops = 0
+        self._seen: dict[tuple[int, Fault], ChannelVerdict] = {}
+        self._gaps: list[Gap] = []
+        self._latest: ArrayHealth | None = None
+
+    def add(self, frame: AcousticFrame) -> None:
+        """Take one hop; frames without a health report count as healthy."""
+        self._n_hops += 1
+        health = frame.health
+        if isinstance(health, NotUsable):
+            return
+        n_new = health.n_gaps - (self._latest.n_gaps if self._latest else 0)
+        self._gaps.extend(health.gaps[-n_new:] if n_new and len(self._gaps) < _LISTED_GAPS else ())
+        self._latest = health
+        for fault in health.faults:
+            key = fault.channel, fault.fault
+            before = self._seen.get(key)
+            # Shares are hops until the summary divides them.
+            self._seen[key] = ChannelVerdict(
+                channel=fault.channel,
+                fault=fault.fault,
+                share=1.0 + (before.share if before else 0.0),
+                first_s=before.first_s if before else seconds(frame.stamp_ns),
+                value=fault.value,
+                looks_like=fault.looks_like,
+            )
+
+    def summary(self) -> RecordingHealth:
+        """Return the verdicts so far."""
+        latest = self._latest
+        unknown = NotUsable("nothing heard")
+        return RecordingHealth(
+            verdicts=self._verdicts(),
+            gaps=tuple(self._gaps[:_LISTED_GAPS]),
+            n_gaps=latest.n_gaps if latest else 0,
+            n_hops=self._n_hops,
+            coherence=latest.coherence if latest else unknown,
+            sample_rate=latest.sample_rate if latest else unknown,
+        )
+
+    def _verdicts(self) -> tuple[ChannelVerdict, ...]:
+        ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
+        return tuple(
+            ChannelVerdict(v.channel, v.fault, v.share / self._n_hops, v.first_s, v.value, v.looks_like)
+            for v in ordered
+            if not self._is_other_half(v)
+        )
+
+    def _is_other_half(self, verdict: ChannelVerdict) -> bool:
+        """Tell a channel that was called dead while it came and went, or the other way round, mostly that."""
+        others = {Fault.DEAD: Fault.INTERMITTENT, Fault.INTERMITTENT: Fault.DEAD}
+        other = self._seen.get((verdict.channel, others.get(verdict.fault, verdict.fault)))
+        return other is not None and other.fault != verdict.fault and other.share > verdict.share
