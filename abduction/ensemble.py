@@ -47,6 +47,9 @@ class EnsembleModel:
         Class frequencies of the training set, mirrored rows included.
     home : SiteReference
         Mean reference of the training sites, mirrored ones included: stands in where no site is known.
+    empty : ndarray, shape (features,)
+        Mean log-levels of the training windows without any source: what a stream that is mostly empty is
+        compared with, see `SiteEstimate`.
 
     Raises
     ------
@@ -56,7 +59,7 @@ class EnsembleModel:
     Examples
     --------
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
-    >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))))
+    >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))
     >>> model.predict_proba(np.ones((1, 6)))
     array([[0.25, 0.25, 0.25, 0.25]])
     """
@@ -64,6 +67,7 @@ class EnsembleModel:
     experts: tuple[Expert, ...]
     class_prior: Numbers
     home: SiteReference
+    empty: Numbers
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
@@ -73,6 +77,9 @@ class EnsembleModel:
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
         prior.flags.writeable = False
         object.__setattr__(self, "class_prior", prior)
+        empty = finite_array("empty", self.empty, (self.n_features,)).copy()
+        empty.flags.writeable = False
+        object.__setattr__(self, "empty", empty)
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
         for expert in self.experts:
@@ -153,6 +160,7 @@ class EnsembleModel:
             "classes": list(CLASSES),
             "class_prior": self.class_prior.tolist(),
             "home": self.home.row.tolist(),
+            "empty": self.empty.tolist(),
             "experts": [expert.to_dict() for expert in self.experts],
         }
 
@@ -174,6 +182,7 @@ class EnsembleModel:
             tuple(Expert.from_dict(expert) for expert in experts),
             np.array(read_numbers(data.get("class_prior"), "class_prior")),
             SiteReference.from_row(read_numbers(data.get("home"), "home")),
+            np.array(read_numbers(data.get("empty"), "empty")),
         )
 
     def _split(self, X: ArrayLike) -> tuple[Numbers, Numbers]:

@@ -12,9 +12,9 @@ from worldstate.checks import finite_array
 from worldstate.errors import InvalidArgumentError
 
 from .ensemble import MIRRORED_CLASSES, EnsembleModel
-from .expert import SHAPE, Expert, expert_view, split_reference
+from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_view, split_reference
 from .mirror import SEGMENTS, mirror_features
-from .signature import CLASSES
+from .signature import CLASSES, NONE
 from .signature_training import checked_labels
 from .site import KINDS, SiteReference
 from .standardise import standardisation
@@ -51,6 +51,7 @@ RECIPES = (
     Recipe("median", 1e-3),
     Recipe("quiet", 1e-3),
     Recipe(SHAPE, 1e-2),
+    Recipe(SHAPE_CHANGE, 1e-2),
 )
 
 
@@ -106,6 +107,7 @@ class SiteEnsembleClassifier:
             tuple(_fit_expert(recipe, levels, reference, codes) for recipe in self.recipes),
             np.bincount(codes) / codes.size,
             SiteReference.from_row(reference.mean(axis=0)),
+            levels[codes == NONE].mean(axis=0),
         )
         return self
 

@@ -16,8 +16,8 @@ from .schema import read_numbers, read_rows
 from .shape import shape_features
 from .site import KINDS, log_levels
 
-SHAPE = "shape"
-VIEWS = (*KINDS, SHAPE)
+SHAPE, SHAPE_CHANGE = "shape", "shape_change"
+VIEWS = (*KINDS, SHAPE, SHAPE_CHANGE)
 
 Numbers = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ class Expert:
     Parameters
     ----------
     view : str
-        ``mean``, ``median`` or ``quiet``: log-levels above that summary of the site; ``shape``: how the shape
-        of the window differs from that of the site's median.
+        ``mean``, ``median`` or ``quiet``: log-levels above that summary of the site; ``shape``: a few numbers
+        of the window alone; ``shape_change``: how they differ from those of the site's median.
     mean, scale : ndarray, shape (inputs,)
         Standardisation; scale > 0.
     weights : ndarray, shape (4, inputs)
@@ -113,9 +113,11 @@ def expert_view(view: str, levels: Numbers, reference: Numbers) -> Numbers:
     >>> expert_view("median", np.full((1, 2), 3.0), np.array([[0.0, 0.0, 1.0, 2.0, 0.0, 0.0]]))
     array([[2., 1.]])
     """
-    kind = KINDS.index("median" if view == SHAPE else view)
-    summary = reference[:, kind * levels.shape[1] : (kind + 1) * levels.shape[1]]
     if view == SHAPE:
+        return shape_features(levels, SEGMENTS)
+    kind = KINDS.index("median" if view == SHAPE_CHANGE else view)
+    summary = reference[:, kind * levels.shape[1] : (kind + 1) * levels.shape[1]]
+    if view == SHAPE_CHANGE:
         return shape_features(levels, SEGMENTS) - shape_features(summary, SEGMENTS)
     return levels - summary
 

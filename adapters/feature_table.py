@@ -5,6 +5,7 @@ ego, D.. moving ego), ``T0`` (frame number, may be empty) and ``Recording ID``. 
 degrees and grow to the right, as in the released data and in `frontend.feature`.
 """
 
+import csv
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.signature import CLASSES
+from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.csv_rows import read_rows
 from worldstate.errors import InputFileError, InvalidArgumentError
 
@@ -145,6 +147,22 @@ def read_features(path: str | Path) -> FeatureTable:
     features, labels, t0_frames = zip(*windows, strict=True)
     classes, ids, environments, recordings = (np.array(column) for column in zip(*labels, strict=True))
     return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames)
+
+
+def write_features(path: str | Path, table: FeatureTable) -> None:
+    """Write a table of windows that `read_features` reads back to the bit, whole or not at all.
+
+    Raises
+    ------
+    InputFileError
+        If the folder is missing.
+    """
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(FEATURE_COLUMNS + LABEL_COLUMNS)
+        names = (table.labels, table.ids, table.environments, table.t0_frames, table.recordings)
+        for feature, *labels in zip(table.features.tolist(), *names, strict=True):
+            writer.writerow([*feature, *labels])
 
 
 def read_ids(path: str | Path) -> frozenset[str]:

@@ -1,0 +1,160 @@
+"""From labelled recordings to a table of feature windows, for an array of one's own."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.signature import CLASSES
+from worldstate.adapters.audio import AudioSource, open_audio
+from worldstate.adapters.csv_rows import read_rows
+from worldstate.adapters.feature_table import FeatureTable
+from worldstate.adapters.ovad import AUDIO_NAME
+from worldstate.errors import InputFileError
+from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.feature import published_feature
+
+WINDOW_S = 1.0
+BLOCK_S = 0.1
+REQUIRED = ("ID", "Class", "Environment", "Recording ID")
+OPTIONAL = ("File", "End", "T0")
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledWindow:
+    """One line of a list of labels.
+
+    Parameters
+    ----------
+    window_id, label, environment, recording : str
+        As in the feature table.
+    t0_frame : int or None
+        Line-of-sight entry, frame number at 10 a second.
+    path : Path
+        Sound file.
+    end_s : float or None
+        End of the window in its file, seconds; None where the file ends.
+    """
+
+    window_id: str
+    label: str
+    environment: str
+    recording: str
+    t0_frame: int | None
+    path: Path
+    end_s: float | None
+
+
+def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
+    """Read which window of which recording carries which label.
+
+    Columns ID, Class, Environment and Recording ID as in the feature table, with these beside them where
+    wanted: File, relative to the data set; End, seconds from the start of the file; T0. Where no File is
+    given, ``<Environment>/<Class>/<ID>/out_multi.wav`` and ``<ID>.wav`` are looked for.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV file.
+    dataset : str or Path
+        Folder that files are looked for in; a name that leads out of it is refused.
+
+    Raises
+    ------
+    InputFileError
+        If the list is missing or damaged, a label is unknown or a sound file is not there; the message names
+        the line.
+    """
+    name, root = Path(path), Path(dataset)
+    present = _optional_columns(name)
+    rows = read_rows(name, (*REQUIRED, *present))
+    if not rows:
+        raise InputFileError(name, "expected at least one window below the header")
+    return [_labelled(name, root, line, row) for line, row in rows]
+
+
+def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[NDArray[np.float64]]:
+    """Yield the published feature of each window, shape (60,).
+
+    Raises
+    ------
+    InputFileError
+        If a recording is damaged, has another number of channels than the array, or is too short.
+    """
+    for window in windows:
+        with open_audio(window.path, array.n_microphones) as source:
+            yield published_feature(_last_second(source, window), array, source.sample_rate_hz)
+
+
+def feature_table(windows: list[LabelledWindow], features: list[NDArray[np.float64]]) -> FeatureTable:
+    """Return windows and features, in the same order, as a table."""
+    columns = zip(*((w.label, w.window_id, w.environment, w.recording) for w in windows), strict=True)
+    labels, ids, environments, recordings = (np.array(column) for column in columns)
+    t0_frames = tuple(w.t0_frame for w in windows)
+    return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames)
+
+
+def _last_second(source: AudioSource, window: LabelledWindow) -> NDArray[np.float32]:
+    """Return the second before the end of the window, shape (n, M)."""
+    rate = source.sample_rate_hz
+    end = source.frames if window.end_s is None else round(window.end_s * rate)
+    start = end - round(WINDOW_S * rate)
+    if end > source.frames or start < 0:
+        at = "" if window.end_s is None else f" before {window.end_s:g} s"
+        raise InputFileError(source.path, f"expected a second of sound{at}, got {source.duration_s:.3g} s")
+    kept, at_frame = [], 0
+    for block in source.blocks(max(round(BLOCK_S * rate), 1)):
+        low, high = max(start - at_frame, 0), min(end - at_frame, len(block))
+        if low < high:
+            kept.append(block[low:high])
+        at_frame += len(block)
+        if at_frame >= end:
+            break
+    return np.concatenate(kept)
+
+
+def _optional_columns(path: Path) -> tuple[str, ...]:
+    """Return which of the optional columns are there."""
+    found = []
+    for column in OPTIONAL:
+        try:
+            read_rows(path, (column,))
+        except InputFileError:
+            continue
+        found.append(column)
+    return tuple(found)
+
+
+def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:
+    if row["Class"] not in CLASSES:
+        raise InputFileError(name, f"line {line}: expected a class {CLASSES}, got {row['Class'][:40]!r}")
+    for column in ("ID", "Environment", "Recording ID"):
+        if not row[column]:
+            raise InputFileError(name, f"line {line}: expected a value of {column}")
+    try:
+        end_s = float(row["End"]) if row.get("End") else None
+        t0_frame = int(row["T0"]) if row.get("T0") else None
+    except ValueError as error:
+        raise InputFileError(name, f"line {line}: {error}") from error
+    if end_s is not None and not (math.isfinite(end_s) and end_s > 0):
+        raise InputFileError(name, f"line {line}: expected End > 0 s, got {end_s}")
+    where = _sound_file(name, root, line, row)
+    return LabelledWindow(
+        row["ID"], row["Class"], row["Environment"], row["Recording ID"], t0_frame, where, end_s
+    )
+
+
+def _sound_file(name: Path, root: Path, line: int, row: dict[str, str]) -> Path:
+    folder = f"{row['Environment']}/{row['Class']}/{row['ID']}/{AUDIO_NAME}"
+    candidates = [row["File"]] if row.get("File") else [folder, f"{row['ID']}.wav"]
+    for candidate in candidates:
+        relative = PurePosixPath(candidate)
+        if relative.is_absolute() or ".." in relative.parts:
+            problem = f"line {line}: expected a file inside the data set, got {candidate!r:.80}"
+            raise InputFileError(name, problem)
+        if (root / relative).is_file():
+            return root / relative
+    raise InputFileError(name, f"line {line}: expected a file {' or '.join(candidates)} in the data set")

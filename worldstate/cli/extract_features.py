@@ -1,0 +1,68 @@
+"""`worldstate extract-features`: labelled recordings in, a table of feature windows out."""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.output import print_summary
+from worldstate.cli.progress import progress_bar
+
+DESCRIPTION = """\
+Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
+array of one's own. The list of labels is CSV with the columns ID, Class (front, left, none, right),
+Environment (S.. standing ego, D.. moving ego, then the junction) and Recording ID; optional are File,
+relative to DATASET, End, the end of the window in seconds from the start of the file (default: its last
+second), and T0. Where no File is given, DATASET/Environment/Class/ID/out_multi.wav and DATASET/ID.wav are
+looked for."""
+
+EXAMPLE = """\
+example:
+  worldstate extract-features recordings --labels labels.csv --array mics.xml --out features.csv
+  worldstate train features.csv --method worldstate --out model.json"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "extract-features",
+        help="compute feature windows from labelled recordings",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
+    parser.add_argument("--labels", type=Path, required=True, metavar="CSV", help="list of windows")
+    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
+    parser.add_argument(
+        "--array", type=Path, metavar="XML", help="microphones (default: the 56-microphone roof array)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    import numpy as np
+
+    from worldstate.adapters.array_xml import read_array_xml
+    from worldstate.adapters.feature_extraction import extract_features, feature_table, read_labels
+    from worldstate.adapters.feature_table import write_features
+    from worldstate.frontend.array import roof_array_56
+
+    array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
+    windows = read_labels(arguments.labels, arguments.dataset)
+    features = []
+    with progress_bar("extracting", len(windows)) as bar:
+        for feature in extract_features(windows, array):
+            features.append(feature)
+            bar.advance()
+    table = feature_table(windows, features)
+    write_features(arguments.out, table)
+    summary = {
+        "out": str(arguments.out),
+        "n_windows": len(table),
+        "n_recordings": len(np.unique(table.recording_keys)),
+        "n_hazard": int(table.hazards.sum()),
+        "n_hazard_free": int(table.hazard_free.sum()),
+    }
+    print_summary(summary, as_json=arguments.json)
+    return 0
