@@ -86,7 +86,8 @@ def _other_lines(health: RecordingHealth) -> Iterator[str]:
     if isinstance(health.sample_rate, RateEstimate):
         rate = health.sample_rate
         ppm = f"{rate.rate_hz:.2f} +- {rate.std_hz:.2f} Hz, {1e6 * rate.error:+.0f} millionths off"
-        yield f"sample rate by the other clock: {ppm}" + (": the header is wrong, or samples are missing" if rate.is_wrong else "")
+        wrong = ": the header is wrong, or samples are missing" if rate.is_wrong else ""
+        yield f"sample rate by the other clock: {ppm}{wrong}"
     if isinstance(health.coherence, NotUsable):
         yield f"swapped, inverted and noisy microphones not judged: {health.coherence.reason}"
 

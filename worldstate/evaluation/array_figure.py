@@ -9,8 +9,8 @@ from worldstate.evaluation.health import RecordingHealth
 from worldstate.frontend.array import MicrophoneArray
 
 COLOURS = {
-    "dead": "black",
-    "intermittent": "tab:gray",
+    "dead": "dimgray",
+    "intermittent": "silver",
     "noisy": "tab:red",
     "inverted": "tab:purple",
     "swapped": "tab:orange",

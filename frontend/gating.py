@@ -1,0 +1,102 @@
+r"""Prominence gating: a bearing is kept where its peak stands out, which trades coverage for accuracy.
+
+.. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
+          e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
+
+over n bearings with peak-to-median ratios rho_i and errors epsilon_i. `AcousticSettings.min_prominence` of the
+acoustic adapter is such a threshold.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.values import NotUsable, wrap_angle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GatingCurve:
+    """What thresholds on prominence do, from keeping all to keeping few.
+
+    Parameters
+    ----------
+    threshold : ndarray, shape (T,)
+        Smallest prominence kept, ascending.
+    coverage : ndarray, shape (T,)
+        Share of the bearings kept, in (0, 1].
+    median_error_rad : ndarray, shape (T,)
+        Median of the absolute errors of these.
+
+    Examples
+    --------
+    >>> curve = gating_curve([1.1, 1.2, 2.0, 3.0], [0.4, 0.3, 0.02, 0.01])
+    >>> curve.coverage, curve.median_error_rad
+    (array([1.  , 0.75, 0.5 , 0.25]), array([0.16 , 0.02 , 0.015, 0.01 ]))
+    """
+
+    threshold: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    median_error_rad: NDArray[np.float64]
+
+    def threshold_for(self, median_error_rad: float) -> float | NotUsable:
+        """Return the lowest threshold from which on the median error stays within the given one.
+
+        Examples
+        --------
+        >>> curve = gating_curve([1.1, 1.2, 2.0, 3.0], [0.4, 0.3, 0.02, 0.01])
+        >>> curve.threshold_for(0.1), curve.threshold_for(0.001)
+        (1.2, NotUsable(reason='no threshold keeps the median error within 0.001 rad'))
+        """
+        too_large = np.flatnonzero(self.median_error_rad > median_error_rad)
+        first = int(too_large[-1]) + 1 if len(too_large) else 0
+        if first == len(self.threshold):
+            return NotUsable(f"no threshold keeps the median error within {median_error_rad:g} rad")
+        return float(self.threshold[first])
+
+
+def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int = 200) -> GatingCurve:
+    """Trade coverage for accuracy on bearings whose errors are known.
+
+    Parameters
+    ----------
+    prominence : array_like, shape (n,)
+        Peak-to-median ratios; n >= 1.
+    error_rad : array_like, shape (n,)
+        Bearing minus truth, wrapped here.
+    max_points : int
+        At most so many thresholds, evenly spread over the coverage.
+
+    Returns
+    -------
+    GatingCurve
+        One point for every prominence that occurs, or an even choice of them; the first keeps all.
+
+    Raises
+    ------
+    InvalidArgumentError
+        On another shape, no bearings, NaN or infinity.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> prominence = 1.0 + rng.exponential(0.5, 2000)
+    >>> curve = gating_curve(prominence, rng.standard_normal(2000) * 0.1 / (prominence - 0.9))
+    >>> len(curve.threshold), bool(curve.median_error_rad[100] < 0.5 * curve.median_error_rad[0])
+    (200, True)
+    """
+    ratios = finite_array("prominence", prominence, (None,))
+    errors = np.abs(wrap_angle(finite_array("error_rad", error_rad, ratios.shape)))
+    in_range("max_points", max_points, 1, np.inf)
+    if not len(ratios):
+        raise InvalidArgumentError("prominence: expected at least one bearing, got none")
+    order = np.argsort(ratios, kind="stable")
+    ratios, errors = ratios[order], errors[order]
+    # Equal prominences are kept or dropped together.
+    starts = np.flatnonzero(np.diff(ratios, prepend=-np.inf))
+    if len(starts) > max_points:
+        starts = starts[np.linspace(0, len(starts) - 1, max_points).round().astype(np.intp)]
+    medians = np.array([np.median(errors[start:]) for start in starts])
+    return GatingCurve(ratios[starts], 1.0 - starts / len(ratios), medians)
