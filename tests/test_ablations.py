@@ -50,6 +50,7 @@ def recording(rng, number, label, d=0.0):
         clutter_rate=np.full(hops, 0.01),
         approach=(heard & ~sight) * 1.5 + rng.normal(size=hops),
         seen=seen,
+        there=sight,
     )
 
 

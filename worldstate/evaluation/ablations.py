@@ -86,8 +86,8 @@ class AblationRow:
     ece, ece_floor, brier : float or None
         Of the risk on the same windows, with its sampling floor.
     awareness, vision_only : float or None
-        Share of the hops after T0 in which a detection is there or P(hidden) + P(visible) is above its
-        threshold, and in which a detection is there.
+        Share of the hops after T0, while the vehicle is in view, in which a detection is there or P(hidden) +
+        P(visible) is above its threshold, and in which a detection is there.
     approach_weight : float
         Mean of the weights chosen.
     """
@@ -324,7 +324,8 @@ def _onsets_s(one: _Scored) -> list[float]:
 
 
 def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[NDArray[np.bool_]]) -> float | None:
-    """Return the share of hops after T0 in which a flag holds."""
-    after = [flag[~one.stream.before_sight] for one, flag in zip(scored, flags, strict=True)]
+    """Return the share of hops after T0, the vehicle in view, in which a flag holds."""
+    streams = [one.stream for one in scored]
+    after = [flag[s.there & ~s.before_sight] for s, flag in zip(streams, flags, strict=True)]
     hops = np.concatenate(after) if after else np.empty(0)
     return float(hops.mean()) if hops.size else None

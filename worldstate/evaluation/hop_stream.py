@@ -1,6 +1,6 @@
 """What a recording said at every hop, kept so that decisions can be tried on it again and again."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -46,6 +46,8 @@ class HopStream:
         1/TTA over its standard deviation; NaN where not usable.
     seen : ndarray of bool, shape (n,)
         Whether a moving object was reported anywhere.
+    there : ndarray of bool, shape (n,)
+        Whether one was in view, by a reference where there is one: what a degraded camera may miss.
 
     Raises
     ------
@@ -69,13 +71,14 @@ class HopStream:
     clutter_rate: Numbers
     approach: Numbers
     seen: NDArray[np.bool_]
+    there: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
         n = np.size(self.time_s)
         for name in ("time_s", "miss_rate", "clutter_rate"):
             finite_array(name, getattr(self, name), (n,))
         finite_array("log_likelihoods", self.log_likelihoods, (n, None))
-        for name in ("answer", "approach", "seen"):
+        for name in ("answer", "approach", "seen", "there"):
             check_shape(name, np.shape(getattr(self, name)), (n,))
         if not np.isin(self.answer, (UNQUERIED, ABSENT, PRESENT)).all():
             raise InvalidArgumentError("answer: expected 0 unqueried, 1 absent or 2 present")
@@ -107,6 +110,7 @@ class HopStream:
             clutter_rate=np.zeros(hops),
             approach=np.full(hops, np.nan),
             seen=np.zeros(hops, dtype=bool),
+            there=np.zeros(hops, dtype=bool),
         )
 
 
@@ -114,7 +118,12 @@ _ARRAYS = tuple(field.name for field in fields(HopStream) if field.name not in (
 
 
 def hop_stream(
-    measurements: Iterable[Measurement], *, name: str, label: str = "none", t0_s: float | None = None
+    measurements: Iterable[Measurement],
+    *,
+    name: str,
+    label: str = "none",
+    t0_s: float | None = None,
+    there: Sequence[bool] | None = None,
 ) -> HopStream:
     """Record what an adapter measured.
 
@@ -124,15 +133,18 @@ def hop_stream(
         One recording in the order of time.
     name, label, t0_s
         As for `HopStream`.
+    there : sequence of bool, optional
+        As for `HopStream`; what was reported itself where not given.
 
     Raises
     ------
     InvalidArgumentError
-        If there is no measurement.
+        If there is no measurement, or another number of flags.
     """
     rows = list(measurements)
     if not rows:
         raise InvalidArgumentError(f"{name}: expected at least one hop, so at least one second of sound")
+    seen = np.array([any(sighting.moving for sighting in row.sightings) for row in rows])
     answers = np.array([_answer(row.co_evidence) for row in rows])
     return HopStream(
         name=name,
@@ -144,7 +156,8 @@ def hop_stream(
         miss_rate=answers[:, 1],
         clutter_rate=answers[:, 2],
         approach=np.array([_approach(row) for row in rows]),
-        seen=np.array([any(sighting.moving for sighting in row.sightings) for row in rows]),
+        seen=seen,
+        there=seen if there is None else np.array(there, dtype=bool),
     )
 
 

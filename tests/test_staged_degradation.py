@@ -1,0 +1,78 @@
+"""End to end: a simulated approach is heard, its camera is degraded frame by frame, and nobody is told."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.camera_health import learn_health
+from worldstate.adapters.detections import read_detections
+from worldstate.adapters.listen import open_source
+from worldstate.adapters.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.motion_detector import MotionDetector
+from worldstate.adapters.ovad import Recording
+from worldstate.adapters.video import open_video
+from worldstate.adapters.vision import VisionSettings
+from worldstate.adapters.watched_camera import any_motion, watch
+from worldstate.errors import InvalidArgumentError
+from worldstate.evaluation.staged_degradation import Staging, staged_streams
+
+CAMERA = PinholeCamera()
+WIDTH, HEIGHT = 484, 304
+SMALL = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+
+
+def render(log):
+    """A textured street with the reference boxes drawn as textured cars."""
+    rng = np.random.default_rng(0)
+    scene = 110.0 + 25.0 * gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 1.2) / 0.2
+    body = 200.0 + 60.0 * gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 3.0) / 0.1
+    scale = np.array([WIDTH / CAMERA.width_px, HEIGHT / CAMERA.height_px] * 2)
+    for frame in log.frames:
+        image = scene.copy()
+        for left, top, right, bottom in (frame.boxes_px * scale).astype(int):
+            image[top:bottom, left:right] = body[: bottom - top, : right - left]
+        image = image[:, :, None] + rng.normal(0.0, 2.0, (HEIGHT, WIDTH, 3))
+        yield np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def video(approach, tmp_path_factory):
+    path = tmp_path_factory.mktemp("staged") / "street.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    for frame in render(read_detections(approach.detections_path)):
+        writer.write(frame)
+    writer.release()
+    return open_video(path)
+
+
+@pytest.fixture(scope="module")
+def rates(video):
+    health = learn_health([next(video.frames())], np.random.default_rng(0))
+    rising = FamilyCounts(((100,) * 5,), ((2, 10, 90, 98, 100),), (100,) * 5, (0, 0, 1, 1, 1))
+    return MissRates((0.0, 37.0), {"noise": rising}, health=health)
+
+
+@pytest.mark.xdist_group("approach")
+def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, rates):
+    source, recording = open_source(approach.folder), Recording.open(approach.folder)
+    staging = Staging("noise", MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
+    streams = staged_streams(
+        source, video, staging, (0.0, 1.0), np.random.default_rng(0), name="a", label=recording.label
+    )
+    clean, blind = streams[0.0], streams[1.0]
+    assert np.array_equal(clean.log_likelihoods, blind.log_likelihoods)
+    after = clean.there & ~clean.before_sight
+    assert np.array_equal(clean.there, blind.there)
+    assert clean.seen[after].mean() > 0.7
+    assert blind.seen[after].mean() <= 0.05
+    asked = (clean.answer > 0) & (blind.answer > 0)
+    assert asked.mean() > 0.5
+    assert np.median(clean.miss_rate[asked]) < 0.4
+    assert np.median(blind.miss_rate[asked]) > 0.9
+
+
+def test_without_a_scale_of_health_nothing_is_watched(rates):
+    with pytest.raises(InvalidArgumentError, match="health"):
+        watch([], MotionDetector(), MissRates(rates.azimuth_deg, rates.families))
