@@ -29,7 +29,7 @@ from worldstate.errors import InvalidArgumentError
 
 from .harmonic_cancellation import HarmonicCanceller
 from .phat import whiten
-from .prewhitening import shrunk_inverse_root
+from .prewhitening import shrunk_inverse_root, white_share
 from .steering import Steering, cross_spectra
 
 _TINY = np.float32(1e-30)
@@ -278,11 +278,9 @@ class EgoNoise:
         self._hops_since_refresh = 0
 
     def _update(self, index: int) -> None:
-        n_microphones = self._roots.shape[1]
-        # White noise counts like half as many observations as there are microphones.
-        few = n_microphones / (n_microphones + 2.0 * self.learned_frames)
-        shrinkage = max(self._settings.min_shrinkage, few)
-        self._roots[index] = shrunk_inverse_root(self._covariance.mean(index), shrinkage)
+        R = self._covariance.mean(index)
+        shrinkage = max(self._settings.min_shrinkage, white_share(R, self.learned_frames))
+        self._roots[index] = shrunk_inverse_root(R, shrinkage)
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
                 beams.update(index - bins.start, self._roots[index])

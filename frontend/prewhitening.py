@@ -13,7 +13,8 @@ References
 ----------
 R. Roy and T. Kailath, "ESPRIT", IEEE Trans. ASSP 37, 1989 (generalised eigenvalues). K. Nakamura et al.,
 "Intelligent sound source localization for dynamic environments", IROS 2009 (generalised MUSIC for ego-noise).
-O. Ledoit and M. Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", 2004.
+Y. Chen, A. Wiesel, Y. Eldar and A. Hero, "Shrinkage algorithms for MMSE covariance estimation", IEEE Trans.
+Signal Processing 58, 2010.
 """
 
 from dataclasses import dataclass
@@ -132,6 +133,35 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
         raise InvalidArgumentError(f"noise_covariance: expected shape (bins, M, M), got {R.shape}")
     s = in_range("shrinkage", shrinkage, 0.0, 1.0)
     return np.stack([shrunk_inverse_root(matrix, s) for matrix in R]) if len(R) else R
+
+
+def white_share(R: ComplexArray, n_frames: float) -> float:
+    r"""Say how far a sample covariance should be shrunk towards white noise (oracle-approximating shrinkage).
+
+    .. math:: s = \min\Big(1, \frac{(1 - 2/M) \operatorname{tr} R^2 + \operatorname{tr}^2 R}
+              {(n + 1 - 2/M) (\operatorname{tr} R^2 - \operatorname{tr}^2 R / M)}\Big)
+
+    One where the eigenvalues spread no more than n frames of white noise would make them, so that nothing
+    is whitened that was white; next to nothing where a few directions dominate.
+
+    Parameters
+    ----------
+    R : ndarray of complex, shape (M, M)
+        Mean over the frames.
+    n_frames : float
+        Number of independent frames n >= 0.
+
+    Examples
+    --------
+    >>> white_share(np.eye(4), 100), round(white_share(np.ones((4, 4)), 100), 3)
+    (1.0, 0.02)
+    """
+    size = len(R)
+    squares = float(np.square(R.real).sum() + np.square(R.imag).sum())
+    trace = float(np.einsum("mm->", R).real) ** 2
+    spread = (n_frames + 1.0 - 2.0 / size) * (squares - trace / size)
+    share = (1.0 - 2.0 / size) * squares + trace
+    return share / spread if spread > share else 1.0
 
 
 def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
