@@ -1,7 +1,7 @@
 """Sound in, world-state out: the whole chain over a recording, for those who bring no loop of their own."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +12,13 @@ from worldstate.adapters.array_xml import read_array_xml
 from worldstate.adapters.audio import open_audio
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import DetectionLog, read_detections
+from worldstate.adapters.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.ovad import Recording
 from worldstate.adapters.sector import Sector
+from worldstate.adapters.video import VIDEO_NAME, open_video
 from worldstate.adapters.vision import VisionQuery
+from worldstate.adapters.watched_camera import video_degradation
 from worldstate.filter import WorldFilter
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.stream import AcousticFrame
@@ -47,6 +50,10 @@ class Source:
         Line-of-sight entry where the recording knows it, seconds from its start.
     mask_dead : bool
         Listen without silent channels instead of refusing them.
+    miss_rates : MissRates or None
+        Measured for the camera's detector; the defaults of `VisionQuery` without.
+    degradation : float or callable
+        d of the camera, or a function from the stamp to it.
     """
 
     audio_path: Path
@@ -57,6 +64,8 @@ class Source:
     context: Context
     t0_s: float | None = None
     mask_dead: bool = False
+    miss_rates: MissRates | None = None
+    degradation: float | Callable[[int], float] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +86,7 @@ def open_source(
     alpha: float | None = 0.02,
     context: Context | None = None,
     mask_dead: bool = False,
+    miss_rates: Path | str | MissRates | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
@@ -97,6 +107,9 @@ def open_source(
         Rates, occluders and ego motion; defaults where not given.
     mask_dead : bool
         Listen without silent channels, as long as half of them are left, instead of refusing them.
+    miss_rates : path or MissRates, optional
+        What `worldstate measure-absence` wrote. Where it holds the camera's scale of health and the recording
+        folder has a video, the degradation is read from that.
 
     Raises
     ------
@@ -108,6 +121,7 @@ def open_source(
     path = Path(path)
     recording = Recording.open(path) if path.is_dir() else None
     signature, policies = load_model(model)
+    rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
     found = detections if detections is not None else recording and recording.detections_path
     return Source(
         audio_path=recording.audio_path if recording else path,
@@ -118,7 +132,17 @@ def open_source(
         context=context or Context(),
         t0_s=recording.t0_s if recording and recording.label != "none" else None,
         mask_dead=mask_dead,
+        miss_rates=rates,
+        degradation=_degradation(recording, rates),
     )
+
+
+def _degradation(recording: Recording | None, rates: MissRates | None) -> float | Callable[[int], float]:
+    """Return d as the recording's own video shows it, 0 where there is none to look at."""
+    if recording is None or rates is None or rates.health is None:
+        return 0.0
+    path = recording.path / VIDEO_NAME
+    return video_degradation(open_video(path), rates) if path.is_file() else 0.0
 
 
 def _array(array: Path | str | MicrophoneArray | None) -> MicrophoneArray:
@@ -166,7 +190,15 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
     strict, n_microphones = not source.mask_dead, source.array.n_microphones
     with open_audio(source.audio_path, expect_channels=n_microphones, strict=strict) as audio:
         sight = line_of_sight(source.context)
-        vision = VisionQuery(PinholeCamera(), source.detections, line_of_sight=sight)
+        rates = source.miss_rates
+        vision = VisionQuery(
+            PinholeCamera(),
+            source.detections,
+            rates.table if rates is not None else None,
+            source.degradation,
+            line_of_sight=sight,
+            clutter=rates.clutter_rate if rates is not None else None,
+        )
         adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.model, vision=vision)
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):

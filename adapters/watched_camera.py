@@ -7,14 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.camera_health import DegradationLog, HealthMonitor
+from worldstate.adapters.camera_health import DegradationLog, HealthMonitor, degradation_log
 from worldstate.adapters.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.detector import Detector
 from worldstate.adapters.image_quality import image_quality
 from worldstate.adapters.miss_rates import MissRates
 from worldstate.adapters.sector import Sector
+from worldstate.adapters.video import Video
 from worldstate.adapters.vision import VisionQuery, VisionSettings
 from worldstate.errors import InvalidArgumentError
+from worldstate.values import nanoseconds
 
 Frame = NDArray[np.uint8]
 
@@ -98,6 +100,22 @@ def watch(frames: Iterable[tuple[int, Frame]], detector: Detector, rates: MissRa
     stamps_ns = np.array(stamps, dtype=np.int64)
     log = DetectionLog(tuple(found), stamps_ns, "watched camera")
     return Watched(log, DegradationLog(stamps_ns, np.array(levels)), rates)
+
+
+def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
+    """Read d from every frame of a video that starts with the recording.
+
+    Raises
+    ------
+    InputFileError
+        If no frame can be decoded.
+    InvalidArgumentError
+        If the rates hold no scale of health.
+    """
+    if rates.health is None:
+        raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
+    stamped = ((nanoseconds(i / video.frame_rate_hz), frame) for i, frame in enumerate(video.frames()))
+    return degradation_log(stamped, rates.health, rates.level)
 
 
 def any_motion(label: str = "car") -> DetectionFilter:

@@ -1,18 +1,23 @@
 """End to end: a simulated approach is heard, its camera is degraded frame by frame, and nobody is told."""
 
+import shutil
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.camera_health import learn_health
+from worldstate.adapters.degradation import degrade
 from worldstate.adapters.detections import read_detections
-from worldstate.adapters.listen import open_source
-from worldstate.adapters.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.listen import measure_steps, open_source
+from worldstate.adapters.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.motion_detector import MotionDetector
 from worldstate.adapters.ovad import Recording
-from worldstate.adapters.video import open_video
+from worldstate.adapters.video import VIDEO_NAME, open_video
 from worldstate.adapters.vision import VisionSettings
 from worldstate.adapters.watched_camera import any_motion, watch
 from worldstate.errors import InvalidArgumentError
@@ -71,6 +76,31 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, 
     assert asked.mean() > 0.5
     assert np.median(clean.miss_rate[asked]) < 0.4
     assert np.median(blind.miss_rate[asked]) > 0.9
+
+
+@pytest.mark.xdist_group("approach")
+def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
+    folder = tmp_path / "recording"
+    shutil.copytree(approach.folder, folder)
+    writer = cv2.VideoWriter(str(folder / VIDEO_NAME), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    for number, frame in enumerate(video.frames()):
+        writer.write(degrade(frame, "darkness", 1.0 if number >= 50 else 0.0, np.random.default_rng(0)))
+    writer.release()
+    save_miss_rates(tmp_path / "beta.json", with_darkness := darkening(rates))
+    source = open_source(folder, miss_rates=tmp_path / "beta.json")
+    assert source.miss_rates.table == with_darkness.table
+    assert source.degradation(2_000_000_000) < 0.1 < 0.9 < source.degradation(8_000_000_000)
+    betas = {
+        m.stamp_ns: m.co_evidence.miss_rate
+        for _, m in measure_steps(source)
+        if isinstance(m.co_evidence, Absent)
+    }
+    assert np.median([b for t, b in betas.items() if t < 4_500_000_000]) < 0.4
+    assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
+
+
+def darkening(rates):
+    return replace(rates, families={"darkness": rates.families["noise"]})
 
 
 def test_without_a_scale_of_health_nothing_is_watched(rates):

@@ -38,6 +38,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
     )
+    parser.add_argument(
+        "--miss-rates", type=Path, metavar="JSON", help="of the camera, as measure-absence wrote them"
+    )
     parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
@@ -58,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         model=arguments.model,
         alpha=arguments.alpha,
         mask_dead=arguments.mask_dead,
+        miss_rates=arguments.miss_rates,
     )
     try:
         report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
