@@ -1,11 +1,12 @@
 """The bearing of the strongest source, with a standard deviation and the prominence it was read with."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .peaks import find_peaks
+from .peaks import Peak, find_peaks
 
 # Prominence less one at which noise doubles the variance of a bearing.
 _PROMINENCE_KNEE = 0.15
@@ -93,8 +94,20 @@ def strongest_bearing(
     >>> strongest_bearing(np.zeros(181), grid, 0.06).prominence
     1.0
     """
+    return bearing_of(find_peaks(spectrum, azimuths_rad, max_peaks=1), azimuths_rad, broadside_std_rad)
+
+
+def bearing_of(
+    peaks: Sequence[Peak], azimuths_rad: NDArray[np.float64], broadside_std_rad: float
+) -> AcousticBearing:
+    """Take the first of the peaks that were found on a grid, highest first, for a bearing.
+
+    Examples
+    --------
+    >>> bearing_of([Peak(0.3, 0.5, 2.0)], np.linspace(-1.5, 1.5, 31), 0.06).prominence
+    2.0
+    """
     span = float(azimuths_rad[-1] - azimuths_rad[0])
-    peaks = find_peaks(spectrum, azimuths_rad, max_peaks=1)
     if not peaks:
         middle = float(0.5 * (azimuths_rad[0] + azimuths_rad[-1]))
         return AcousticBearing(middle, bearing_std_rad(middle, 1.0, broadside_std_rad, span), 1.0)

@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 from worldstate.values import NotUsable
 
 from .channel_health import ArrayHealth
+from .geometry import Ambiguity
 from .looming import Looming
+from .music_stage import MusicReading
+from .peaks import Peak
 
 _NOT_WATCHED = NotUsable("microphones were not watched")
 
@@ -26,11 +29,25 @@ class AcousticFrame:
     azimuths_rad : ndarray, shape (A,)
         Grid of `srp`, ascending from right (negative) to left.
     srp : ndarray of float64, shape (A,)
-        SRP-PHAT of the decision window, 0..1.
+        SRP-PHAT of the decision window, 0..1; where elevations are searched, the highest over them.
+    elevations_rad : ndarray, shape (E,)
+        Rows of `srp_map`, ascending.
+    srp_map : ndarray of float64, shape (E, A)
+        SRP-PHAT of the decision window over elevation and azimuth.
     bearing_rad, bearing_std_rad : float
         Strongest peak over the last `bearing_hops` hops.
     prominence : float
         Peak-to-median ratio of the spectrum that the bearing was read from.
+    elevation_rad : float
+        Elevation of that peak.
+    peaks : tuple of Peak
+        All peaks of that spectrum, highest first, at most `max_peaks`; the first is the bearing.
+    ambiguity : str
+        What the array cannot tell apart: see `MicrophoneArray.ambiguity`.
+    twin_bearing_rad : float or NotUsable
+        The azimuth that sounds the same as the bearing to this array.
+    music : MusicReading or NotUsable
+        MUSIC on the decision window; not usable when it is off.
     band_log_energy : ndarray of float64, shape (16,)
         ln mean square of the last hop per band.
     looming : Looming or NotUsable
@@ -47,9 +64,16 @@ class AcousticFrame:
     sample_index: int
     azimuths_rad: NDArray[np.float64]
     srp: NDArray[np.float64]
+    elevations_rad: NDArray[np.float64]
+    srp_map: NDArray[np.float64]
     bearing_rad: float
     bearing_std_rad: float
     prominence: float
+    elevation_rad: float
+    peaks: tuple[Peak, ...]
+    ambiguity: Ambiguity
+    twin_bearing_rad: float | NotUsable
+    music: MusicReading | NotUsable
     band_log_energy: NDArray[np.float64]
     looming: Looming | NotUsable
     feature: NDArray[np.float64]

@@ -3,8 +3,8 @@ r"""Prominence gating: a bearing is kept where its peak stands out, which trades
 .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
           e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
 
-over n bearings with peak-to-median ratios rho_i and errors epsilon_i. `AcousticSettings.min_prominence` of the
-acoustic adapter is such a threshold.
+over n bearings with peak-to-median ratios rho_i and errors epsilon_i. `AcousticSettings.min_prominence` of
+the acoustic adapter is such a threshold.
 """
 
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int
     >>> rng = np.random.default_rng(0)
     >>> prominence = 1.0 + rng.exponential(0.5, 2000)
     >>> curve = gating_curve(prominence, rng.standard_normal(2000) * 0.1 / (prominence - 0.9))
-    >>> len(curve.threshold), bool(curve.median_error_rad[100] < 0.5 * curve.median_error_rad[0])
+    >>> len(curve.threshold), bool(curve.median_error_rad[150] < 0.5 * curve.median_error_rad[0])
     (200, True)
     """
     ratios = finite_array("prominence", prominence, (None,))

@@ -13,6 +13,7 @@ from .ego_noise import EgoNoise
 from .feature import feature_steering, pair_sum, pair_sum_of
 from .harmonic_cancellation import HarmonicCanceller
 from .masking import ChannelMask
+from .music_stage import MusicStage
 from .phat import power, whiten
 from .settings import FrontEndSettings
 from .srp import steered_power
@@ -33,7 +34,7 @@ class HopSums:
         Number of these frames.
     centre : float
         Mean of their middles, samples from the start of the stream.
-    power : ndarray of float64, shape (A,)
+    power : ndarray of float64, shape (E * A,)
         Steered power: see `worldstate.frontend.srp.steered_power`. Where microphones are left out, power and
         pairs are scaled to what all would give.
     pairs : ndarray of complex128, shape (30,)
@@ -76,11 +77,12 @@ class Listener:
             slice(b.start - bins.start, b.stop - bins.start) for b in bands
         )
         frequencies = bin_frequencies_hz(self.srp_bins, sample_rate_hz, nfft)
-        self._beams = Steering.towards(array, frequencies, settings.azimuths_rad(), speed_of_sound_m_s=speed)
+        self._beams = Steering.towards(array, frequencies, *settings.directions_rad(), speed)
         self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft, speed)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft = nfft
         self._n_frames = 0
+        self.music = self._music(array, frequencies, settings)
         self._unwatched = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array.n_microphones, sample_rate_hz, bins, settings)
@@ -93,6 +95,8 @@ class Listener:
         energies = self._frame_energies(powers)
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
         health = self._watch(samples, energies, matrices)
+        if self.music is not None:
+            self.music.push(spectra[:, self._srp])
         health.mask.silence(spectra)
         health.mask.silence(whitened)
         srp, pairs = self._sums(spectra, whitened, matrices, health.mask)
@@ -124,6 +128,17 @@ class Listener:
         else:
             pairs = pair_sum_of(mask.cross(matrices), self._feature_beams)
         return steered_power(*srp) * mask.power_scale, pairs * mask.pair_scale
+
+    def _music(
+        self, array: MicrophoneArray, frequencies_hz: NDArray[np.float64], settings: FrontEndSettings
+    ) -> MusicStage | None:
+        if not settings.music_sources:
+            return None
+        centred = MicrophoneArray(array.centred_m)
+        steering = centred.steering(frequencies_hz, *settings.directions_rad(), settings.speed_of_sound_m_s)
+        azimuths = settings.azimuths_rad()
+        single = steering.astype(np.complex64)
+        return MusicStage(single, azimuths, settings.music_sources, settings.window_hops)
 
     def _monitor(
         self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings

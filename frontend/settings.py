@@ -34,6 +34,14 @@ class FrontEndSettings:
         First and last azimuth searched, left positive.
     azimuth_step_deg : float
         Step of that grid; it must divide the span.
+    elevation_span_deg : (float, float)
+        First and last elevation searched, up positive; only the horizon by default.
+    elevation_step_deg : float
+        Step of that grid; it must divide the span.
+    max_peaks : int
+        At most so many peaks are listed.
+    music_sources : int
+        Sources that MUSIC shall expect, at most as many as microphones less one; 0 leaves MUSIC out.
     srp_band_hz, feature_band_hz, looming_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
     level_bands : int
@@ -68,6 +76,10 @@ class FrontEndSettings:
     bearing_hops: int = 2
     azimuth_span_deg: tuple[float, float] = (-90.0, 90.0)
     azimuth_step_deg: float = 1.0
+    elevation_span_deg: tuple[float, float] = (0.0, 0.0)
+    elevation_step_deg: float = 5.0
+    max_peaks: int = 4
+    music_sources: int = 0
     srp_band_hz: Band = (300.0, 1800.0)
     feature_band_hz: Band = FEATURE_BAND_HZ
     looming_band_hz: Band = (300.0, 1800.0)
@@ -90,6 +102,8 @@ class FrontEndSettings:
         in_range("level_channels", self.level_channels, 1, np.inf)
         in_range("bearing_std_rad", self.bearing_std_rad, 0.0, np.pi, open_low=True)
         in_range("speed_of_sound_m_s", self.speed_of_sound_m_s, 100.0, 10_000.0)
+        in_range("max_peaks", self.max_peaks, 1, 1000)
+        in_range("music_sources", self.music_sources, 0, 1000)
         self._check_grid()
         for name in ("srp_band_hz", "feature_band_hz", "looming_band_hz", "level_band_hz"):
             low, high = getattr(self, name)
@@ -100,14 +114,42 @@ class FrontEndSettings:
         first, last = self.azimuth_span_deg
         in_range("azimuth_span_deg: first", first, -180.0, 180.0)
         in_range("azimuth_span_deg: last", last, first, 180.0, open_low=True)
-        step = in_range("azimuth_step_deg", self.azimuth_step_deg, 0.01, (last - first) / 2)
-        if abs((last - first) / step - round((last - first) / step)) > 1e-9:
-            raise InvalidArgumentError(f"azimuth_step_deg: expected a divisor of {last - first}, got {step}")
+        in_range("azimuth_step_deg", self.azimuth_step_deg, 0.01, (last - first) / 2)
+        _divides("azimuth_step_deg", self.azimuth_step_deg, last - first)
+        lowest, highest = self.elevation_span_deg
+        in_range("elevation_span_deg: first", lowest, -90.0, 90.0)
+        in_range("elevation_span_deg: last", highest, lowest, 90.0)
+        in_range("elevation_step_deg", self.elevation_step_deg, 0.01, 180.0)
+        _divides("elevation_step_deg", self.elevation_step_deg, highest - lowest)
 
     def azimuths_rad(self) -> NDArray[np.float64]:
         """Grid of azimuths, ascending from right to left, radians, shape (A,)."""
-        first, last = self.azimuth_span_deg
-        return np.radians(np.linspace(first, last, round((last - first) / self.azimuth_step_deg) + 1))
+        return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
+
+    def elevations_rad(self) -> NDArray[np.float64]:
+        """Grid of elevations, ascending, radians, shape (E,).
+
+        Examples
+        --------
+        >>> np.degrees(FrontEndSettings(elevation_span_deg=(-10.0, 20.0)).elevations_rad()).round()
+        array([-10.,  -5.,   0.,   5.,  10.,  15.,  20.])
+        """
+        return _grid_rad(self.elevation_span_deg, self.elevation_step_deg)
+
+    def directions_rad(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Azimuth and elevation of every direction, row by row of elevations, shape (E * A,) each."""
+        azimuths, elevations = np.meshgrid(self.azimuths_rad(), self.elevations_rad())
+        return azimuths.ravel(), elevations.ravel()
+
+
+def _grid_rad(span_deg: tuple[float, float], step_deg: float) -> NDArray[np.float64]:
+    first, last = span_deg
+    return np.radians(np.linspace(first, last, round((last - first) / step_deg) + 1))
+
+
+def _divides(name: str, step: float, span: float) -> None:
+    if abs(span / step - round(span / step)) > 1e-9:
+        raise InvalidArgumentError(f"{name}: expected a divisor of {span}, got {step}")
 
 
 def _even(name: str, value: int, low: int, high: int) -> None:

@@ -11,7 +11,7 @@ from worldstate.values import NotUsable, nanoseconds
 
 from .array import MicrophoneArray
 from .bands import SILENCE
-from .bearing import strongest_bearing
+from .bearing import bearing_of
 from .ego_noise import EgoNoise
 from .feature import FEATURE_SEGMENTS, segment_feature
 from .frame import AcousticFrame
@@ -19,14 +19,18 @@ from .hops import Hop, HopCutter
 from .levels import LevelMeter
 from .listener import HopSums, Listener
 from .looming import Looming, looming
+from .music_stage import MusicReading
+from .peaks import find_peaks
 from .settings import FrontEndSettings
 from .srp import normalised
 from .threads import one_blas_thread
+from .twins import twin_azimuth_rad, twin_reflection
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
 # Far above any converter's full scale; its power over a frame still fits single precision.
 _LOUDEST = 1e15
+_MUSIC_IS_OFF = NotUsable("MUSIC is off: see FrontEndSettings.music_sources")
 
 
 class FrontEnd:
@@ -82,21 +86,27 @@ class FrontEnd:
                 f"nfft: expected at most one hop of {hop:.0f} samples, got {settings.nfft}"
             )
         self._start_ns = start_ns
+        self._n_taken = 0
         self._azimuths = settings.azimuths_rad()
-        self._azimuths.flags.writeable = False
+        self._elevations = settings.elevations_rad()
+        self._azimuths.flags.writeable = self._elevations.flags.writeable = False
+        self._ambiguity, self._twin = array.ambiguity, twin_reflection(array)
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
         with one_blas_thread():
             self._listener = Listener(array, self.sample_rate_hz, settings)
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
 
-    def process(self, block: ArrayLike) -> list[AcousticFrame]:
+    def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
         """Take the next samples, give one frame for every hop that they complete after the first window.
 
         Parameters
         ----------
         block : array_like, shape (n, M)
             Any n, from a single sample to a whole file; converted to float32.
+        captured_ns : int, optional
+            When the last of these samples was captured by the caller's clock, nanoseconds; measures the
+            sample rate (`AcousticFrame.health`) and changes nothing else.
 
         Raises
         ------
@@ -104,7 +114,11 @@ class FrontEnd:
             On another number of channels, values that are no numbers, NaN, infinity or beyond 1e15; the
             stream is left as it was.
         """
-        frames = (self._hear(hop) for hop in self._cutter.cut(self._checked(block)))
+        samples = self._checked(block)
+        self._n_taken += len(samples)
+        if captured_ns is not None and self._listener.monitor is not None:
+            self._listener.monitor.clock.read(self._n_taken, captured_ns)
+        frames = (self._hear(hop) for hop in self._cutter.cut(samples))
         return [frame for frame in frames if frame is not None]
 
     def learn_ego_noise(self, none_probability: float) -> None:
@@ -178,17 +192,24 @@ class FrontEnd:
 
     def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
         settings = self.settings
-        bearing = strongest_bearing(
-            self._srp(settings.bearing_hops), self._azimuths, settings.bearing_std_rad
-        )
+        recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
+        peaks = find_peaks(recent.max(axis=0), self._azimuths, max_peaks=settings.max_peaks)
+        bearing = bearing_of(peaks, self._azimuths, settings.bearing_std_rad)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
             sample_index=hop.end,
             azimuths_rad=self._azimuths,
-            srp=self._srp(settings.window_hops),
+            srp=window.max(axis=0),
+            elevations_rad=self._elevations,
+            srp_map=window,
             bearing_rad=bearing.azimuth_rad,
             bearing_std_rad=bearing.std_rad,
             prominence=bearing.prominence,
+            elevation_rad=self._elevation_rad(recent, bearing.azimuth_rad),
+            peaks=peaks,
+            ambiguity=self._ambiguity,
+            twin_bearing_rad=twin_azimuth_rad(self._twin, bearing.azimuth_rad),
+            music=self._music(),
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),
@@ -205,10 +226,25 @@ class FrontEnd:
         return self._hops[-1].health.mask.keep
 
     def _srp(self, n_hops: int) -> NDArray[np.float64]:
+        """SRP-PHAT of the last hops, (E, A)."""
         hops = self._last(n_hops)
         total = np.sum([hop.power for hop in hops], axis=0)
         n_frames = sum(hop.n_frames for hop in hops)
-        return normalised(total, n_frames, len(self._listener.srp_bins), self.array.n_microphones)
+        power = normalised(total, n_frames, len(self._listener.srp_bins), self.array.n_microphones)
+        return power.reshape(len(self._elevations), len(self._azimuths))
+
+    def _elevation_rad(self, spectrum: NDArray[np.float64], azimuth_rad: float) -> float:
+        """Elevation of the peak next to an azimuth, interpolated where the grid has three."""
+        column = spectrum[:, np.abs(self._azimuths - azimuth_rad).argmin()]
+        if len(column) < 3 or not column.any():
+            return float(self._elevations[column.argmax()])
+        return find_peaks(column, self._elevations, max_peaks=1)[0].azimuth_rad
+
+    def _music(self) -> MusicReading | NotUsable:
+        if self._listener.music is None:
+            return _MUSIC_IS_OFF
+        with one_blas_thread():
+            return self._listener.music.read(self._hops[-1].health.mask)
 
     def _age_s(self, n_hops: int, end: int) -> float:
         hops = self._last(n_hops)
