@@ -1,0 +1,207 @@
+r"""What a class of road user is like: how it sounds, what a camera would call it, what physics ties together.
+
+A coupling says what an observable of the signature is worth at a given radial speed, as curves over speed. It
+can be tested by itself and switched off.
+
+References
+----------
+Light vehicles, rolling and propulsion noise in octave bands over speed: European Commission, Directive
+2015/996 (CNOSSOS-EU), annex, tables of category 1.
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.checks import finite_array, in_range
+from worldstate.errors import InvalidArgumentError
+
+SPEED_OF_SOUND_M_S = 343.0
+# Total ratio of gearbox and final drive, first to fifth gear of a passenger car.
+GEAR_RATIOS = (14.0, 8.0, 5.4, 4.1, 3.3)
+WHEEL_RADIUS_M = 0.3
+FIRINGS_PER_TURN = 2.0
+IDLE_HZ = 25.0
+REFERENCE_SPEED_M_S = 70.0 / 3.6
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Coupling:
+    """An observable that depends on the radial speed.
+
+    Parameters
+    ----------
+    observable : str
+        Its name, unit included.
+    speed_m_s : tuple of float
+        Knots, rising; speed towards the listener is positive.
+    curves : tuple of tuple of float
+        Values at the knots, linear between and constant beyond; several where one of them holds but not
+        known which, such as the gear, all equally likely.
+    std : float
+        How far a source of this class scatters about its curve, in the observable's unit, > 0.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If knots do not rise, a curve is of another length or a number is out of range.
+
+    Examples
+    --------
+    >>> Coupling("spacing_hz", (0.0, 10.0), ((0.0, 100.0),), 5.0).expected([5.0])
+    array([[50.]])
+    """
+
+    observable: str
+    speed_m_s: tuple[float, ...]
+    curves: tuple[tuple[float, ...], ...]
+    std: float
+
+    def __post_init__(self) -> None:
+        knots = finite_array("speed_m_s", self.speed_m_s, (None,))
+        if not knots.size or (np.diff(knots) <= 0).any() or not self.curves:
+            raise InvalidArgumentError("coupling: expected rising speeds and at least one curve")
+        for curve in self.curves:
+            finite_array("curves", curve, (knots.size,))
+        in_range("std", self.std, 0.0, np.inf, open_low=True, open_high=True)
+
+    def expected(self, radial_speed_m_s: ArrayLike) -> Numbers:
+        """Return the value on every curve, shape (curves, n)."""
+        speed = np.asarray(radial_speed_m_s, dtype=np.float64)
+        return np.stack([np.interp(speed, self.speed_m_s, curve) for curve in self.curves])
+
+    def log_likelihood(self, value: float, value_std: float, radial_speed_m_s: ArrayLike) -> Numbers:
+        r"""Return log p(value | c, v_r) at each speed, shape (n,), nats.
+
+        .. math:: p = \frac{1}{G} \sum_g N\big(value;\ f_g(v_r),\ \sigma_c^2 + \sigma_{value}^2\big)
+        """
+        expected = self.expected(radial_speed_m_s)
+        variance = self.std**2 + value_std**2
+        log_density = -0.5 * ((value - expected) ** 2 / variance + np.log(2 * pi * variance))
+        return np.asarray(np.logaddexp.reduce(log_density, axis=0) - np.log(len(expected)))
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptor:
+    """One class of road user.
+
+    Parameters
+    ----------
+    name : str
+        Of the class.
+    labels : tuple of str
+        What a camera would report if it were in plain view: the co-evidence that its signature predicts.
+    weight : float
+        Prior share among all classes, > 0; shares are normalised by the model.
+    speed_mean_m_s, speed_std_m_s : float
+        Of the radial speed of one that approaches, a normal law cut off at the model's speeds.
+    couplings : tuple of Coupling
+        At most one for each observable.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or an observable is coupled twice.
+
+    Examples
+    --------
+    >>> car().labels
+    ('car', 'truck', 'bus')
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    weight: float
+    speed_mean_m_s: float
+    speed_std_m_s: float
+    couplings: tuple[Coupling, ...] = ()
+
+    def __post_init__(self) -> None:
+        in_range("weight", self.weight, 0.0, np.inf, open_low=True, open_high=True)
+        finite_array("speed_mean_m_s", self.speed_mean_m_s, ())
+        in_range("speed_std_m_s", self.speed_std_m_s, 0.0, np.inf, open_low=True, open_high=True)
+        names = [coupling.observable for coupling in self.couplings]
+        if len(set(names)) != len(names):
+            raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
+
+    def log_speed_prior(self, radial_speed_m_s: Numbers) -> Numbers:
+        """Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats."""
+        log_weight = -0.5 * ((radial_speed_m_s - self.speed_mean_m_s) / self.speed_std_m_s) ** 2
+        return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
+
+
+def engine_line(std_hz: float = 4.0) -> Coupling:
+    r"""Spacing of the engine's harmonics over speed, one curve a gear.
+
+    .. math:: f = \max\Big( f_{idle},\ \frac{n_f\, G\, |v|}{2 \pi R} \Big)
+
+    with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
+
+    Examples
+    --------
+    >>> engine_line().expected([10.0]).round(0).ravel()
+    array([149.,  85.,  57.,  44.,  35.])
+    """
+    speed = np.linspace(-40.0, 40.0, 161)
+    per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
+    curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(speed)) for ratio in GEAR_RATIOS]
+    return Coupling("line_spacing_hz", _tuple(speed), tuple(map(_tuple, curves)), std_hz)
+
+
+def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
+    r"""Level of the 1 kHz octave above that of 125 Hz: rolling noise takes over from the engine with speed.
+
+    Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
+    with v_0 = 70 km/h; below 10 km/h it is held constant.
+
+    Examples
+    --------
+    >>> tyre_noise_shape().expected([5.0, 10.0, 20.0]).round(0)
+    array([[-3.,  3.,  7.]])
+    """
+    speed = np.linspace(-40.0, 40.0, 161)
+    at = np.maximum(np.abs(speed), 10.0 / 3.6)
+    low = _octave_db(at, rolling=(85.7, 41.5), propulsion=(89.2, 7.2))
+    high = _octave_db(at, rolling=(97.3, 32.5), propulsion=(84.2, 8.0))
+    return Coupling("tyre_shape_db", _tuple(speed), (_tuple(high - low),), std_db)
+
+
+def doppler_trajectory(std: float = 0.01) -> Coupling:
+    """Ratio of the frequencies heard before and after a pass-by: (c + v) / (c - v).
+
+    Examples
+    --------
+    >>> doppler_trajectory().expected([10.0]).round(3)
+    array([[1.06]])
+    """
+    speed = np.linspace(-40.0, 40.0, 161)
+    ratio = (SPEED_OF_SOUND_M_S + speed) / (SPEED_OF_SOUND_M_S - speed)
+    return Coupling("doppler_ratio", _tuple(speed), (_tuple(ratio),), std)
+
+
+def car() -> Descriptor:
+    """Return a motor vehicle that approaches at town speed, all three couplings in place."""
+    couplings = (engine_line(), tyre_noise_shape(), doppler_trajectory())
+    return Descriptor("motor_vehicle", ("car", "truck", "bus"), 0.9, 8.0, 4.0, couplings)
+
+
+def motorcycle() -> Descriptor:
+    """Return a motorcycle: faster, with an engine line of its own gearing left open."""
+    return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
+
+
+def _octave_db(
+    speed_m_s: Numbers, rolling: tuple[float, float], propulsion: tuple[float, float]
+) -> Numbers:
+    ratio = speed_m_s / REFERENCE_SPEED_M_S
+    rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
+    propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)
+    return np.asarray(10.0 * np.log10(10.0 ** (rolling_db / 10.0) + 10.0 ** (propulsion_db / 10.0)))
+
+
+def _tuple(values: Numbers) -> tuple[float, ...]:
+    return tuple(values.tolist())
