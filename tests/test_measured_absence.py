@@ -235,9 +235,9 @@ def test_present_and_absent_share_one_model_of_miss_and_clutter(beta, clutter):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("video")
-    video = open_video(write_video(folder / "street.mp4", street(36, speed_px=16.0)))
+    video = open_video(write_video(folder / "street.mp4", street(26, speed_px=16.0)))
     camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
-    return Scene(video, reference(36, 16.0), camera)
+    return Scene(video, reference(26, 16.0), camera)
 
 
 def test_beta_rises_from_a_tenth_to_nine_tenths(scene):
@@ -262,7 +262,7 @@ def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_cl
             everywhere = np.array([[x, 0.0, x + 40.0, 60.0] for x in range(0, WIDTH - 40, 40)])
             return DetectionFrame(everywhere, np.ones(len(everywhere)), ("car",) * len(everywhere))
 
-    chosen = AbsenceSettings(families=("darkness",))
+    chosen = AbsenceSettings(families=("darkness",), warm_up=20)
     for make, clutter in ((Blind, 0.0), (Raving, 1.0)):
         rates = measure_absence([scene], make, np.random.default_rng(0), chosen)
         family = rates.families["darkness"]

@@ -52,6 +52,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)"
     )
     parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    parser.add_argument(
+        "--keep", type=float, metavar="N", help="let the threshold move to keep N false alarms an hour"
+    )
     parser.add_argument("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     parser.set_defaults(run=run)
@@ -71,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         method=arguments.method,
         confidence=arguments.confidence,
         block_s=arguments.block,
+        keep_per_hour=arguments.keep,
     )
     model = read_model(arguments.model)
     streams = _streams(arguments)

@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.abduction.adaptive_threshold import AdaptiveBudget
 from worldstate.abduction.conformal import conformal_threshold, recordings_needed
 from worldstate.abduction.correlation import correlation_time_hops
-from worldstate.abduction.cueing import CueingPolicies, CueingPolicy
+from worldstate.abduction.cueing import CueingPolicies, CueingPolicy, sustained_statistic
 from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.risk_map import IsotonicMap, RiskMap, fit_risk_map
 from worldstate.checks import in_range
@@ -45,6 +46,10 @@ class CueingSettings:
         should be longer than the correlation time of the statistic.
     folds : int
         Of the recording-level folds that the achieved rate is measured by, >= 2.
+    keep_per_hour : float, optional
+        False alarms per hour that the filter is to keep while it runs, by moving the threshold. With
+        approaches at hand it never moves beyond the level that half of them reach: those are announced come
+        what may.
 
     Raises
     ------
@@ -63,6 +68,7 @@ class CueingSettings:
     confidence: float | None = None
     block_s: float = 10.0
     folds: int = 5
+    keep_per_hour: float | None = None
 
     def __post_init__(self) -> None:
         if not self.alphas:
@@ -73,6 +79,8 @@ class CueingSettings:
             in_range("confidence", self.confidence, 0.0, 1.0, open_low=True, open_high=True)
         in_range("block_s", self.block_s, 1.0, 3600.0)
         in_range("folds", self.folds, 2, 1000)
+        if self.keep_per_hour is not None:
+            AdaptiveBudget(self.keep_per_hour)
         if self.method not in ("conformal", "plain"):
             raise InvalidArgumentError(f"method: expected conformal or plain, got {self.method!r:.40}")
 
@@ -198,11 +206,13 @@ def calibrate_cueing(
     for beta in sorted(MISS_RATES):
         calm = _statistics(free, reference_prior, beta)
         tau = correlation_time_hops(calm)
-        risk = _risk_map(calm, _hazards(approaches, reference_prior, beta), tau, _risk_of(kept, beta))
+        hazards = _hazards(approaches, reference_prior, beta)
+        risk = _risk_map(calm, hazards, tau, _risk_of(kept, beta))
+        adaptive, hops = _adaptive(hazards, chosen), chosen.sustain_hops
         for report in (_budget(calm, alpha, beta, chosen) for alpha in chosen.alphas):
             budgets.append(report)
             policies.append(
-                CueingPolicy(report.gamma, chosen.sustain_hops, report.alpha, reference_prior, risk, beta)
+                CueingPolicy(report.gamma, hops, report.alpha, reference_prior, risk, beta, adaptive)
             )
     blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
     tau = correlation_time_hops(_statistics(free, reference_prior, 0.0))
@@ -273,6 +283,17 @@ def _risk_map(calm: list[Numbers], hazards: list[Numbers], time_hops: float, kep
     scores = np.concatenate([*calm, *hazards])
     labels = np.arange(scores.size) >= sum(s.size for s in calm)
     return fit_risk_map(scores, labels, independent=scores.size / time_hops)
+
+
+def _adaptive(hazards: list[Numbers], settings: CueingSettings) -> AdaptiveBudget | None:
+    """Return the rate to keep, its threshold bounded by what half of the approaches reach."""
+    if settings.keep_per_hour is None:
+        return None
+    peaks = [sustained_statistic(scores, settings.sustain_hops).max() for scores in hazards]
+    reached = float(np.median(peaks)) if peaks else -np.inf
+    if not 0.0 < reached < 1.0:
+        return AdaptiveBudget(settings.keep_per_hour)
+    return AdaptiveBudget(settings.keep_per_hour, highest=reached)
 
 
 def _risk_of(policies: CueingPolicies, beta: float) -> RiskMap:
