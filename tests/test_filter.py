@@ -245,6 +245,16 @@ def test_a_vehicle_heard_on_the_wrong_side_is_still_the_one_heard():
     assert after.direction == "right"
 
 
+def test_a_missed_frame_just_after_hand_over_is_no_new_hazard():
+    """The window still holds the sound from before; the source that came into view explains it."""
+    loud = (0.97, 0.01, 0.01, 0.01)
+    script = [measured(t, loud) for t in hops(1.0, 3.0)] + [measured(3.0, loud, car(0.5))]
+    world, _ = run(start(), script)
+    assert world.explanation.visible > 0.9
+    missed = world.update(measured(3.1, loud, answer=Absent(0.1)))
+    assert missed.explanation.visible > missed.explanation.hidden_total
+
+
 def test_a_faint_belief_is_not_handed_over():
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, QUIET) for t in hops(4.0, 5.0)]
     settings_ = FilterSettings(death_probability=1e-3)

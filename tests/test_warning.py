@@ -27,7 +27,7 @@ def test_lead_time_counts_from_the_first_onset_within_five_seconds():
     assert got.lead_time_s == 2.5
     assert got.first_advisory_s == 5.5
     assert got.false_advisories_before == 1
-    assert got.hidden_entity_id == "heard"
+    assert got.hidden_entity_id == "again"
 
 
 def test_an_advisory_after_line_of_sight_leads_nothing():

@@ -7,6 +7,7 @@ import numpy as np
 
 from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing import CueingPolicy
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import abduce
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.hearing import hear, hidden_share
@@ -80,8 +81,9 @@ def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: G
     base = memory.trail.base(source, stamp_ns, window_ns)
     prior = base.belief.predict(ground.context.rates.values_hz, stamp_ns - base.stamp_ns)
     answer = log_co_evidence(measurement.co_evidence, len(ground.scene.sides))
-    explanation = prior.update(measurement.signature, answer + base.log_likelihoods)
-    said = np.maximum(measurement.signature.log_likelihoods + answer, LOG_FLOOR)
+    signature = _with_hand_overs(measurement.signature, memory.handover_ns, stamp_ns - window_ns)
+    explanation = prior.update(signature, answer + base.log_likelihoods)
+    said = np.maximum(signature.log_likelihoods + answer, LOG_FLOOR)
     heard = Heard(source, stamp_ns, tuple(said.tolist()))
     return replace(
         memory,
@@ -90,6 +92,18 @@ def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: G
         tracks=hear(memory.tracks, measurement, explanation, weights.sound, settings),
         predicted=priors_of(prior),
     )
+
+
+def _with_hand_overs(
+    signature: SignatureEvidence, handover_ns: tuple[int | None, ...], begin_ns: int
+) -> SignatureEvidence:
+    """Return the signature, a source in view explaining what it sounded like while it still hid.
+
+    The window that begins at `begin_ns` holds sound from before a hand-over within it.
+    """
+    pairs = zip(signature.hidden, handover_ns, strict=True)
+    before = [hidden for hidden, stamp_ns in pairs if stamp_ns is not None and stamp_ns > begin_ns]
+    return replace(signature, visible=max([signature.visible, *before]))
 
 
 def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:

@@ -2,12 +2,21 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate.cli.output import print_summary
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from worldstate.adapters.simulation import SimulationSettings
+
+VAN_OVER_CAR_DB = 6.0
+
 DESCRIPTION = """\
-Simulate a vehicle that approaches a blind junction, listen to it, and watch it enter the world-state seconds
+Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
 before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder."""
 
 
@@ -29,21 +38,30 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def simulate_approach(root: Path, seed: int) -> Path:
-    """Write one recording of a vehicle that `seed` puts at a site and on a side; return its folder."""
+    """Write one recording of a van that `seed` puts at a site and on a side; return its folder."""
     import numpy as np
 
     from worldstate.adapters import simulation
     from worldstate.cli.progress import progress_bar
 
     rng = np.random.default_rng(seed)
-    site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
-    settings = simulation.draw_settings(site, side, rng)
+    settings = _delivery_van(rng)
     root.mkdir(parents=True, exist_ok=True)
     with progress_bar(f"simulating {settings.duration_s:g} s at {settings.site.name}", None):
         recording = simulation.simulate_recording(settings, rng)
         row = simulation.write_recording(root, recording)
     simulation.write_log(root, [row])
     return root / row.folder
+
+
+def _delivery_van(rng: "np.random.Generator") -> "SimulationSettings":
+    """Return an easy approach: a van, louder than a car, at 20 to 29 km/h without braking."""
+    from worldstate.adapters import simulation
+
+    site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
+    drawn = simulation.draw_settings(site, side, rng)
+    louder = replace(drawn.preset, vehicle_level_db=drawn.preset.vehicle_level_db + VAN_OVER_CAR_DB)
+    return replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
 
 
 def run(arguments: argparse.Namespace) -> int:

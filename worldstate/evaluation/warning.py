@@ -24,7 +24,8 @@ class WarningSummary:
     advisory_onsets_s : tuple of float
         All rising edges of the advisory.
     hidden_entity_id : str or None
-        The entity that the counted advisory spoke of.
+        The entity that the last advisory before `t0_s` spoke of; without a `t0_s`, or where none led, that of
+        the first advisory counted.
     visible_entity_id : str or None
         The first moving entity that came into view.
     """
@@ -51,6 +52,7 @@ class WarningMeter:
     t0_s: float | None
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
+    _hidden_id: str | None = None
     _visible_id: str | None = None
 
     def update(self, state: WorldState) -> None:
@@ -59,6 +61,8 @@ class WarningMeter:
         if raised and not self._raised:
             self._onsets.append((seconds(state.stamp_ns), _strongest(raised).entity_id))
         self._raised = bool(raised)
+        if raised and self.t0_s is not None and seconds(state.stamp_ns) < self.t0_s:
+            self._hidden_id = _strongest(raised).entity_id or self._hidden_id
         if self._visible_id is None:
             self._visible_id = _first_visible(state)
 
@@ -66,14 +70,15 @@ class WarningMeter:
         """Return the figures of all states so far."""
         onsets_s = tuple(time_s for time_s, _ in self._onsets)
         found = None if self.t0_s is None else detection(onsets_s, self.t0_s)
-        first_s, hidden_id = next(filter(self._speaks_of_vehicle, self._onsets), (None, None))
+        counted = list(filter(self._speaks_of_vehicle, self._onsets))
+        first_s, hidden_id = next(iter(counted), (None, None))
         return WarningSummary(
             t0_s=self.t0_s,
             first_advisory_s=first_s,
             lead_time_s=found.lead_time_s if found else None,
             false_advisories_before=found.false_advisories_before if found else len(onsets_s),
             advisory_onsets_s=onsets_s,
-            hidden_entity_id=hidden_id,
+            hidden_entity_id=self._hidden_id or hidden_id,
             visible_entity_id=self._visible_id,
         )
 
