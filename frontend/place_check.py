@@ -21,6 +21,8 @@ _SUSPECT, _WELL = 0.3, 0.45
 # How much better another place must fit. Simulated streets: right places lose by 0.18 at most, swapped
 # channels that stand 9 cm or more apart across the road gain 0.25 to 0.75.
 _MARGIN = 0.3
+# ... and how much the channel that belongs there must gain by leaving: it does not sit there either.
+_OTHER_MARGIN = 0.1
 
 
 class PlaceCheck:
@@ -106,7 +108,7 @@ class PlaceCheck:
         limit = typical * np.where(self._suspects, _WELL, _SUSPECT)
         own = scores.diagonal()
         inverted = there & (own < -limit)
-        swapped = displaced(scores, there & ~inverted & (scores.max(axis=1) > limit))
+        swapped = displaced(scores, there & ~inverted & (scores.max(axis=1) > 0.5 * limit))
         noisy = there & ~inverted & (own < limit)
         noisy[[fault.channel for fault in swapped]] = False
         self._suspects = noisy | inverted
@@ -144,7 +146,11 @@ def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> lis
     table = scores[np.ix_(seated, seated)]
     best = linear_sum_assignment(table, maximize=True)[1]
     gain = table[np.arange(len(seated)), best] - table.diagonal()
+    leaves = gain > _OTHER_MARGIN
+    found = (gain > _MARGIN) & leaves[best]
+    # Of two that trade places, one that is sure names the other.
+    found |= (best[best] == np.arange(len(seated))) & found[best] & leaves
     return [
         ChannelFault(int(seated[i]), Fault.SWAPPED, float(gain[i]), looks_like=int(seated[best[i]]))
-        for i in np.flatnonzero(gain > _MARGIN)
+        for i in np.flatnonzero(found)
     ]
