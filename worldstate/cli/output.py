@@ -22,7 +22,7 @@ def print_summary(summary: Mapping[str, object], *, as_json: bool) -> None:
 
 
 def _readable(value: object) -> str:
-    if value is None or value == ():
+    if value is None or value in ((), []):
         return "-"
     if isinstance(value, float):
         return f"{value:.4g}"
