@@ -19,6 +19,7 @@ COMMANDS = (
     "measure_absence",
     "evaluate_features",
     "extract_features",
+    "twin",
 )
 
 

@@ -1,0 +1,142 @@
+"""What of a simulated recording the published figures need: listened to once, by the whole front-end."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.any_signature import AnySignature
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.listen import line_of_sight
+from worldstate.adapters.simulation import SimulatedRecording
+from worldstate.adapters.simulation.detector import FRAME_RATE_HZ
+from worldstate.adapters.simulation.vehicle import LENGTH_M
+from worldstate.adapters.vision import VisionQuery
+from worldstate.evaluation.hop_stream import hop_stream
+from worldstate.evaluation.stream_statistic import stream_statistic
+from worldstate.evaluation.twin_recording import NONE_APPROACH, TwinRecording
+from worldstate.frontend.array import MicrophoneArray, roof_array_56
+from worldstate.frontend.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.doppler import DopplerSettings, radial_speed
+from worldstate.frontend.harmonics import track_fundamental
+from worldstate.frontend.music import music_spectrum, signal_subspace
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stft import StreamingStft
+from worldstate.frontend.stream import AcousticFrame
+from worldstate.frontend.threads import one_blas_thread
+from worldstate.state import Context
+from worldstate.values import NotUsable, nanoseconds, seconds
+
+Numbers = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
+DOPPLER = DopplerSettings(min_lines=2)
+# Half a camera period: the frame nearest in time to the middle of a bearing's window is the one to compare.
+NEAREST_S = 0.5 / FRAME_RATE_HZ
+
+
+def hear(recording: SimulatedRecording, signature: AnySignature, name: str = "") -> TwinRecording:
+    """Listen to a recording of the 56-microphone roof array.
+
+    Parameters
+    ----------
+    recording : SimulatedRecording
+        At least a second long.
+    signature : SignatureModel
+        From features to likelihoods.
+    name : str
+        For the report.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If it is shorter than a second.
+    """
+    array = roof_array_56()
+    vision = VisionQuery(PinholeCamera(), detection_log(recording), line_of_sight=line_of_sight(Context()))
+    adapter = AcousticAdapter(array, recording.sample_rate_hz, signature, vision=vision)
+    frames = adapter.front_end.process(recording.audio)
+    stream = hop_stream((adapter.interpret(frame) for frame in frames), name=name)
+    joint = stream.log_likelihoods + np.log(signature.reference_prior)
+    reference = np.array([_reference(frame, vision) for frame in frames])
+    settings = recording.truth["settings"]
+    approaches = settings["approach"] != NONE_APPROACH
+    return TwinRecording(
+        name=name,
+        site=settings["site"]["name"],
+        approach=settings["approach"],
+        t0_s=recording.t0_frame / FRAME_RATE_HZ if approaches else np.nan,
+        pass_s=pass_time_s(recording) if approaches else np.nan,
+        doppler=_doppler(recording, array) if approaches else "no vehicle",
+        time_s=stream.time_s,
+        posteriors=np.exp(joint - np.logaddexp.reduce(joint, axis=1, keepdims=True)),
+        statistic=stream_statistic(stream, signature.reference_prior),
+        prominence=np.array([frame.srp.max() / np.median(frame.srp) for frame in frames]),
+        log_slope_hz=np.array([_log_slope(frame) for frame in frames]),
+        reference_rad=reference,
+        srp_rad=np.where(np.isfinite(reference), [frame.bearing_rad for frame in frames], np.nan),
+        music_rad=_music(recording, array, frames, np.isfinite(reference)),
+    )
+
+
+def detection_log(recording: SimulatedRecording) -> DetectionLog:
+    """Return the boxes of a simulated recording as the camera adapter reads them."""
+    frames = [
+        DetectionFrame(
+            np.array([seen.box_px for seen in frame], dtype=np.float64).reshape(-1, 4),
+            np.array([seen.score for seen in frame], dtype=np.float64),
+            tuple(seen.label for seen in frame),
+        )
+        for frame in recording.detections
+    ]
+    return DetectionLog.at_rate(frames, FRAME_RATE_HZ)
+
+
+def pass_time_s(recording: SimulatedRecording) -> float:
+    """Return when the middle of the vehicle crosses the ego's axis; beyond the end at its last speed."""
+    frames = recording.truth["frames"]
+    heading = -1.0 if recording.truth["settings"]["approach"] == "left" else 1.0
+    time = np.array([frame["time_s"] for frame in frames])
+    done = heading * np.array([frame["position_m"][1] for frame in frames]) - 0.5 * LENGTH_M
+    if done[-1] >= 0.0:
+        return float(np.interp(0.0, done, time))
+    return float(time[-1] - done[-1] / frames[-1]["speed_mps"])
+
+
+def _reference(frame: AcousticFrame, vision: VisionQuery) -> float:
+    """Azimuth of the moving box that is nearest to the acoustic bearing, NaN without one."""
+    stamp = nanoseconds(seconds(frame.stamp_ns) - frame.bearing_age_s + NEAREST_S)
+    moving = [seen.azimuth_rad for seen in vision.sightings(stamp) if seen.moving]
+    return min(moving, key=lambda azimuth: abs(azimuth - frame.bearing_rad), default=np.nan)
+
+
+def _log_slope(frame: AcousticFrame) -> float:
+    return np.nan if isinstance(frame.looming, NotUsable) else frame.looming.log_slope_hz
+
+
+def _doppler(recording: SimulatedRecording, array: MicrophoneArray) -> str:
+    """Why the tone of the pass-by cannot be used, at the microphone nearest to the centre; else nothing."""
+    middle = int(np.argmin(np.linalg.norm(array.centred_m, axis=1)))
+    track = track_fundamental(recording.audio[:, middle], recording.sample_rate_hz)
+    found = radial_speed(track, DOPPLER)
+    return found.reason if isinstance(found, NotUsable) else ""
+
+
+def _music(
+    recording: SimulatedRecording, array: MicrophoneArray, frames: list[AcousticFrame], wanted: Flags
+) -> Numbers:
+    """MUSIC bearings of the very samples that the SRP bearings were read from, NaN where not wanted."""
+    chosen, rate = FrontEndSettings(), recording.sample_rate_hz
+    bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)
+    azimuths = chosen.azimuths_rad()
+    steering = array.steering(bin_frequencies_hz(bins, rate, chosen.nfft), azimuths).astype(np.complex64)
+    length = round(chosen.bearing_hops * rate / chosen.hop_rate_hz)
+    bearings = np.full(len(frames), np.nan)
+    with one_blas_thread():
+        for i in np.flatnonzero(wanted):
+            end = frames[i].sample_index
+            stft = StreamingStft(array.n_microphones, chosen.nfft, bins)
+            spectra = stft.push(recording.audio[max(end - length, 0) : end])
+            bearings[i] = azimuths[music_spectrum(signal_subspace(spectra, 1), steering).argmax()]
+    return bearings

@@ -1,0 +1,187 @@
+"""What is kept of one recording of the twin: a few numbers a hop, on disk for the next run."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.adapters.atomic import atomic_path
+from worldstate.checks import check_shape
+from worldstate.errors import InputFileError, InvalidArgumentError
+
+Numbers = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+MAX_BYTES = 16 << 20
+DIRECTION_COLUMNS = slice(0, 2)
+NONE_APPROACH = "none"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwinRecording:
+    """One simulated recording as it was heard.
+
+    Parameters
+    ----------
+    name : str
+        As in ``DataLog.csv``.
+    site, approach : str
+        Junction; "left", "right" or "none".
+    t0_s, pass_s : float
+        Line-of-sight entry, and when the vehicle's middle crosses the ego's axis; NaN without a vehicle.
+    doppler : str
+        Why the tonal Doppler of the pass-by is not usable; empty where it is.
+    time_s : ndarray, shape (n,)
+        End of each window.
+    posteriors : ndarray, shape (n, 4)
+        Of hidden left, hidden right, visible and none at the classifier's own prior, by the signature alone.
+    statistic : ndarray, shape (n,)
+        Eq. (post) at that prior with the camera's answer.
+    prominence : ndarray, shape (n,)
+        Peak-to-median ratio of the spatial spectrum of the window.
+    log_slope_hz : ndarray, shape (n,)
+        Looming slope of log energy; NaN where not usable.
+    reference_rad, srp_rad, music_rad : ndarray, shape (n,)
+        Azimuth of the camera's moving box and the two acoustic bearings; NaN where no box is there.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the shapes do not agree.
+
+    Examples
+    --------
+    >>> recording = TwinRecording.blank("2_00_0001", hops=3)
+    >>> recording.hazard_free, recording.before_sight().any()
+    (True, np.False_)
+    """
+
+    name: str
+    site: str
+    approach: str
+    t0_s: float
+    pass_s: float
+    doppler: str
+    time_s: Numbers
+    posteriors: Numbers
+    statistic: Numbers
+    prominence: Numbers
+    log_slope_hz: Numbers
+    reference_rad: Numbers
+    srp_rad: Numbers
+    music_rad: Numbers
+
+    def __post_init__(self) -> None:
+        n = np.size(self.time_s)
+        for name in _ARRAYS:
+            check_shape(name, np.shape(getattr(self, name)), (n, 4) if name == "posteriors" else (n,))
+
+    @property
+    def hazard_free(self) -> bool:
+        """Whether nothing approaches."""
+        return self.approach == NONE_APPROACH
+
+    @property
+    def published_statistic(self) -> Numbers:
+        """The paper's s(t) = P_left + P_right, shape (n,)."""
+        return np.asarray(self.posteriors[:, DIRECTION_COLUMNS].sum(axis=1))
+
+    @property
+    def argmax_hazard(self) -> Flags:
+        """Where the likeliest class is left or right, shape (n,)."""
+        return np.asarray(self.posteriors.argmax(axis=1) < DIRECTION_COLUMNS.stop)
+
+    def before_sight(self, horizon_s: float = np.inf) -> Flags:
+        """Windows that end within `horizon_s` before T0, T0 included, shape (n,); none without a vehicle."""
+        left_s = self.t0_s - self.time_s
+        return np.asarray((left_s >= -1e-6) & (left_s <= horizon_s + 1e-6))
+
+    @classmethod
+    def blank(cls, name: str, hops: int) -> "TwinRecording":
+        """Return a hazard-free recording that says nothing, to be filled with `dataclasses.replace`."""
+        flat, unknown = np.zeros(hops), np.full(hops, np.nan)
+        return cls(
+            name=name,
+            site="SA1",
+            approach=NONE_APPROACH,
+            t0_s=np.nan,
+            pass_s=np.nan,
+            doppler="no vehicle",
+            time_s=1.0 + 0.1 * np.arange(hops, dtype=np.float64),
+            posteriors=np.tile([0.1, 0.1, 0.1, 0.7], (hops, 1)),
+            statistic=flat,
+            prominence=flat + 1.0,
+            log_slope_hz=unknown,
+            reference_rad=unknown,
+            srp_rad=unknown,
+            music_rad=unknown,
+        )
+
+
+_TEXTS = ("name", "site", "approach", "doppler")
+_SCALARS = ("t0_s", "pass_s")
+_ARRAYS = tuple(f.name for f in fields(TwinRecording) if f.name not in (*_TEXTS, *_SCALARS))
+
+
+def save_twin(path: str | Path, recording: TwinRecording, origin: str) -> None:
+    """Write a recording as npz without objects, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        In an existing folder.
+    recording : TwinRecording
+        What to keep.
+    origin : str
+        What it was made by; `load_twin` takes it back for the same origin only.
+
+    Raises
+    ------
+    InputFileError
+        If the folder is missing.
+    """
+    values = {name: np.array(getattr(recording, name)) for name in (*_TEXTS, *_SCALARS, *_ARRAYS)}
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, origin=np.array(origin), **values)  # type: ignore[arg-type]
+
+
+def load_twin(path: str | Path, origin: str) -> TwinRecording | None:
+    """Return what `save_twin` wrote, None where nothing or something of another origin stands there.
+
+    Raises
+    ------
+    InputFileError
+        If the file is too large or damaged.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_twin(Path(folder) / "a.npz", TwinRecording.blank("a", 2), origin="seed 1")
+    ...     kept, other = (load_twin(Path(folder) / "a.npz", origin) for origin in ("seed 1", "seed 2"))
+    >>> kept.name, kept.time_s, other
+    ('a', array([1. , 1.1]), None)
+    """
+    source = Path(path)
+    if not source.is_file():
+        return None
+    if source.stat().st_size > MAX_BYTES:
+        raise InputFileError(path, f"expected a recording of the twin of at most {MAX_BYTES >> 20} MiB")
+    try:
+        with np.load(source, allow_pickle=False) as file:
+            return _read({name: file[name] for name in file.files}, origin)
+    except (OSError, InvalidArgumentError) as error:
+        raise InputFileError(path, f"expected a recording of the twin ({error})") from error
+    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
+        raise InputFileError(path, f"expected a recording of the twin, it does not read: {error}") from error
+
+
+def _read(values: dict[str, np.ndarray], origin: str) -> TwinRecording | None:
+    if str(values.get("origin")) != origin:
+        return None
+    known: dict[str, Any] = {name: str(values[name]) for name in _TEXTS}
+    known |= {name: float(values[name]) for name in _SCALARS}
+    known |= {name: values[name] for name in _ARRAYS}
+    return TwinRecording(**known)

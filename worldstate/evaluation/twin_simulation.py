@@ -1,0 +1,108 @@
+"""Simulate the recordings of the twin one by one, on any number of processes, and remember those done."""
+
+import hashlib
+import json
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from worldstate.adapters.model_file import load_model
+from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
+from worldstate.adapters.simulation.dataset import Plan
+from worldstate.adapters.simulation.presets import Preset
+from worldstate.evaluation.twin_hearing import hear
+from worldstate.evaluation.twin_recording import TwinRecording, load_twin, save_twin
+
+# What is heard of a recording depends on this code: a change of it is another number.
+VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TwinSettings:
+    """What the twin is made of.
+
+    Parameters
+    ----------
+    preset : Preset
+        Levels of the simulation, the rate of distant vehicles among them.
+    duration_s : float
+        Length of each recording.
+    model : Path, optional
+        Classifier; the one that ships where not given.
+    keep : Path, optional
+        Folder of a data set that the recordings are written to as well.
+    """
+
+    preset: Preset
+    duration_s: float = 10.0
+    model: Path | None = None
+    keep: Path | None = None
+
+    def origin(self, plan: Plan) -> str:
+        """Name everything that a recording depends on, in a few characters."""
+        signature, _ = load_model(self.model)
+        made_of: dict[str, object] = {
+            "version": VERSION,
+            "preset": asdict(self.preset),
+            "duration_s": self.duration_s,
+            "plan": [plan.number, plan.environment, plan.approach, plan.seed.entropy, plan.seed.spawn_key],
+            "model": signature.to_dict(),
+        }
+        if self.keep is not None:
+            made_of["keep"] = str(self.keep)
+        return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def listen_twins(
+    folder: Path, plans: Sequence[Plan], settings: TwinSettings, jobs: int = 1
+) -> Iterator[TwinRecording]:
+    """Yield the recordings of the twin in the order of the plans; those in `folder` are not made again.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing; one small file a recording.
+    plans : sequence of Plan
+        What to simulate.
+    settings : TwinSettings
+        How.
+    jobs : int
+        Processes; the result does not depend on it.
+
+    Raises
+    ------
+    InputFileError
+        If a file in `folder` is damaged.
+    """
+    work = partial(_recall_or_listen, folder, settings)
+    if jobs == 1 or len(plans) == 1:
+        yield from map(work, plans)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(plans)), mp_context=context) as pool:
+        yield from pool.map(work, plans)
+
+
+def _recall_or_listen(folder: Path, settings: TwinSettings, plan: Plan) -> TwinRecording:
+    path, origin = folder / f"{plan.number:04d}.npz", settings.origin(plan)
+    kept = load_twin(path, origin)
+    if kept is None:
+        kept = listen_twin(plan, settings)
+        save_twin(path, kept, origin)
+    return kept
+
+
+def listen_twin(plan: Plan, settings: TwinSettings) -> TwinRecording:
+    """Simulate one recording, the same that `simulate` writes for this plan and preset, and listen to it."""
+    rng = np.random.default_rng(plan.seed)
+    drawn = draw_settings(plan.environment, plan.approach, rng, settings.duration_s)
+    recording = simulate_recording(replace(drawn, preset=settings.preset), rng)
+    if settings.keep is not None:
+        write_recording(settings.keep, recording, plan.number)
+    signature, _ = load_model(settings.model)
+    return hear(recording, signature, name=f"{plan.number:04d}")
