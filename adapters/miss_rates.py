@@ -147,11 +147,10 @@ class MissRates:
     def level(self, health: Health) -> float:
         """Return the d at which `table` has, at boresight, the miss rate of the worst family.
 
-        A blur that a detector hardly minds is then no strong degradation, however strong the blur.
+        A blur that a detector hardly minds is then no strong degradation, however strong the blur. A family
+        that was not measured counts like the worst of those that were.
         """
-        rates = [self.tables[name](0.0, d) for name, d in health.by_family.items() if name in self.tables]
-        if not rates:
-            return health.worst
+        rates = [self.tables.get(name, self.table)(0.0, d) for name, d in health.by_family.items()]
         at_boresight = np.array([self.table(0.0, d) for d in LEVELS])
         # Of several levels with the same rate the lowest: interpolation wants them increasing.
         rising = np.concatenate([[True], np.diff(at_boresight) > 0.0])

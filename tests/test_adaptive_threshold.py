@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from worldstate.abduction.adaptive_threshold import AdaptiveBudget, AdaptiveThreshold
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.cueing import SustainedRule
+from worldstate.abduction.cueing import CueingPolicy, SustainedRule
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.errors import InvalidArgumentError
 from worldstate.filter import WorldFilter, uncalibrated_policy
@@ -145,6 +145,10 @@ def test_damaged_state_is_refused(damaged):
         AdaptiveThreshold.from_dict(damaged)
     with pytest.raises(InvalidArgumentError):
         AdaptiveBudget.from_dict(damaged)
+    policy = uncalibrated_policy().to_dict()
+    if damaged is not None:
+        with pytest.raises(InvalidArgumentError):
+            CueingPolicy.from_dict(policy | {"adaptive": damaged})
 
 
 def evidence_at(hop, log_odds, answer):

