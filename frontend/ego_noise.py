@@ -74,7 +74,7 @@ class EgoNoiseSettings:
     guard_hops: int = 5
     min_weight: float = 0.5
     min_shrinkage: float = 0.03
-    refresh_hops: int = 3
+    refresh_hops: int = 4
     harmonics: int = 40
     feature: bool = False
 
@@ -195,7 +195,7 @@ class EgoNoise:
     >>> for _ in range(3):
     ...     ((whitened, steering),) = ego.process(hop)
     >>> round(ego.learned_frames, 1), whitened.shape
-    (29.7, (20, 1, 2))
+    (39.6, (20, 1, 2))
     """
 
     def __init__(
@@ -218,6 +218,7 @@ class EgoNoise:
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
         self._waiting: deque[tuple[NDArray[np.complex64] | None, int]] = deque()
         self._weights: deque[float] = deque(maxlen=settings.guard_hops + 1)
+        self._is_odd = False
         self._next_bin = 0
         self._stale = 0
         self._hops_since_refresh = 0
@@ -225,7 +226,7 @@ class EgoNoise:
 
     @property
     def learned_frames(self) -> float:
-        """Number of frames that the covariance remembers; every second one is learned."""
+        """Number of frames that the covariance remembers; those of every second hop are learned."""
         return self._covariance.n_frames
 
     def process(self, spectra: NDArray[np.complex64]) -> list[tuple[NDArray[np.complex64], Steering]]:
@@ -254,9 +255,10 @@ class EgoNoise:
         """Put this hop in the queue, take the one that has waited long enough."""
         used = self.weight if self.weight >= self._settings.min_weight else 0.0
         self._weights.append(used)
-        # Frames overlap by half: every second one says nearly everything.
-        frames = spectra[::2]
-        self._waiting.append((_direction_sum(frames) if used > 0.0 else None, len(frames)))
+        # Ego-noise is steady: every second hop says nearly everything.
+        self._is_odd = not self._is_odd
+        total = _direction_sum(spectra) if used > 0.0 and self._is_odd else None
+        self._waiting.append((total, len(spectra)))
         if len(self._waiting) <= self._settings.guard_hops:
             return
         total, n_frames = self._waiting.popleft()

@@ -136,6 +136,7 @@ class HarmonicCanceller:
         self._bins = np.arange(bins.start, bins.stop)
         self._all_orders = np.arange(1, int(harmonics) + 1)
         self._fit: _Fit | None = None
+        self._evident: ComplexArray = np.empty((0, 0), np.complex64)
         self._engine: EngineState | None = None
         self._limits_hz = (0.0, np.inf)
 
@@ -193,11 +194,12 @@ class HarmonicCanceller:
         now = _Fit.of(shapes, spectra, scale, orders)
         error = 0.0
         if self._fit is not None:
-            error = now.phase_ahead(self._fit)
+            error = now.phase_ahead(self._fit, self._evident)
             now = now.turned(error).joined(self._fit, float(np.exp(-time[-1] / self._memory_s)))
-        self._fit = now
+        self._fit, self._evident = now, now.evident_amplitudes()
         self._engine = self._engine.after(float(time[-1]), error).within(*self._limits_hz)
-        lines = (shapes * np.exp(1j * orders * error).astype(np.complex64)) @ now.evident_amplitudes()
+        turn = np.exp(1j * orders * error).astype(np.complex64)
+        lines = shapes @ (turn[:, None] * self._evident)
         return np.asarray(spectra - lines.reshape(spectra.shape))
 
     def _orders(self, frequency_hz: float) -> NDArray[np.int64]:
@@ -240,7 +242,7 @@ class _Fit:
         weights = np.tile(scale, n_frames)[:, None]
         weighted = weights * spectra.reshape(-1, n_microphones)
         adjoint = (weights * shapes).conj().T
-        energy = float(np.square(np.abs(weighted)).sum()) / n_microphones
+        energy = float(np.vdot(weighted, weighted).real) / n_microphones
         gram = adjoint @ adjoint.conj().T
         return cls._solved(orders, gram, adjoint @ weighted, energy, float(n_frames * n_bins))
 
@@ -252,13 +254,17 @@ class _Fit:
         loaded = gram + np.diag(_RIDGE * diagonal + _TINY).astype(gram.dtype)
         return cls(orders, gram, moment, energy, count, np.linalg.solve(loaded, moment))
 
-    def phase_ahead(self, remembered: "_Fit") -> float:
+    def _shared(self, other: "_Fit") -> tuple[slice, slice]:
+        """Return where both have the same orders; orders are successive."""
+        first = max(self.orders[0], other.orders[0])
+        count = max(min(self.orders[-1], other.orders[-1]) - first + 1, 0)
+        mine, theirs = int(first - self.orders[0]), int(first - other.orders[0])
+        return slice(mine, mine + count), slice(theirs, theirs + count)
+
+    def phase_ahead(self, remembered: "_Fit", evident: ComplexArray) -> float:
         """Angle of the fundamental by which this hop is ahead of what is remembered, radians."""
-        _, mine, theirs = np.intersect1d(self.orders, remembered.orders, return_indices=True)
-        if not len(mine):
-            return 0.0
-        known = remembered.evident_amplitudes()[theirs]
-        turned = (self.amplitudes[mine] * known.conj()).sum(axis=1)
+        mine, theirs = self._shared(remembered)
+        turned = (self.amplitudes[mine] * evident[theirs].conj()).sum(axis=1)
         # Lines of like strength say more than one loud one that has no neighbour.
         turned = turned.astype(np.complex128) / np.sqrt(np.abs(turned) + _TINY)
         angle = 0.0
@@ -283,16 +289,16 @@ class _Fit:
 
     def joined(self, remembered: "_Fit", kept: float) -> "_Fit":
         """Add what is remembered, forgotten by a factor; orders that have left are dropped."""
-        _, mine, theirs = np.intersect1d(self.orders, remembered.orders, return_indices=True)
+        mine, theirs = self._shared(remembered)
         gram, moment = self.gram.copy(), self.moment.copy()
-        gram[np.ix_(mine, mine)] += np.float32(kept) * remembered.gram[np.ix_(theirs, theirs)]
+        gram[mine, mine] += np.float32(kept) * remembered.gram[theirs, theirs]
         moment[mine] += np.float32(kept) * remembered.moment[theirs]
         energy = self.energy + kept * remembered.energy
         return self._solved(self.orders, gram, moment, energy, self.count + kept * remembered.count)
 
     def evident_amplitudes(self) -> ComplexArray:
         """Amplitudes (H, M), each shrunk by what noise alone would have left of it."""
-        explained = float((self.amplitudes.conj() * self.moment).real.sum()) / self.moment.shape[1]
+        explained = float(np.vdot(self.amplitudes, self.moment).real) / self.moment.shape[1]
         noise = max(self.energy - explained, 1e-6 * self.energy) / self.count
         power = np.square(np.abs(self.amplitudes)).mean(axis=1) * np.einsum("hh->h", self.gram).real
         kept = np.maximum(1.0 - _NO_LINE * noise / np.maximum(power, _TINY), 0.0)

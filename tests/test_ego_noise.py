@@ -315,11 +315,11 @@ def test_beams_are_those_of_the_definition(thin: bool) -> None:
     ego.weight = 1.0
     for hop in hops:
         ((heard, steering),) = ego.process(hop)
-    # No update comes after the last hops, so that R of the last update is told apart by three hops at most.
+    # Every second hop is learned; a few more let both bins see the last of them.
     ego.weight = 0.0
-    for _ in range(7):
+    for _ in range(9):
         ((heard, steering),) = ego.process(hops[-1])
-    learned = hops[:, ::2].reshape(-1, 2, array.n_microphones).astype(np.complex128)
+    learned = hops[::2].reshape(-1, 2, array.n_microphones).astype(np.complex128)
     unit = learned / np.linalg.norm(learned, axis=2, keepdims=True) * np.sqrt(array.n_microphones)
     R = np.einsum("tbi,tbj->bij", unit, unit.conj()) / len(unit)
     s = np.maximum(0.1, [white_share(matrix, len(unit)) for matrix in R])
@@ -361,7 +361,7 @@ def test_the_hops_before_the_gate_shuts_are_not_learned(guard: int) -> None:
     for k, hop in enumerate(hops):
         ego.weight = 1.0 if k < 20 else 0.0
         ego.process(hop)
-    assert ego.learned_frames == pytest.approx(6 * (20 - guard), rel=1e-2)
+    assert ego.learned_frames == pytest.approx(12 * ((20 - guard + 1) // 2), rel=1e-2)
 
 
 def test_an_unlikely_none_is_not_learned_at_all() -> None:
@@ -516,7 +516,7 @@ def test_a_plane_wave_under_ego_noise_is_found_again_and_elsewhere_no_harm_is_do
     gains: dict[str, list[np.ndarray]] = {}
     for ego in (True, False):
         found: dict[tuple[str, bool], list[np.ndarray]] = {}
-        for _ in range(5):
+        for _ in range(4):
             speed = np.full(round(3.7 * RATE), rng.uniform(4, 12))
             for present in (True, False):
                 white = rng.standard_normal((len(speed), ROOF.n_microphones)).astype(np.float32)
