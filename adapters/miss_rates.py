@@ -71,6 +71,9 @@ class FamilyCounts:
     def miss_rates(self, repeats: float = 1.0) -> Numbers:
         """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation.
 
+        A cell that nobody looked at is at one half, as far as its neighbours let it: not known is neither
+        found nor missed.
+
         Parameters
         ----------
         repeats : float
