@@ -50,7 +50,7 @@ RECIPES = (
     Recipe("mean", 1e-3),
     Recipe("median", 1e-3),
     Recipe("quiet", 1e-3),
-    Recipe(SHAPE, 1e-2),
+    Recipe(SHAPE, 1e-1),
     Recipe(SHAPE_CHANGE, 1e-2),
 )
 

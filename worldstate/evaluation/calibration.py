@@ -1,14 +1,14 @@
 """Threshold and risk map from windows that stand alone, one hazard-free window a recording."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
 from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.risk_map import PlattMap, RiskMap, fit_isotonic
+from worldstate.abduction.risk_map import RiskMap, fit_isotonic
 from worldstate.abduction.signature import hazard_statistic
 from worldstate.errors import InvalidArgumentError
 
@@ -99,36 +99,36 @@ def calibrate_windows(
 
 
 def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
-    """Return the calibration half-way, in log-odds, between several of the same statistic.
+    """Return one calibration of several of the same statistic, from the most careful to the boldest.
 
     A classifier at a junction that it never saw stands between two that can be measured on its training set:
     one that saw fewer junctions and not this one (leave one junction out), and one that saw this one too
-    (leave recordings out). The first is too careful, the second too bold.
+    (leave recordings out). The first is too careful, the second too bold, so the threshold is taken half-way
+    between them, in log-odds. The risk map is that of the boldest: statistics of windows that are compared
+    with their site mean the same elsewhere, those of a classifier from too few junctions do not.
 
     Parameters
     ----------
     levels : sequence of WindowCalibration
-        At least one; with more than one, all with a `PlattMap`.
+        At least one.
 
     Raises
     ------
     InvalidArgumentError
-        If there is none, or there are several and a risk map is no sigmoid.
+        If there is none.
 
     Examples
     --------
+    >>> from worldstate.abduction.risk_map import PlattMap
     >>> careful = WindowCalibration(0.0, 0.9, PlattMap(-2.0, 1.0))
     >>> bold = WindowCalibration(0.0, 0.5, PlattMap(-1.0, 0.0))
     >>> middle = between([careful, bold])
     >>> round(middle.gamma, 3), middle.risk_map
-    (0.75, PlattMap(slope=-1.5, offset=0.5))
+    (0.75, PlattMap(slope=-1.0, offset=0.0))
     """
+    if not levels:
+        raise InvalidArgumentError("levels: expected at least one calibration")
     if len(levels) == 1:
         return levels[0]
-    maps = [level.risk_map for level in levels if isinstance(level.risk_map, PlattMap)]
-    if not levels or len(maps) != len(levels):
-        raise InvalidArgumentError("levels: expected calibrations with sigmoids as risk maps")
-    slope, offset = np.mean([(one.slope, one.offset) for one in maps], axis=0).tolist()
     gammas = np.clip([level.gamma for level in levels], _SMALLEST_GAMMA, 1.0 - _SMALLEST_GAMMA)
-    gamma = float(expit(logit(gammas).mean()))
-    return WindowCalibration(levels[0].miss_rate, gamma, PlattMap(slope, offset))
+    return replace(levels[-1], gamma=float(expit(logit(gammas).mean())))

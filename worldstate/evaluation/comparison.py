@@ -10,7 +10,7 @@ from scipy.stats import binom
 from worldstate.adapters.feature_table import FeatureTable
 from worldstate.errors import InvalidArgumentError
 
-from .bootstrap import FigureDraws, draw_figures, recording_draws
+from .bootstrap import DRAWS, FigureDraws, draw_figures, recording_draws
 from .calibration import ABSENT_MISS_RATE
 from .feature_report import group_figures, mean_figures, report_groups, window_figures
 from .features import Predictions
@@ -70,7 +70,9 @@ def run_passes(
     return passes
 
 
-def comparison(table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float) -> dict[str, Any]:
+def comparison(
+    table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float, draws: int = DRAWS
+) -> dict[str, Any]:
     """Return the figures of one row, those of all others, and what the one gains on each.
 
     Parameters
@@ -83,6 +85,8 @@ def comparison(table: FeatureTable, passes: Mapping[str, Passes], row: str, alph
         Name in `ROWS` of the one that the plain keys are of.
     alpha : float
         Budget, for the test of the achieved false-positive rate.
+    draws : int
+        Bootstrap samples behind the intervals.
 
     Raises
     ------
@@ -92,9 +96,9 @@ def comparison(table: FeatureTable, passes: Mapping[str, Passes], row: str, alph
     chosen = {name: _of_row(passes, name) for name in ROWS if ROWS[name].method in passes}
     if row not in chosen:
         raise InvalidArgumentError(f"method: expected passes of {row}, got {', '.join(passes)}")
-    samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED))
-    draws = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
-    rows = {name: _row_figures(table, mine, draws[name], alpha) for name, mine in chosen.items()}
+    samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED), draws)
+    drawn = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
+    rows = {name: _row_figures(table, mine, drawn[name], alpha) for name, mine in chosen.items()}
     others = [name for name in rows if name != row]
     return {
         **rows[row],
@@ -105,7 +109,7 @@ def comparison(table: FeatureTable, passes: Mapping[str, Passes], row: str, alph
         "n_recordings": len(np.unique(table.recording_keys)),
         "per_group": report_groups(table, [group_figures(table, one) for one in chosen[row]]),
         "rows": {name: rows[name] for name in others},
-        "gains": {name: _gains(rows[row], rows[name], draws[row].gains(draws[name])) for name in others},
+        "gains": {name: _gains(rows[row], rows[name], drawn[row].gains(drawn[name])) for name in others},
     }
 
 

@@ -91,7 +91,7 @@ def cross_validate(
         Budget of the threshold.
     inner_splits : sequence of callable
         Folds inside each training set, from which threshold and map are learned: `split` again, unless given;
-        with several, the calibration is that `between` them.
+        with several, from the most careful to the boldest, the calibration is that `between` them.
     fit_map : callable
         Fits the risk map.
     on_fold : callable

@@ -32,8 +32,8 @@ class Method:
     fit_map : callable
         Fits the risk map.
     two_levels : bool
-        Whether threshold and map stand between junctions left out and recordings left out, where the protocol
-        leaves out junctions; else they come from folds like the outer ones.
+        Whether the threshold stands between junctions left out and recordings left out, where the protocol
+        leaves out junctions; else threshold and map come from folds like the outer ones.
     """
 
     prepare: Callable[[FeatureTable], FeatureTable]

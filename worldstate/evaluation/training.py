@@ -112,7 +112,7 @@ def train_model(
         on_step()
     levels = [passes]
     if compares and len(np.unique(table.environments)) > 1:
-        levels.append([out_of_fold(inputs, junction_folds(table), make, rng)])
+        levels.insert(0, [out_of_fold(inputs, junction_folds(table), make, rng)])
     signature = _trained(inputs, rng, compares=compares)
     on_step()
     provenance = Provenance(
