@@ -26,6 +26,7 @@ from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
 from .spectra import ComplexArray, finite_complex
+from .threads import one_blas_thread
 
 # A microphone whose noise is this far below the mean (power) is dead: it keeps no say in anything.
 _DEAD = 1e-9
@@ -132,7 +133,8 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
     if R.shape[1] != R.shape[2]:
         raise InvalidArgumentError(f"noise_covariance: expected shape (bins, M, M), got {R.shape}")
     s = in_range("shrinkage", shrinkage, 0.0, 1.0)
-    return np.stack([shrunk_inverse_root(matrix, s) for matrix in R]) if len(R) else R
+    with one_blas_thread():
+        return np.stack([shrunk_inverse_root(matrix, s) for matrix in R]) if len(R) else R
 
 
 def white_share(R: ComplexArray, n_frames: float) -> float:

@@ -18,6 +18,7 @@ from worldstate.errors import InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise import EgoNoise, EgoNoiseSettings
 from worldstate.frontend.harmonic_cancellation import HarmonicCanceller
+from worldstate.frontend.harmonics import track_fundamental
 from worldstate.frontend.music import covariance_subspace, music_spectrum
 from worldstate.frontend.phat import whiten
 from worldstate.frontend.prewhitening import Prewhitener, inverse_root, white_share
@@ -461,6 +462,17 @@ def test_lines_go_and_the_rest_stays(drift_hz_per_s: float, told_wrong: float) -
     left = (after - only_noise)[late]
     assert power_db(left) < power_db(only_lines[late]) - 12
     assert power_db(before[late]) - power_db(after[late]) > 3
+
+
+def test_an_engine_whose_speed_is_heard_and_not_told() -> None:
+    rng = np.random.default_rng(22)
+    lines = comb(np.full(4 * RATE, 47.3), 8, rng)
+    noise = 2.0 * rng.standard_normal(lines.shape).astype(np.float32)
+    heard = track_fundamental((lines + noise)[: 2 * RATE, 0], RATE).frequency_hz[-1]
+    before, after = cancelled(lines + noise, np.full(len(lines), heard))
+    only_noise = cancelled(noise, np.full(len(lines), heard))[0]
+    late = slice(len(before) // 2, None)
+    assert power_db((after - only_noise)[late]) < power_db((before - only_noise)[late]) - 12
 
 
 def test_next_to_nothing_is_taken_where_there_is_no_engine() -> None:
