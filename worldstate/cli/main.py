@@ -20,6 +20,7 @@ COMMANDS = (
     "evaluate_features",
     "extract_features",
     "twin",
+    "bench",
 )
 
 

@@ -1,0 +1,47 @@
+"""`worldstate bench`: what the front-end costs on this machine, beside its peers."""
+
+import argparse
+import json
+
+from worldstate.cli.progress import progress_bar
+
+DESCRIPTION = """\
+Time the acoustic front-end per 0.1-s hop, stage by stage: 56 channels at 47,998 Hz, one BLAS thread. Peers
+that are installed (pyroomacoustics, and the published chain built on it) are timed in the same run."""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "bench",
+        help="milliseconds per hop, beside the peers",
+        description=DESCRIPTION,
+        epilog="example: worldstate bench --rounds 5",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    from worldstate.checks import in_range
+    from worldstate.evaluation.bench import run_bench
+
+    rounds = int(in_range("rounds", arguments.rounds, 1, 1000))
+    with progress_bar("timing", rounds, quiet=arguments.json) as bar:
+        report = run_bench(rounds, on_round=bar.advance)
+    if arguments.json:
+        print(json.dumps(report.to_dict(), allow_nan=False))
+        return 0
+    blas = ", ".join(report.blas)
+    print(f"BLAS {blas}; {report.threads} thread; median of {report.rounds} rounds; ms per hop")
+    for name, (median, p99) in report.stages.items():
+        print(f"  {name:32s} {median:9.3f}   p99 {p99:9.3f}")
+    print(f"  {'STFT + SRP181 + feature':32s} {report.total_ms:9.3f}   p99 {report.p99_ms:9.3f}")
+    for name, median in report.peers.items():
+        print(f"  peer {name:27s} {median:9.3f}")
+    for name, ratio in report.ratios.items():
+        print(f"  ratio {name:26s} {ratio:9.1f}")
+    return 0

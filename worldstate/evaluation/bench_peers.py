@@ -1,0 +1,75 @@
+"""The same work by others, where they are installed.
+
+`published_chain` restates the chain of the published acoustic baseline in its amortised form: scipy's STFT of
+the whole file, one channel after the other, its cost shared among the hops; then for every hop two segments of
+half a second through pyroomacoustics' SRP, thirty azimuths, 50-1500 Hz.
+"""
+
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.evaluation.stopwatch import Milliseconds, elapsed_ms
+from worldstate.frontend.array import roof_array_56
+
+NFFT, REPEATS = 512, 9
+SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]
+
+
+def peer_times(
+    sound: NDArray[np.float32],
+    frames: NDArray[np.complex64],
+    sample_rate_hz: int,
+    azimuths_rad: NDArray[np.float64],
+) -> dict[str, Milliseconds]:
+    """Return milliseconds per hop of each peer, keys beginning with ``peer_``; empty where none is installed.
+
+    Parameters
+    ----------
+    sound : ndarray, shape (n, M)
+        The file.
+    frames : ndarray, shape (frames, bins, M)
+        Spectra of a tenth of a second, all bins, those our own SRP is timed on.
+    sample_rate_hz : int
+        Of `sound`.
+    azimuths_rad : ndarray, shape (D,)
+        Search grid.
+    """
+    if find_spec("pyroomacoustics") is None:
+        return {}
+    import pyroomacoustics
+
+    positions = roof_array_56().positions_m.T
+    spectra = np.ascontiguousarray(frames.transpose(2, 1, 0))
+
+    def on_a_tenth(method: Any) -> Milliseconds:
+        peer = method(positions, sample_rate_hz, NFFT, azimuth=azimuths_rad)
+        locate = partial(peer.locate_sources, spectra, freq_range=SRP_BAND_HZ)
+        return [elapsed_ms(locate) for _ in range(REPEATS)]
+
+    return {
+        "peer_pyroomacoustics_srp": on_a_tenth(pyroomacoustics.doa.SRP),
+        "peer_pyroomacoustics_music": on_a_tenth(pyroomacoustics.doa.MUSIC),
+        "peer_published_chain": _published_chain(sound, sample_rate_hz, pyroomacoustics.doa.SRP),
+    }
+
+
+def _published_chain(sound: NDArray[np.float32], sample_rate_hz: int, method: Any) -> Milliseconds:
+    from scipy.signal import stft
+
+    hops = 10.0 * len(sound) / sample_rate_hz
+    file_ms = elapsed_ms(lambda: [stft(channel, sample_rate_hz, nperseg=NFFT) for channel in sound.T])
+    first_second = sound[:sample_rate_hz].T
+    second = np.stack([stft(channel, sample_rate_hz, nperseg=NFFT)[2] for channel in first_second])
+    azimuths = np.radians(np.linspace(-90.0, 90.0, 30))
+    peer = method(roof_array_56().positions_m.T, sample_rate_hz, NFFT, azimuth=azimuths)
+    half = second.shape[2] // 2
+
+    def one_hop() -> None:
+        for segment in (second[..., :half], second[..., half : 2 * half]):
+            peer.locate_sources(segment, freq_range=FEATURE_BAND_HZ)
+
+    return [elapsed_ms(one_hop) + file_ms / hops for _ in range(REPEATS)]
