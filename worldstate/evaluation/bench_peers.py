@@ -1,7 +1,7 @@
 """The same work by others, where they are installed.
 
 `published_chain` restates the chain of the published acoustic baseline in its amortised form: scipy's STFT of
-the whole file, one channel after the other, its cost shared among the hops; then for every hop two segments of
+the whole file, channel by channel, its cost shared among the hops; then for every hop two segments of
 half a second through pyroomacoustics' SRP, thirty azimuths, 50-1500 Hz.
 """
 
