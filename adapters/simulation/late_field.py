@@ -7,12 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
+from .scene import Site, site_generator
 from .static_field import add_static, plane_wave_delays
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]
 
 DIRECTIONS = 48
+LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
+ELEVATION_RAD = 0.3
 TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
 
 
@@ -31,6 +34,41 @@ def sphere(count: int) -> Array:
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
+def street_field(site: Site, lobe_share: float) -> tuple[Array, Array]:
+    """Directions from which late sound reaches the array in a street, and their shares of the energy.
+
+    Between walls and under an open sky late sound is near the horizon; it comes in by the mouth and from
+    what stands there, so that a site has late directions of its own, ahead.
+
+    Parameters
+    ----------
+    site : Site
+        Its name decides the directions.
+    lobe_share : float
+        Share of the energy in the site's own directions; the rest comes evenly from all around.
+
+    Returns
+    -------
+    (ndarray, ndarray), shapes (DIRECTIONS, 3) and (DIRECTIONS,)
+
+    Examples
+    --------
+    >>> from .scene import site
+    >>> directions, shares = street_field(site("SA1"), 0.5)
+    >>> directions.shape, round(float(shares.sum()), 6)
+    ((48, 3), 1.0)
+    """
+    rng = site_generator(site.name, "late")
+    azimuth = 2.0 * np.pi * (np.arange(DIRECTIONS) + rng.random()) / DIRECTIONS
+    elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, DIRECTIONS))
+    centres, weights = rng.uniform(-LOBE_SPAN_RAD, LOBE_SPAN_RAD, LOBES), rng.dirichlet(np.full(LOBES, 3.0))
+    lobes = np.exp(LOBE_CONCENTRATION * (np.cos(azimuth[:, None] - centres) - 1.0))
+    shares = lobe_share * (lobes / lobes.sum(axis=0)) @ weights + (1.0 - lobe_share) / DIRECTIONS
+    flat = np.cos(elevation)
+    directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+    return directions, shares
+
+
 def add_late_field(
     out: Signal,
     dry: Signal,
@@ -38,8 +76,11 @@ def add_late_field(
     positions_m: Array,
     sample_rate_hz: float,
     rng: np.random.Generator,
+    field: tuple[Array, Array] | None = None,
 ) -> None:
-    r"""Add a diffuse tail of a dry signal; two microphones d apart hear it with coherence sinc(2 f d / c).
+    r"""Add a diffuse tail of a dry signal.
+
+    From a full sphere two microphones d apart hear it with coherence sinc(2 f d / c).
 
     Parameters
     ----------
@@ -55,15 +96,20 @@ def add_late_field(
         Rate in Hz.
     rng : numpy.random.Generator
         Source of randomness.
+    field : (ndarray, ndarray), optional
+        Directions (Q, 3) and their shares of the energy (Q,); a full sphere if not given.
     """
+    directions, shares = (
+        (sphere(DIRECTIONS), np.full(DIRECTIONS, 1.0 / DIRECTIONS)) if field is None else field
+    )
     tail = max(int(TAIL_DECAYS * decay_s * sample_rate_hz), 1)
     n = next_fast_len(len(dry) + tail, real=True)
     spectrum = rfft(dry, n)
     envelope = 10.0 ** (-3.0 * np.arange(tail) / tail * TAIL_DECAYS)
-    envelope /= np.sqrt(DIRECTIONS * (envelope**2).sum())
-    waves = np.empty((DIRECTIONS, out.shape[1]), np.float32)
-    for wave in waves:
-        response = (envelope * rng.standard_normal(tail)).astype(np.float32)
+    envelope /= np.sqrt((envelope**2).sum())
+    waves = np.empty((len(shares), out.shape[1]), np.float32)
+    for wave, share in zip(waves, shares, strict=True):
+        response = (np.sqrt(share) * envelope * rng.standard_normal(tail)).astype(np.float32)
         wave[:] = irfft(spectrum * rfft(response, n), n)[len(dry) - out.shape[1] : len(dry)]
     offsets = positions_m - positions_m.mean(axis=0)
-    add_static(out, waves, plane_wave_delays(sphere(DIRECTIONS), offsets), sample_rate_hz)
+    add_static(out, waves, plane_wave_delays(directions, offsets), sample_rate_hz)

@@ -24,23 +24,26 @@ FACADE_END_M = 0.5  # a reflection fades over this length at the end of a facade
 LEFT, RIGHT = 0, 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class SourceImage:
     """Mirror image of the source after `opposite` and `near` reflections in the crossing street.
 
     Parameters
     ----------
-    x_m : float
-        Where the image stands ahead of the ego, unfolded.
+    x_m : float or ndarray, shape (T,)
+        Where the image stands ahead of the origin, unfolded.
     gain : float
         Product of the reflection factors.
     near_planes_m : tuple of float
         Unfolded positions of the near facade that the line crosses; that facade has a gap at the mouth.
+    order : int
+        Number of reflections.
     """
 
-    x_m: float
+    x_m: float | Array
     gain: float
     near_planes_m: tuple[float, ...] = ()
+    order: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,7 @@ class ReceiverImage:
     sign: int
     offset_m: float
     gain: float
+    order: int = 0
 
     def mirror(self, y_m: Array) -> Array:
         """Lateral positions in the unfolded street."""
@@ -90,7 +94,7 @@ class Path:
     gain: Array
 
 
-def source_images(site: Site, lane_x_m: float) -> list[SourceImage]:
+def source_images(site: Site, lane_x_m: float | Array) -> list[SourceImage]:
     """Images of a lane in the facades of the crossing street; only the lane itself where there is no wall.
 
     Examples
@@ -108,7 +112,7 @@ def source_images(site: Site, lane_x_m: float) -> list[SourceImage]:
         turns = (order + 1) // 2
         x = mouth + 2.0 * depth * turns + (inside if order % 2 == 0 else -inside)
         planes = tuple(mouth + 2.0 * depth * i for i in range(1, order // 2 + 1))
-        images.append(SourceImage(x, site.facade_reflection**order, planes))
+        images.append(SourceImage(x, site.facade_reflection**order, planes, order))
     return images
 
 
@@ -128,56 +132,135 @@ def receiver_images(site: Site) -> list[ReceiverImage]:
         shift = (order // 2) * 2.0 * (left + right)
         if order % 2:
             images += [
-                ReceiverImage(-1, shift + 2.0 * left, gain),
-                ReceiverImage(-1, -shift - 2.0 * right, gain),
+                ReceiverImage(-1, shift + 2.0 * left, gain, order),
+                ReceiverImage(-1, -shift - 2.0 * right, gain, order),
             ]
         else:
-            images += [ReceiverImage(1, shift, gain), ReceiverImage(1, -shift, gain)]
+            images += [ReceiverImage(1, shift, gain, order), ReceiverImage(1, -shift, gain, order)]
     return images
 
 
-def trace_paths(site: Site, lane_x_m: float, source_y_m: Array, height_m: float, cap_db: float) -> list[Path]:
-    """All paths from a source that moves along a lane to the array's centre at (0, 0).
+def trace_paths(
+    site: Site,
+    lane_x_m: float | Array,
+    source_y_m: Array,
+    height_m: float,
+    cap_db: float,
+    *,
+    receiver_x_m: float | Array = 0.0,
+    specular: Array | None = None,
+) -> list[Path]:
+    """All paths from a source that moves in the crossing street to the array's centre at (receiver_x_m, 0).
 
     Parameters
     ----------
     site : Site
         The junction.
-    lane_x_m : float
-        Distance ahead of the source's lane.
+    lane_x_m : float or ndarray, shape (T,)
+        How far ahead the source is.
     source_y_m : ndarray, shape (T,)
         Lateral positions of the source.
     height_m : float
         Height of the receiver above the source.
     cap_db : float
         Largest screen attenuation.
+    receiver_x_m : float or ndarray, shape (T,)
+        Where the array's centre is when it hears what was emitted; behind the mouth.
+    specular : ndarray, shape (8,), optional
+        Share of the amplitude per octave that a wall reflects as a mirror; one if not given.
 
     Returns
     -------
     list of Path
         One per pair of source and receiver image.
     """
+    mirror = np.ones(len(OCTAVES_HZ)) if specular is None else specular
     pairs = product(source_images(site, lane_x_m), receiver_images(site))
-    return [_trace(site, source, receiver, source_y_m, height_m, cap_db) for source, receiver in pairs]
+    return [
+        _trace(site, source, receiver, source_y_m, height_m, cap_db, receiver_x_m, mirror)
+        for source, receiver in pairs
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passage:
+    """A line from a source in the crossing street through the mouth, at a series of times, shape (T,) each.
+
+    Parameters
+    ----------
+    clearance_m : ndarray
+        How far inside the mouth the line crosses it; negative where a corner is in the way.
+    edge : ndarray of int8
+        The corner with the shorter way round, LEFT or RIGHT.
+    straight_m, bent_m : ndarray
+        Length of the line, and of the way round that corner.
+    aim_y_m : ndarray
+        Where the line, or the way round the corner, passes the mouth.
+    """
+
+    clearance_m: Array
+    edge: NDArray[np.int8]
+    straight_m: Array
+    bent_m: Array
+    aim_y_m: Array
+
+    @property
+    def lit(self) -> Array:
+        """1 where the line is straight, 0 where it bends round the corner, smooth in between."""
+        return smooth_step(self.clearance_m / LIT_DEPTH_M)
+
+    def screen_gain(self, cap_db: float) -> Array:
+        """Amplitude that the corner leaves, shape (T, 8)."""
+        detour = np.copysign(self.bent_m - self.straight_m, -self.clearance_m)
+        return np.asarray(10.0 ** (-screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db) / 20.0))
+
+
+def through_mouth(
+    site: Site,
+    source_x_m: float | Array,
+    source_y_m: Array,
+    end_x_m: float | Array,
+    end_y_m: float,
+    height_m: float,
+) -> Passage:
+    """Follow a line from a source beyond the mouth to an end before it.
+
+    Examples
+    --------
+    >>> plan = Site("SA1", 2.8, 2.8, 4.0, 10.0, 2.8, 2.8, 6.0)
+    >>> passage = through_mouth(plan, 8.0, np.array([2.0, 12.0]), 0.0, 0.0, 0.0)
+    >>> passage.clearance_m, passage.lit
+    (array([ 1.8, -3.2]), array([1., 0.]))
+    """
+    mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
+    run, depth = source_x_m - end_x_m, mouth - end_x_m
+    crossing = end_y_m + (source_y_m - end_y_m) * depth / run
+    clearance = np.minimum(left - crossing, crossing - right)
+    # The shorter way round: both are equal where the corner changes, so nothing jumps there.
+    ways = [
+        _bent_length(source_x_m - mouth, source_y_m - y, depth, y - end_y_m, height_m) for y in (left, right)
+    ]
+    edge, bent = np.argmin(ways, axis=0).astype(np.int8), np.minimum(*ways)
+    return Passage(
+        clearance, edge, _length(run, source_y_m - end_y_m, height_m), bent, np.clip(crossing, right, left)
+    )
 
 
 def _trace(
-    site: Site, source: SourceImage, receiver: ReceiverImage, source_y: Array, height: float, cap_db: float
+    site: Site,
+    source: SourceImage,
+    receiver: ReceiverImage,
+    source_y: Array,
+    height: float,
+    cap_db: float,
+    receiver_x: float | Array,
+    specular: Array,
 ) -> Path:
-    mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     end_y = float(receiver.mirror(np.zeros(1))[0])
-    crossing = end_y + (source_y - end_y) * mouth / source.x_m
-    clearance = np.minimum(left - crossing, crossing - right)
-    # The shorter way round: both are equal where the corner changes, so nothing jumps there.
-    ways = [_bent_length(source.x_m, source_y, mouth, y, end_y, height) for y in (left, right)]
-    edge, bent = np.argmin(ways, axis=0).astype(np.int8), np.minimum(*ways)
-    straight = _length(source.x_m, source_y - end_y, height)
-    detour = np.copysign(bent - straight, -clearance)
-    screen_db = screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db)
-    aim_y = np.clip(crossing, right, left)
-    walls = source.gain * receiver.gain * _near_facade(source, source_y, mouth, aim_y, left, right)
-    gain = walls[:, None] * 10.0 ** (-screen_db / 20.0)
-    return Path(source, receiver, smooth_step(clearance / LIT_DEPTH_M), edge, bent, gain)
+    passage = through_mouth(site, source.x_m, source_y, receiver_x, end_y, height)
+    walls = source.gain * receiver.gain * near_facade(site, source, source_y, passage.aim_y_m)
+    gain = walls[:, None] * specular ** (source.order + receiver.order) * passage.screen_gain(cap_db)
+    return Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain)
 
 
 def _length(dx: float | Array, dy: Array, dz: float) -> Array:
@@ -185,18 +268,15 @@ def _length(dx: float | Array, dy: Array, dz: float) -> Array:
 
 
 def _bent_length(
-    source_x: float, source_y: Array, mouth: float, edge_y: float, end_y: float, height: float
+    before_x: float | Array, before_y: Array, after_x: float | Array, after_y: float, height: float
 ) -> Array:
-    """Shortest way over the vertical edge: the two legs lie in one unfolded plane."""
-    before = np.hypot(source_x - mouth, source_y - edge_y)
-    after = np.hypot(mouth, edge_y - end_y)
-    return np.asarray(np.hypot(before + after, height))
+    """Shortest way over a vertical edge: the two legs lie in one unfolded plane."""
+    return np.asarray(np.hypot(np.hypot(before_x, before_y) + np.hypot(after_x, after_y), height))
 
 
-def _near_facade(
-    source: SourceImage, source_y: Array, mouth: float, aim_y: Array, left: float, right: float
-) -> Array:
-    """1 where every reflection in the near facade meets wall, 0 where it meets the mouth."""
+def near_facade(site: Site, source: SourceImage, source_y: Array, aim_y: Array) -> Array:
+    """1 where every reflection in the near facade meets wall, 0 where it meets the mouth, shape (T,)."""
+    mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     weight = np.ones_like(source_y)
     for plane in source.near_planes_m:
         met = aim_y + (source_y - aim_y) * (plane - mouth) / (source.x_m - mouth)

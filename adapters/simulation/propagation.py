@@ -9,6 +9,8 @@ from .bands import split_octaves
 from .delay import KNOT_SAMPLES, OVERSAMPLING, Table, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_paths
+from .presets import Preset
+from .scatter import NEAREST_M, FirstLeg, first_legs, last_leg, patches, scattering
 from .scene import Site
 from .static_field import add_static
 from .vehicle import SOURCE_HEIGHT_M
@@ -107,6 +109,7 @@ def add_source(
     site: Site,
     receiver: Receiver,
     cap_db: float,
+    specular: Array | None = None,
 ) -> None:
     """Add one moving source, by every path, to all microphones.
 
@@ -126,8 +129,10 @@ def add_source(
         Microphones and receive times.
     cap_db : float
         Largest screen attenuation.
+    specular : ndarray, shape (8,), optional
+        Share of the amplitude per octave that a wall reflects as a mirror; one if not given.
     """
-    paths = trace_paths(site, lane_x_m, source_y_m, receiver.height_m, cap_db)
+    paths = trace_paths(site, lane_x_m, source_y_m, receiver.height_m, cap_db, specular=specular)
     images = receiver_images(site)
     bent = np.zeros((len(images), 2, receiver.samples), np.float32)
     for path in _audible(paths):
@@ -135,6 +140,60 @@ def add_source(
             _add_bent(bent[images.index(path.receiver), edge], emission, path, edge, receiver.knots_s)
         _add_lit(out, emission, path, source_y_m, receiver)
     _add_corners(out, bent, images, site, receiver, emission.sample_rate_hz)
+
+
+def add_scattered(
+    out: Signal,
+    emission: Emission,
+    source_x_m: float | Array,
+    source_y_m: Array,
+    site: Site,
+    receiver: Receiver,
+    preset: Preset,
+) -> None:
+    """Add what rough walls send on of one moving source, from where they stand, to all microphones.
+
+    Parameters
+    ----------
+    out, emission, site, receiver
+        As for `add_source`.
+    source_x_m, source_y_m : float or ndarray, ndarray, shape (T,)
+        Where the source is at the knots of `emission`.
+    preset : Preset
+        Scattering coefficient and largest screen attenuation.
+    """
+    amplitude = np.sqrt(scattering(preset))
+    if not amplitude.any():
+        return
+    for group in patches(site):
+        arrived = np.zeros((len(group.strengths_m), receiver.samples), np.float32)
+        for index, signal in enumerate(arrived):
+            for leg in first_legs(
+                site, group, index, source_x_m, source_y_m, SOURCE_HEIGHT_M, preset.screen_cap_db
+            ):
+                _add_leg(signal, emission, leg, amplitude, receiver, group.positions_m[index])
+        distance, gain = last_leg(group, receiver.positions_m)
+        centre = _to_centre(group.positions_m, receiver)
+        delays = (distance - centre[:, None]) / SPEED_OF_SOUND_MPS + receiver.skew_s
+        add_static(out, arrived, delays, emission.sample_rate_hz, gain)
+
+
+def _to_centre(positions_m: Array, receiver: Receiver) -> Array:
+    return np.asarray(np.linalg.norm(positions_m - receiver.positions_m.mean(axis=0), axis=1))
+
+
+def _add_leg(
+    out: Signal, emission: Emission, leg: FirstLeg, amplitude: Array, receiver: Receiver, patch_m: Array
+) -> None:
+    """Add what one patch sends on, as late as the array's centre hears it."""
+    made = emission.table(leg.gain * amplitude)
+    if made is None:
+        return
+    table, span = made
+    knots, onward = emission.knots_s[span], _to_centre(patch_m[None], receiver)[0]
+    emit = emission_times(receiver.knots_s, knots, leg.length_m[span] + onward, SPEED_OF_SOUND_MPS)
+    length = np.interp(np.nan_to_num(emit), knots, leg.length_m[span])
+    add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 
 
 def _audible(paths: list[Path]) -> list[Path]:

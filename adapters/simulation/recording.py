@@ -13,8 +13,9 @@ from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from .background import add_background
 from .delay import KNOT_SAMPLES
 from .detector import ARRAY_HEIGHT_M, FRAME_RATE_HZ, Frame, detect, line_of_sight, park
-from .late_field import add_late_field
-from .propagation import Emission, Receiver, add_source
+from .late_field import add_late_field, street_field
+from .propagation import Emission, Receiver, add_scattered, add_source
+from .scatter import scattering
 from .settings import SimulationSettings
 from .truth import describe
 from .vehicle import Trajectory, drive, emit
@@ -160,10 +161,15 @@ def _add_vehicle_sound(
     for axle, signal in enumerate(axles):
         emission = Emission.of(signal, path.time_s[0], rate)
         y, cap_db = path.axle_y_m(axle), preset.screen_cap_db
-        add_source(sound, emission, path.lane_x_m, y, settings.site, receiver, cap_db)
+        mirror = np.sqrt(1.0 - scattering(preset))
+        add_source(sound, emission, path.lane_x_m, y, settings.site, receiver, cap_db, mirror)
+    whole = Emission.of(axles.sum(axis=0), path.time_s[0], rate)
+    middle = 0.5 * (path.axle_y_m(0) + path.axle_y_m(1))
+    add_scattered(sound, whole, path.lane_x_m, middle, settings.site, receiver, preset)
     dry = axles.sum(axis=0) * _late_gain(settings, path, samples)
     heard = dry[: round(-path.time_s[0] * rate) + sound.shape[1]]
-    add_late_field(sound, heard, preset.late_decay_s, receiver.positions_m, rate, rng)
+    field = street_field(settings.site, preset.late_lobe_share)
+    add_late_field(sound, heard, preset.late_decay_s, receiver.positions_m, rate, rng, field)
 
 
 def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> Signal:

@@ -12,6 +12,8 @@ from .scene import Site, site
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
 SAMPLE_RATE_HZ = 47_998.0
+# Narrow streets and a blind junction ahead: most drivers slow down before it.
+SPEEDS_MPS, BRAKING_SHARE, BRAKING_MPS2 = (5.0, 12.0), 0.75, (0.5, 3.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,7 @@ class SimulationSettings:
 def draw_settings(
     site_name: str, approach: str, rng: np.random.Generator, duration_s: float = 10.0
 ) -> SimulationSettings:
-    """Draw how a vehicle drives: 18 to 47 km/h, every third one braking, in sight at 65 to 75 % of the time.
+    """Draw how a vehicle drives: 18 to 43 km/h, three in four braking, in sight at 65 to 75 % of the time.
 
     Parameters
     ----------
@@ -92,13 +94,13 @@ def draw_settings(
     'SB1'
     """
     in_range("duration_s", duration_s, 0.5, 60.0)
-    brakes = rng.random() < 1.0 / 3.0
+    brakes = rng.random() < BRAKING_SHARE
     return SimulationSettings(
         site=site(site_name),
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
-        speed_mps=rng.uniform(5.0, 13.0),
-        braking_mps2=rng.uniform(0.5, 2.0) if brakes else 0.0,
+        speed_mps=rng.uniform(*SPEEDS_MPS),
+        braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
         parked_car=bool(rng.random() < 0.3),
     )

@@ -1,0 +1,183 @@
+r"""Rough walls: patches of facade that send a vehicle's sound on from where they are.
+
+A wall with reveals, doors, pipes and gaps mirrors only a part of what falls on it; the rest leaves every
+patch in all directions (Lambert). Patches stand still, so what they send arrives from fixed azimuths however
+the vehicle moves, and those on the side walls near the mouth are lit long before the array is: this is how
+an empty-looking street is heard to fill up.
+
+.. math:: p_i(t) = \frac{a_i(f)}{d_i\, r_i}\, s\Big(t - \frac{d_i + r_i}{c}\Big), \qquad
+          a_i^2 = w_i\, \sigma(f)\, \rho^2\, \frac{A}{\pi} \cos\theta_{in} \cos\theta_{out}
+
+with the patch's area A, the wall's reflection rho, its scattering coefficient sigma(f), and a weight w_i of
+mean one that is drawn once for a site: its face.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bands import OCTAVES_HZ
+from .paths import SourceImage, near_facade, source_images, through_mouth
+from .presets import Preset
+from .scene import Site, site_generator
+
+Array = NDArray[np.float64]
+
+PATCH_M = 0.9  # along the wall
+WALL_HEIGHT_M = 3.0  # what of a wall is near enough to matter
+HEIGHTS_M = (0.4, 2.8)
+BEHIND_M = 1.5  # side walls scatter from this far behind the array
+OPPOSITE_REACH = 0.9  # of the part of the opposite wall that is seen through the mouth
+SCATTER_HZ = 400.0  # relief of a few decimetres: below, a facade is smooth
+IMAGE_ORDERS = 2  # reflections in the crossing street before a patch is met
+NEAREST_M = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    r"""Pieces of wall, all of one kind.
+
+    Parameters
+    ----------
+    positions_m : ndarray, shape (P, 3)
+        Middles, z above the road.
+    normals : ndarray, shape (P, 2)
+        Towards the street.
+    strengths_m : ndarray, shape (P,)
+        :math:`\sqrt{w A \rho^2 / \pi}`, the length that scatters at grazing angles of 0.
+    beyond_mouth : bool
+        Whether they stand in the crossing street.
+    """
+
+    positions_m: Array
+    normals: Array
+    strengths_m: Array
+    beyond_mouth: bool
+
+
+def scattering(preset: Preset) -> Array:
+    """Scattering coefficient sigma per octave, shape (8,).
+
+    Examples
+    --------
+    >>> from .presets import preset
+    >>> sigma = scattering(preset())
+    >>> sigma[[0, -1]].round(3)
+    array([0.004, 0.15 ])
+    """
+    relief = (OCTAVES_HZ / SCATTER_HZ) ** 2
+    return preset.wall_scattering * relief / (1.0 + relief)
+
+
+def patches(site: Site) -> list[Patches]:
+    """Patches of the ego street's side walls and, where there is one, of the wall opposite.
+
+    Examples
+    --------
+    >>> from .scene import site
+    >>> [(len(group.strengths_m), group.beyond_mouth) for group in patches(site("SA1"))]
+    [(12, False), (12, True)]
+    """
+    rng = site_generator(site.name, "facades")
+    groups = [_side_walls(site, rng)]
+    if site.opposite_wall_m is not None:
+        groups.append(_opposite_wall(site, site.opposite_wall_m, rng))
+    return groups
+
+
+def _side_walls(site: Site, rng: np.random.Generator) -> Patches:
+    x = _spread(-BEHIND_M, site.corner_ahead_m, rng)
+    left = np.column_stack([x, np.full_like(x, site.side_wall_left_m), rng.uniform(*HEIGHTS_M, len(x))])
+    x = _spread(-BEHIND_M, site.corner_ahead_m, rng)
+    right = np.column_stack([x, np.full_like(x, -site.side_wall_right_m), rng.uniform(*HEIGHTS_M, len(x))])
+    normals = np.repeat([[0.0, -1.0], [0.0, 1.0]], [len(left), len(right)], axis=0)
+    positions = np.concatenate([left, right])
+    return Patches(positions, normals, _strengths(len(positions), site.side_reflection, rng), False)
+
+
+def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patches:
+    right, left = site.sight_m(wall_m)
+    y = _spread(OPPOSITE_REACH * right, OPPOSITE_REACH * left, rng)
+    positions = np.column_stack([np.full_like(y, wall_m), y, rng.uniform(*HEIGHTS_M, len(y))])
+    normals = np.tile([-1.0, 0.0], (len(y), 1))
+    return Patches(positions, normals, _strengths(len(y), site.facade_reflection, rng), True)
+
+
+def _spread(low: float, high: float, rng: np.random.Generator) -> Array:
+    """Places along a wall, one in every patch, not quite in its middle."""
+    count = max(int((high - low) / PATCH_M), 1)
+    return np.asarray(low + (high - low) * (np.arange(count) + rng.uniform(0.2, 0.8, count)) / count)
+
+
+def _strengths(count: int, reflection: float, rng: np.random.Generator) -> Array:
+    weights = rng.exponential(1.0, count)
+    return np.asarray(reflection * np.sqrt(weights * PATCH_M * WALL_HEIGHT_M / np.pi))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstLeg:
+    """From the source to one patch, at a series of emission times.
+
+    Parameters
+    ----------
+    length_m : ndarray, shape (T,)
+        Way to the patch.
+    gain : ndarray, shape (T, 8)
+        Amplitude factor per octave without spherical spreading; the last leg's angle is not in it.
+    """
+
+    length_m: Array
+    gain: Array
+
+
+def first_legs(
+    site: Site,
+    group: Patches,
+    index: int,
+    source_x_m: float | Array,
+    source_y_m: Array,
+    height_m: float,
+    cap_db: float,
+) -> list[FirstLeg]:
+    """Ways of one source to one patch: direct and by the facades of the crossing street."""
+    images = source_images(site, source_x_m)
+    if group.beyond_mouth:
+        return [_open_leg(group, index, images[0], source_y_m, height_m)]
+    near = [image for image in images if image.order <= IMAGE_ORDERS]
+    return [_mouth_leg(site, group, index, image, source_y_m, height_m, cap_db) for image in near]
+
+
+def _open_leg(group: Patches, index: int, image: SourceImage, source_y: Array, height: float) -> FirstLeg:
+    x, y, z = group.positions_m[index]
+    away = np.stack([image.x_m - x + np.zeros_like(source_y), source_y - y], axis=1)
+    length = np.sqrt((away**2).sum(axis=1) + (z - height) ** 2)
+    cosine = np.abs(away @ group.normals[index]) / np.maximum(length, NEAREST_M)
+    return FirstLeg(length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ)))
+
+
+def _mouth_leg(
+    site: Site,
+    group: Patches,
+    index: int,
+    image: SourceImage,
+    source_y: Array,
+    height: float,
+    cap_db: float,
+) -> FirstLeg:
+    x, y, z = group.positions_m[index]
+    passage = through_mouth(site, image.x_m, source_y, x, y, z - height)
+    away = np.stack([np.full_like(source_y, site.corner_ahead_m - x), passage.aim_y_m - y], axis=1)
+    cosine = np.abs(away @ group.normals[index]) / np.maximum(np.hypot(*away.T), NEAREST_M)
+    length = passage.lit * passage.straight_m + (1.0 - passage.lit) * passage.bent_m
+    walls = image.gain * near_facade(site, image, source_y, passage.aim_y_m)
+    gain = group.strengths_m[index] * np.sqrt(cosine) * walls
+    return FirstLeg(length, gain[:, None] * passage.screen_gain(cap_db))
+
+
+def last_leg(group: Patches, positions_m: Array) -> tuple[Array, Array]:
+    """Distance of every patch to every microphone and the amplitude factor there, shape (P, M) each."""
+    away = positions_m[None] - group.positions_m[:, None]
+    distance = np.maximum(np.linalg.norm(away, axis=2), NEAREST_M)
+    cosine = np.abs(np.einsum("pmk,pk->pm", away[:, :, :2], group.normals)) / distance
+    return distance, np.sqrt(cosine) / distance
