@@ -21,7 +21,7 @@ _SUSPECT, _WELL = 0.3, 0.45
 # How much better another place must fit. Simulated streets: right places lose by 0.18 at most, swapped
 # channels that stand 9 cm or more apart across the road gain 0.25 to 0.75.
 _MARGIN = 0.3
-# ... and how much the channel that belongs there must gain by leaving: it does not sit there either.
+# ... and how much any channel must gain to move at all, the one at the other place included.
 _OTHER_MARGIN = 0.1
 
 
@@ -142,7 +142,9 @@ def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> lis
     >>> [(fault.channel, fault.looks_like) for fault in displaced(scores, np.ones(3, bool))]
     [(0, 1), (1, 0)]
     """
-    seated = np.flatnonzero(candidates)
+    # Whoever sits well stays, so that nobody is sent to the next best place.
+    restless = scores.max(axis=1) - scores.diagonal() > _OTHER_MARGIN
+    seated = np.flatnonzero(candidates & restless)
     table = scores[np.ix_(seated, seated)]
     best = linear_sum_assignment(table, maximize=True)[1]
     gain = table[np.arange(len(seated)), best] - table.diagonal()
