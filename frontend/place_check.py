@@ -21,7 +21,8 @@ _SUSPECT, _WELL = 0.3, 0.45
 # How much better another place must fit. Simulated streets: right places lose by 0.18 at most, swapped
 # channels that stand 9 cm or more apart across the road gain 0.25 to 0.75.
 _MARGIN = 0.3
-# ... and how much any channel must gain to move at all, the one at the other place included.
+# Nobody moves who fits no other place this much better, and nobody takes a place whose owner stays.
+_RESTLESS = 0.2
 _OTHER_MARGIN = 0.1
 
 
@@ -143,7 +144,7 @@ def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> lis
     [(0, 1), (1, 0)]
     """
     # Whoever sits well stays, so that nobody is sent to the next best place.
-    restless = scores.max(axis=1) - scores.diagonal() > _OTHER_MARGIN
+    restless = scores.max(axis=1) - scores.diagonal() > _RESTLESS
     seated = np.flatnonzero(candidates & restless)
     table = scores[np.ix_(seated, seated)]
     best = linear_sum_assignment(table, maximize=True)[1]
