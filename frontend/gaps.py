@@ -92,7 +92,7 @@ class GapFinder:
         self._tail = samples[-2:].copy()
         self._n_seen += len(samples)
         change = sound[:, 1:] - sound[:, :-1]
-        still = np.asarray(~change.any(axis=0))
+        still = np.asarray((change == 0.0).all(axis=0))
         gaps = self._still.push(still[-len(samples) :], self._n_seen)
         if len(sound) >= _MIN_SPLICE_CHANNELS:
             gaps += find_splices(change, start + 1, still)
@@ -120,6 +120,10 @@ class StillRuns:
 
     def push(self, still: NDArray[np.bool_], end: int) -> list[Gap]:
         """Take one flag per sample, the last being sample `end` - 1; give the runs that end here."""
+        if not (still.any() or self._length):
+            self._heard = True
+            self._n_moving += len(still)
+            return []
         moving = np.flatnonzero(~still)
         if not len(moving):
             self._length += len(still)

@@ -10,8 +10,8 @@ from worldstate.errors import InvalidArgumentError
 from worldstate.values import NotUsable
 
 from .masking import ChannelMask
-from .music import music_spectrum
 from .peaks import find_peaks
+from .spectra import ComplexArray
 from .steering import cross_spectra
 from .subspace import SubspaceTracker
 
@@ -117,10 +117,18 @@ class MusicStage:
         if not power > 0.0:
             return NotUsable("silence")
         subspace = self._tracker.update(covariance / np.float32(power))
-        heard = music_spectrum(subspace, self._steering, normalised=True)
+        heard = self._spectrum(subspace.vectors, mask.n_kept)
         profile = heard.reshape(-1, len(self._azimuths)).max(axis=0)
         peak = find_peaks(profile, self._azimuths, max_peaks=1)[0]
         return MusicReading(peak.azimuth_rad, peak.prominence, profile)
+
+    def _spectrum(self, vectors: ComplexArray, n_kept: int) -> NDArray[np.float64]:
+        """MUSIC as in `music.music_spectrum`, normalised; |a|^2 is the number of microphones left."""
+        inside = vectors.conj().transpose(0, 2, 1) @ self._steering
+        power = np.square(inside.real).sum(axis=1) + np.square(inside.imag).sum(axis=1)
+        outside = np.maximum(n_kept - power, np.finfo(np.float32).eps * n_kept)
+        score = outside.min(axis=1, keepdims=True) / outside
+        return np.asarray(score.mean(axis=0, dtype=np.float64))
 
     def _use(self, mask: ChannelMask) -> None:
         """Keep the steering of the last mask; another one replaces it."""
