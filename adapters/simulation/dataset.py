@@ -5,7 +5,7 @@ import io
 import json
 import multiprocessing
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +16,7 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.atomic import atomic_path, write_text
+from worldstate.adapters.video import VIDEO_NAME
 from worldstate.checks import in_range
 from worldstate.errors import InputFileError
 
@@ -23,6 +24,7 @@ from .detector import to_json
 from .recording import SimulatedRecording, simulate_recording
 from .scene import SITES
 from .settings import APPROACHES, draw_settings
+from .video import Picture, camera_frames, write_video
 
 AUDIO_NAME = "out_multi.wav"
 DETECTIONS_NAME = "camera_baseline_results.json"
@@ -102,6 +104,7 @@ def write_dataset(
     *,
     jobs: int = 1,
     duration_s: float = 10.0,
+    video: bool = False,
     progress: Callable[[LogRow], None] | None = None,
 ) -> list[LogRow]:
     """Simulate a data set of recordings with a standing ego.
@@ -120,6 +123,8 @@ def write_dataset(
         Processes.
     duration_s : float
         Length of every recording.
+    video : bool
+        Write what the camera sees, too; sound, detections and truth are the same with and without.
     progress : callable, optional
         Called with every finished recording, in order.
 
@@ -134,6 +139,8 @@ def write_dataset(
         If a number is out of range.
     InputFileError
         If something that was not simulated stands where a recording would go.
+    MissingExtraError
+        If video is wanted and OpenCV is not installed.
     """
     in_range("jobs", jobs, 1, 256)
     in_range("duration_s", duration_s, 0.5, 60.0)
@@ -141,7 +148,7 @@ def write_dataset(
     folder = Path(root)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in _each(partial(_simulate_one, folder, duration_s), plans, jobs):
+    for row in _each(partial(_simulate_one, folder, duration_s, video), plans, jobs):
         rows.append(row)
         if progress is not None:
             progress(row)
@@ -149,7 +156,12 @@ def write_dataset(
     return rows
 
 
-def write_recording(root: str | Path, recording: SimulatedRecording, number: int = 0) -> LogRow:
+def write_recording(
+    root: str | Path,
+    recording: SimulatedRecording,
+    number: int = 0,
+    frames: Iterable[Picture] | None = None,
+) -> LogRow:
     """Write one recording below `root`, whole or not at all.
 
     Parameters
@@ -160,6 +172,8 @@ def write_recording(root: str | Path, recording: SimulatedRecording, number: int
         What to write; site and approach are in its truth.
     number : int
         Running number in the ID, 0..9999.
+    frames : iterable of ndarray, optional
+        What the camera sees, from `camera_frames`; no video where not given.
 
     Returns
     -------
@@ -181,6 +195,8 @@ def write_recording(root: str | Path, recording: SimulatedRecording, number: int
         _write_audio(temporary / AUDIO_NAME, recording)
         _write_json(temporary / DETECTIONS_NAME, to_json(list(recording.detections)))
         _write_json(temporary / TRUTH_NAME, recording.truth)
+        if frames is not None:
+            write_video(temporary / VIDEO_NAME, frames)
     return row
 
 
@@ -215,10 +231,13 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     write_text(Path(root) / LOG_NAME, text.getvalue())
 
 
-def _simulate_one(root: Path, duration_s: float, plan: Plan) -> LogRow:
+def _simulate_one(root: Path, duration_s: float, video: bool, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     settings = draw_settings(plan.environment, plan.approach, rng, duration_s)
-    return write_recording(root, simulate_recording(settings, rng), plan.number)
+    recording = simulate_recording(settings, rng)
+    # A generator of its own: what is drawn for the picture changes nothing else.
+    frames = camera_frames(settings, recording, rng.spawn(1)[0]) if video else None
+    return write_recording(root, recording, plan.number, frames)
 
 
 def _each(work: Callable[[Plan], LogRow], plans: list[Plan], jobs: int) -> Iterator[LogRow]:
