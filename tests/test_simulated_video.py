@@ -287,14 +287,14 @@ def test_the_video_lies_beside_the_sound_with_the_same_bytes_again(tmp_path):
     recording = simulate_recording(plan, np.random.default_rng(3), PAIR)
     for name in "abc":
         (tmp_path / name).mkdir()
-        frames = camera_frames(plan, recording, np.random.default_rng(3))
+        frames = camera_frames(plan, recording, np.random.default_rng(3), MIDDLE)
         write_recording(tmp_path / name, recording, 0, None if name == "c" else frames)
     first, again, silent = (tmp_path / name / "SA1/left/1_00_0000" for name in "abc")
     files = {path.name for path in first.iterdir()}
     assert files - {path.name for path in silent.iterdir()} == {VIDEO_NAME}
     assert all((again / name).read_bytes() == (first / name).read_bytes() for name in files)
     video = open_video(first / VIDEO_NAME)
-    assert (video.width_px, video.height_px, len(list(video.frames()))) == (1936, 1216, 5)
+    assert (video.width_px, video.height_px, len(list(video.frames()))) == (640, 402, 5)
     assert len(read_detections(first / "camera_baseline_results.json")) == 5
 
 
