@@ -128,7 +128,7 @@ def read_yolo_text(
     first_image: int = 0,
     frames: int | None = None,
 ) -> DetectionLog:
-    """Read a folder of YOLO text: ``street_17.txt`` with lines ``class x y w h [score]`` in parts of the image.
+    """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image.
 
     Parameters
     ----------

@@ -215,7 +215,7 @@ def _emission(firing: Array, line_share: float, rate: float, rng: np.random.Gene
     # White noise divided by its own share of power per octave: unit pressure in each of them.
     shares = np.maximum((masks**2).mean(axis=1), 1e-6)
     shape = (masks / np.sqrt(shares)[:, None]).sum(axis=0)
-    noise = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng, 1)[0]
+    noise: Signal = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng, 1)[0]
     return noise + _lines(firing, line_share, rate, rng) if line_share > 0.0 else noise
 
 
