@@ -120,7 +120,7 @@ def calibration_error_sampling(
     --------
     >>> mean, deviation = calibration_error_sampling(np.full(400, 0.5), np.random.default_rng(0))
     >>> round(mean, 2), round(deviation, 3)
-    (0.02, 0.014)
+    (0.02, 0.016)
     """
     predicted, _ = _checked_sample(risk, np.zeros(np.shape(risk)))
     index = _bin_index(predicted, bins)
