@@ -25,7 +25,7 @@ from .expert import Expert, expert_view, split_reference
 from .mirror import SEGMENTS, mirror_features
 from .pairwise import SMALLEST_PROBABILITY
 from .schema import read_numbers
-from .signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS, LEFT, RIGHT
+from .signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS, LEFT, RIGHT, evidence_of, explanation_ratios
 from .site import KINDS, SiteReference, log_levels
 
 MOST_EXPERTS = 32
@@ -139,8 +139,7 @@ class EnsembleModel:
 
         Parameters and errors are those of `predict_proba`.
         """
-        ratios = np.log(self.predict_proba(X)) - np.log(self.class_prior)
-        return np.asarray(ratios[:, EXPLANATION_COLUMNS])
+        return explanation_ratios(self.predict_proba(X), self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of one window, shape (features,) or (4 * features,).
@@ -150,8 +149,7 @@ class EnsembleModel:
         InvalidArgumentError
             On another shape, NaN or infinity.
         """
-        left, right, visible, none = self.log_likelihoods(np.atleast_2d(feature))[0].tolist()
-        return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
+        return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; reading them back gives the same model to the bit."""

@@ -144,8 +144,7 @@ class SignatureModel:
 
         Parameters and errors are those of `decision_values`.
         """
-        ratios = np.log(self.predict_proba(X)) - np.log(self.class_prior)
-        return np.asarray(ratios[:, EXPLANATION_COLUMNS])
+        return explanation_ratios(self.predict_proba(X), self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of one feature vector, shape (features,).
@@ -155,8 +154,7 @@ class SignatureModel:
         InvalidArgumentError
             On another shape, NaN or infinity.
         """
-        left, right, visible, none = self.log_likelihoods(np.atleast_2d(feature))[0].tolist()
-        return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
+        return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; reading them back gives the same model to the bit."""
@@ -202,3 +200,15 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Number
     hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]
     statistic: Numbers = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
     return statistic
+
+
+def explanation_ratios(posteriors: Numbers, class_prior: ArrayLike) -> Numbers:
+    """Return log P_c - log pi_c of left, right, visible, none by window, shape (n, 4), nats."""
+    ratios = np.log(posteriors) - np.log(class_prior)
+    return np.asarray(ratios[:, EXPLANATION_COLUMNS])
+
+
+def evidence_of(log_likelihoods: Numbers) -> SignatureEvidence:
+    """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence."""
+    left, right, visible, none = log_likelihoods.tolist()
+    return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
