@@ -14,6 +14,11 @@ Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise 
 source, and diffraction round a corner, bias either of them: what is measured then is the approach of the
 sound, not of the vehicle.
 
+How well it can be known is set by chance in the sound itself, which no number of microphones averages: n
+energies over T seconds, each of scatter s = (bandwidth x interval)^(-1/2), give TTA with a relative error of
+about (s / 2) (TTA / T + 1/2) sqrt(12 / n). Noise from 0.3 to 20 kHz, 1 to 3 s away, scattered by 4.0 % when
+read from one second and by 1.5 % when read from two: `FrontEndSettings.looming_hops` is that choice.
+
 References
 ----------
 D. Lee, A theory of visual control of braking based on information about time-to-collision, Perception, 1976.
