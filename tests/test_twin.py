@@ -8,10 +8,13 @@ import pytest
 from sklearn.metrics import roc_auc_score
 from sklearn.metrics import roc_curve as sklearn_roc
 
+from worldstate.adapters.model_file import load_model
 from worldstate.adapters.simulation import SimulationSettings, preset, simulate_recording, site
 from worldstate.adapters.simulation.dataset import plan_static
 from worldstate.cli.main import main
 from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.evaluation.hop_stream import ABSENT
+from worldstate.evaluation.simulated_windows import simulated_windows
 from worldstate.evaluation.twin_figures import rule_figures, twin_figures, twin_intervals
 from worldstate.evaluation.twin_hearing import pass_time_s
 from worldstate.evaluation.twin_plot import roc_curve, write_twin_figure
@@ -19,6 +22,7 @@ from worldstate.evaluation.twin_recording import TwinRecording, load_twin, save_
 from worldstate.evaluation.twin_report import TARGETS, twin_report, twin_table
 from worldstate.evaluation.twin_score import deal, score_twins
 from worldstate.evaluation.twin_simulation import TwinSettings
+from worldstate.evaluation.twin_training import train_on_twin
 from worldstate.frontend.array import MicrophoneArray
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
@@ -173,7 +177,7 @@ def test_a_recording_comes_back_as_written_and_damage_is_named(tmp_path, streams
     path = tmp_path / "0000.npz"
     save_twin(path, streams[0], "a")
     back = load_twin(path, "a")
-    for name in ("posteriors", "srp_rad", "log_slope_hz"):
+    for name in ("features", "srp_rad", "log_slope_hz"):
         assert np.array_equal(getattr(back, name), getattr(streams[0], name), equal_nan=True)
     assert (back.t0_s, back.doppler) == (T0_S, "")
     assert load_twin(path, "b") is None
@@ -195,6 +199,37 @@ def test_origin_names_all_that_a_recording_depends_on():
     assert len({settings.origin(plans[0]), *others}) == 5
 
 
+def test_another_classifier_judges_what_was_heard(streams):
+    """Eq. (post) of the shipped classifier, hop by hop, from the kept features and answers."""
+    rng = np.random.default_rng(2)
+    signature, _ = load_model()
+    features = rng.uniform(0.05, 0.4, (HOPS, 60))
+    asked = {"answer": np.full(HOPS, ABSENT), "miss_rate": np.full(HOPS, 0.3)}
+    answered = replace(streams[0], features=features, **asked)
+    judged = answered.judged(signature)
+    likelihoods = np.exp([signature.evidence(feature).log_likelihoods for feature in features])
+    joint = likelihoods * signature.reference_prior
+    assert np.allclose(judged.posteriors, joint / joint.sum(axis=1, keepdims=True))
+    joint[:, 2] *= 0.3
+    assert np.allclose(judged.statistic, joint[:, :2].sum(axis=1) / joint.sum(axis=1))
+
+
+def test_training_on_the_twin_is_kept_and_apart_from_the_test(tmp_path, monkeypatch):
+    made = []
+
+    def simulated(per_approach, seed, **_):
+        made.append(seed)
+        return simulated_windows(per_approach, seed, sites=("SA1",))
+
+    monkeypatch.setattr("worldstate.evaluation.twin_training.simulated_windows", simulated)
+    first, again = (train_on_twin(tmp_path, preset(), 1, per_approach=1) for _ in range(2))
+    assert first.to_dict() == again.to_dict()
+    assert len(made) == 1
+    assert made != [1]
+    train_on_twin(tmp_path, replace(preset(), far_rate=0.0), 1, per_approach=1)
+    assert len(made) == 2
+
+
 @pytest.mark.parametrize(("duration_s", "beyond"), [(6.0, False), (3.2, True)])
 def test_pass_time_is_that_of_constant_speed(duration_s, beyond):
     """The front is at the edge of sight at 3 s; the middle crosses y = 0 half a length after it, at 6 m/s."""
@@ -212,6 +247,7 @@ def test_four_recordings_end_to_end(tmp_path, capsys):
     """Resumed by another number of jobs with the same figures; half a run does not matter."""
     out = tmp_path / "twin"
     arguments = ["twin", "--static", "4", "--duration", "1.5", "--seed", "2", "--out", str(out), "--json"]
+    arguments += ["--model", "default"]
     assert main(arguments) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["recordings"], report["approaches"]) == (4, 2)
@@ -237,3 +273,21 @@ def test_a_folder_that_is_not_there_is_named(streams, tmp_path):
     score = score_twins(streams, np.random.default_rng(0))
     with pytest.raises(InputFileError, match="nowhere"):
         write_twin_figure(score, tmp_path / "nowhere" / "twin.png")
+
+
+@pytest.mark.slow
+def test_realism_stands_beside_the_figures(tmp_path, capsys, monkeypatch):
+    """Simulated windows of one seed against those of another, which take the part of the real ones."""
+    from worldstate.adapters.feature_table import write_features
+    from worldstate.cli import twin
+
+    write_features(tmp_path / "real.csv", simulated_windows(3, seed=9))
+    monkeypatch.setattr(twin, "WINDOWS", 3)
+    monkeypatch.setattr(twin, "REALISM_SEEDS", (1,))
+    arguments = ["twin", "--static", "4", "--duration", "1.5", "--out", str(tmp_path / "t"), "--json"]
+    arguments += ["--model", "default"]
+    assert main([*arguments, "--realism", str(tmp_path / "real.csv")]) == 0
+    realism = json.loads(capsys.readouterr().out)["realism"]
+    assert set(realism) == {"1"}
+    assert set(realism["1"]) == {"medians", "transfers", "c2st"}
+    assert realism["1"]["c2st"]["all"] < 0.75

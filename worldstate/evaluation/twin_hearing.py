@@ -1,9 +1,11 @@
 """What of a simulated recording the published figures need: listened to once, by the whole front-end."""
 
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import replace
 
-from worldstate.abduction.any_signature import AnySignature
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import DetectionFrame, DetectionLog
@@ -13,7 +15,6 @@ from worldstate.adapters.simulation.detector import FRAME_RATE_HZ
 from worldstate.adapters.simulation.vehicle import LENGTH_M
 from worldstate.adapters.vision import VisionQuery
 from worldstate.evaluation.hop_stream import hop_stream
-from worldstate.evaluation.stream_statistic import stream_statistic
 from worldstate.evaluation.twin_recording import NONE_APPROACH, TwinRecording
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.bins import band_bins, bin_frequencies_hz
@@ -36,15 +37,20 @@ DOPPLER = DopplerSettings(min_lines=2)
 NEAREST_S = 0.5 / FRAME_RATE_HZ
 
 
-def hear(recording: SimulatedRecording, signature: AnySignature, name: str = "") -> TwinRecording:
-    """Listen to a recording of the 56-microphone roof array.
+class _Silent:
+    """A classifier that favours nothing: judging comes later, on the features."""
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+
+
+def hear(recording: SimulatedRecording, name: str = "") -> TwinRecording:
+    """Listen to a recording of the 56-microphone roof array; `TwinRecording.judged` comes after.
 
     Parameters
     ----------
     recording : SimulatedRecording
         At least a second long.
-    signature : SignatureModel
-        From features to likelihoods.
     name : str
         For the report.
 
@@ -55,23 +61,24 @@ def hear(recording: SimulatedRecording, signature: AnySignature, name: str = "")
     """
     array = roof_array_56()
     vision = VisionQuery(PinholeCamera(), detection_log(recording), line_of_sight=line_of_sight(Context()))
-    adapter = AcousticAdapter(array, recording.sample_rate_hz, signature, vision=vision)
+    adapter = AcousticAdapter(array, recording.sample_rate_hz, _Silent(), vision=vision)
     frames = adapter.front_end.process(recording.audio)
     stream = hop_stream((adapter.interpret(frame) for frame in frames), name=name)
-    joint = stream.log_likelihoods + np.log(signature.reference_prior)
     reference = np.array([_reference(frame, vision) for frame in frames])
     settings = recording.truth["settings"]
     approaches = settings["approach"] != NONE_APPROACH
-    return TwinRecording(
-        name=name,
+    return replace(
+        TwinRecording.blank(name, len(stream)),
         site=settings["site"]["name"],
         approach=settings["approach"],
         t0_s=recording.t0_frame / FRAME_RATE_HZ if approaches else np.nan,
         pass_s=pass_time_s(recording) if approaches else np.nan,
         doppler=_doppler(recording, array) if approaches else "no vehicle",
         time_s=stream.time_s,
-        posteriors=np.exp(joint - np.logaddexp.reduce(joint, axis=1, keepdims=True)),
-        statistic=stream_statistic(stream, signature.reference_prior),
+        features=np.array([frame.feature for frame in frames]),
+        answer=stream.answer,
+        miss_rate=stream.miss_rate,
+        clutter_rate=stream.clutter_rate,
         prominence=np.array([frame.srp.max() / np.median(frame.srp) for frame in frames]),
         log_slope_hz=np.array([_log_slope(frame) for frame in frames]),
         reference_rad=reference,

@@ -1,15 +1,22 @@
-"""What is kept of one recording of the twin: a few numbers a hop, on disk for the next run."""
+"""What is kept of one recording of the twin: a few numbers a hop, on disk for the next run.
 
-from dataclasses import dataclass, fields
+What was heard is kept, not what a classifier made of it: another classifier judges the same files.
+"""
+
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.abduction.any_signature import AnySignature
 from worldstate.adapters.atomic import atomic_path
+from worldstate.adapters.feature_table import N_FEATURES
 from worldstate.checks import check_shape
 from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.evaluation.hop_stream import HopStream
+from worldstate.evaluation.stream_statistic import stream_statistic
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -35,16 +42,22 @@ class TwinRecording:
         Why the tonal Doppler of the pass-by is not usable; empty where it is.
     time_s : ndarray, shape (n,)
         End of each window.
-    posteriors : ndarray, shape (n, 4)
-        Of hidden left, hidden right, visible and none at the classifier's own prior, by the signature alone.
-    statistic : ndarray, shape (n,)
-        Eq. (post) at that prior with the camera's answer.
+    features : ndarray, shape (n, 60)
+        Published feature of the window.
+    answer : ndarray of int, shape (n,)
+    miss_rate, clutter_rate : ndarray, shape (n,)
+        Of the camera: see `HopStream`.
     prominence : ndarray, shape (n,)
         Peak-to-median ratio of the spatial spectrum of the window.
     log_slope_hz : ndarray, shape (n,)
         Looming slope of log energy; NaN where not usable.
     reference_rad, srp_rad, music_rad : ndarray, shape (n,)
         Azimuth of the camera's moving box and the two acoustic bearings; NaN where no box is there.
+    posteriors : ndarray, shape (n, 4)
+        Of hidden left, hidden right, visible and none at the classifier's own prior, by the signature alone;
+        equal until `judged`.
+    statistic : ndarray, shape (n,)
+        Eq. (post) at that prior with the camera's answer; zero until `judged`.
 
     Raises
     ------
@@ -65,18 +78,23 @@ class TwinRecording:
     pass_s: float
     doppler: str
     time_s: Numbers
-    posteriors: Numbers
-    statistic: Numbers
+    features: Numbers
+    answer: NDArray[np.int64]
+    miss_rate: Numbers
+    clutter_rate: Numbers
     prominence: Numbers
     log_slope_hz: Numbers
     reference_rad: Numbers
     srp_rad: Numbers
     music_rad: Numbers
+    posteriors: Numbers
+    statistic: Numbers
 
     def __post_init__(self) -> None:
         n = np.size(self.time_s)
-        for name in _ARRAYS:
-            check_shape(name, np.shape(getattr(self, name)), (n, 4) if name == "posteriors" else (n,))
+        wide = {"posteriors": (n, 4), "features": (n, N_FEATURES)}
+        for name in (*_HEARD, *_JUDGED):
+            check_shape(name, np.shape(getattr(self, name)), wide.get(name, (n,)))
 
     @property
     def hazard_free(self) -> bool:
@@ -92,6 +110,23 @@ class TwinRecording:
     def argmax_hazard(self) -> Flags:
         """Where the likeliest class is left or right, shape (n,)."""
         return np.asarray(self.posteriors.argmax(axis=1) < DIRECTION_COLUMNS.stop)
+
+    def judged(self, signature: AnySignature) -> "TwinRecording":
+        """Return the recording with what a classifier makes of its features."""
+        evidence = [signature.evidence(feature) for feature in self.features]
+        stream = replace(
+            HopStream.blank(self.name, len(self.time_s)),
+            log_likelihoods=np.stack([one.log_likelihoods for one in evidence]),
+            answer=self.answer,
+            miss_rate=self.miss_rate,
+            clutter_rate=self.clutter_rate,
+        )
+        joint = stream.log_likelihoods + np.log(signature.reference_prior)
+        return replace(
+            self,
+            posteriors=np.exp(joint - np.logaddexp.reduce(joint, axis=1, keepdims=True)),
+            statistic=stream_statistic(stream, signature.reference_prior),
+        )
 
     def before_sight(self, horizon_s: float = np.inf) -> Flags:
         """Windows that end within `horizon_s` before T0, T0 included, shape (n,); none without a vehicle."""
@@ -110,23 +145,28 @@ class TwinRecording:
             pass_s=np.nan,
             doppler="no vehicle",
             time_s=1.0 + 0.1 * np.arange(hops, dtype=np.float64),
-            posteriors=np.tile([0.1, 0.1, 0.1, 0.7], (hops, 1)),
-            statistic=flat,
+            features=np.zeros((hops, N_FEATURES)),
+            answer=np.zeros(hops, dtype=np.int64),
+            miss_rate=flat + 1.0,
+            clutter_rate=flat,
             prominence=flat + 1.0,
             log_slope_hz=unknown,
             reference_rad=unknown,
             srp_rad=unknown,
             music_rad=unknown,
+            posteriors=np.full((hops, 4), 0.25),
+            statistic=flat,
         )
 
 
 _TEXTS = ("name", "site", "approach", "doppler")
 _SCALARS = ("t0_s", "pass_s")
-_ARRAYS = tuple(f.name for f in fields(TwinRecording) if f.name not in (*_TEXTS, *_SCALARS))
+_JUDGED = ("posteriors", "statistic")
+_HEARD = tuple(f.name for f in fields(TwinRecording) if f.name not in (*_TEXTS, *_SCALARS, *_JUDGED))
 
 
 def save_twin(path: str | Path, recording: TwinRecording, origin: str) -> None:
-    """Write a recording as npz without objects, whole or not at all.
+    """Write what was heard of a recording as npz without objects, whole or not at all.
 
     Parameters
     ----------
@@ -142,13 +182,13 @@ def save_twin(path: str | Path, recording: TwinRecording, origin: str) -> None:
     InputFileError
         If the folder is missing.
     """
-    values = {name: np.array(getattr(recording, name)) for name in (*_TEXTS, *_SCALARS, *_ARRAYS)}
+    values = {name: np.array(getattr(recording, name)) for name in (*_TEXTS, *_SCALARS, *_HEARD)}
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, origin=np.array(origin), **values)  # type: ignore[arg-type]
 
 
 def load_twin(path: str | Path, origin: str) -> TwinRecording | None:
-    """Return what `save_twin` wrote, None where nothing or something of another origin stands there.
+    """Return what `save_twin` wrote, not yet judged; None where nothing of this origin stands there.
 
     Raises
     ------
@@ -183,5 +223,6 @@ def _read(values: dict[str, np.ndarray], origin: str) -> TwinRecording | None:
         return None
     known: dict[str, Any] = {name: str(values[name]) for name in _TEXTS}
     known |= {name: float(values[name]) for name in _SCALARS}
-    known |= {name: values[name] for name in _ARRAYS}
-    return TwinRecording(**known)
+    known |= {name: values[name] for name in _HEARD}
+    n = len(known["time_s"])
+    return TwinRecording(**known, posteriors=np.full((n, 4), 0.25), statistic=np.zeros(n))

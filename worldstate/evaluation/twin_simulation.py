@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.model_file import load_model
 from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
 from worldstate.adapters.simulation.dataset import Plan
 from worldstate.adapters.simulation.presets import Preset
@@ -19,7 +18,7 @@ from worldstate.evaluation.twin_hearing import hear
 from worldstate.evaluation.twin_recording import TwinRecording, load_twin, save_twin
 
 # What is heard of a recording depends on this code: a change of it is another number.
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,26 +31,21 @@ class TwinSettings:
         Levels of the simulation, the rate of distant vehicles among them.
     duration_s : float
         Length of each recording.
-    model : Path, optional
-        Classifier; the one that ships where not given.
     keep : Path, optional
         Folder of a data set that the recordings are written to as well.
     """
 
     preset: Preset
     duration_s: float = 10.0
-    model: Path | None = None
     keep: Path | None = None
 
     def origin(self, plan: Plan) -> str:
         """Name everything that a recording depends on, in a few characters."""
-        signature, _ = load_model(self.model)
         made_of: dict[str, object] = {
             "version": VERSION,
             "preset": asdict(self.preset),
             "duration_s": self.duration_s,
             "plan": [plan.number, plan.environment, plan.approach, plan.seed.entropy, plan.seed.spawn_key],
-            "model": signature.to_dict(),
         }
         if self.keep is not None:
             made_of["keep"] = str(self.keep)
@@ -104,5 +98,4 @@ def listen_twin(plan: Plan, settings: TwinSettings) -> TwinRecording:
     recording = simulate_recording(replace(drawn, preset=settings.preset), rng)
     if settings.keep is not None:
         write_recording(settings.keep, recording, plan.number)
-    signature, _ = load_model(settings.model)
-    return hear(recording, signature, name=f"{plan.number:04d}")
+    return hear(recording, name=f"{plan.number:04d}")
