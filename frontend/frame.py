@@ -12,8 +12,10 @@ from .geometry import Ambiguity
 from .looming import Looming
 from .music_stage import MusicReading
 from .peaks import Peak
+from .tone_stage import ToneReading
 
 _NOT_WATCHED = NotUsable("microphones were not watched")
+TONE_IS_OFF = NotUsable("the tone is off: see FrontEndSettings.tone_band_hz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +60,8 @@ class AcousticFrame:
         How long before `stamp_ns` the middle of the bearing's interval was, seconds.
     health : ArrayHealth or NotUsable
         What is wrong with the microphones, and which were left out; not usable in frames made by hand.
+    tone : ToneReading or NotUsable
+        Engine line over the last `tone_hops` hops; not usable when it is off, or none stands out.
     """
 
     stamp_ns: int
@@ -79,3 +83,4 @@ class AcousticFrame:
     feature: NDArray[np.float64]
     bearing_age_s: float = 0.0
     health: ArrayHealth | NotUsable = _NOT_WATCHED
+    tone: ToneReading | NotUsable = TONE_IS_OFF

@@ -11,6 +11,7 @@ from worldstate.errors import InvalidArgumentError
 from .ego_noise import EgoNoiseSettings
 from .feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_SEGMENTS
 from .geometry import SPEED_OF_SOUND_M_S
+from .tone_stage import ENGINE_BAND_HZ
 
 Band = tuple[float, float]
 
@@ -42,6 +43,13 @@ class FrontEndSettings:
         At most so many peaks are listed.
     music_sources : int
         Sources that MUSIC shall expect, at most as many as microphones less one; 0 leaves MUSIC out.
+    tone_band_hz : (float, float), optional
+        Look for an engine line there, e.g. (20, 400) Hz: see `worldstate.frontend.tone_stage`. None, the
+        default, leaves it out.
+    tone_hops : int
+        Hops in the window of the tone fit.
+    tone_channels : int
+        The tone is heard by so many microphones, those next to the middle of the array.
     srp_band_hz, feature_band_hz, looming_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
     level_bands : int
@@ -80,6 +88,9 @@ class FrontEndSettings:
     elevation_step_deg: float = 5.0
     max_peaks: int = 4
     music_sources: int = 0
+    tone_band_hz: Band | None = None
+    tone_hops: int = 10
+    tone_channels: int = 4
     srp_band_hz: Band = (300.0, 1800.0)
     feature_band_hz: Band = FEATURE_BAND_HZ
     looming_band_hz: Band = (300.0, 1800.0)
@@ -104,9 +115,11 @@ class FrontEndSettings:
         in_range("speed_of_sound_m_s", self.speed_of_sound_m_s, 100.0, 10_000.0)
         in_range("max_peaks", self.max_peaks, 1, 1000)
         in_range("music_sources", self.music_sources, 0, 1000)
+        in_range("tone_hops", self.tone_hops, 1, 1000)
+        in_range("tone_channels", self.tone_channels, 1, 1000)
         self._check_grid()
-        for name in ("srp_band_hz", "feature_band_hz", "looming_band_hz", "level_band_hz"):
-            low, high = getattr(self, name)
+        for name in ("srp_band_hz", "feature_band_hz", "looming_band_hz", "level_band_hz", "tone_band_hz"):
+            low, high = getattr(self, name) or ENGINE_BAND_HZ
             in_range(f"{name}: lower end", low, 0.0, np.inf)
             in_range(f"{name}: upper end", high, low, np.inf, open_low=True, open_high=True)
 

@@ -14,7 +14,7 @@ from .bands import SILENCE
 from .bearing import bearing_of
 from .ego_noise import EgoNoise
 from .feature import FEATURE_SEGMENTS, segment_feature
-from .frame import AcousticFrame
+from .frame import TONE_IS_OFF, AcousticFrame
 from .hops import Hop, HopCutter
 from .levels import LevelMeter
 from .listener import HopSums, Listener
@@ -24,6 +24,7 @@ from .peaks import find_peaks
 from .settings import FrontEndSettings
 from .srp import normalised
 from .threads import one_blas_thread
+from .tone_stage import ToneReading, ToneStage
 from .twins import twin_azimuth_rad, twin_reflection
 
 __all__ = ["AcousticFrame", "FrontEnd"]
@@ -95,6 +96,7 @@ class FrontEnd:
         with one_blas_thread():
             self._listener = Listener(array, self.sample_rate_hz, settings)
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
+        self._tone = self._tone_stage()
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
 
     def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
@@ -188,6 +190,8 @@ class FrontEnd:
         with one_blas_thread():
             self._hops.append(self._listener.push(hop.samples))
             levels = self._meter.push(hop.samples, self._keep)
+            if self._tone is not None:
+                self._tone.push(hop.samples, self._hops[-1].health.mask)
         return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
@@ -215,6 +219,7 @@ class FrontEnd:
             feature=self._feature(),
             bearing_age_s=self._age_s(settings.bearing_hops, hop.end),
             health=self._hops[-1].health,
+            tone=self._tone_reading(),
         )
 
     def _last(self, n_hops: int) -> list[HopSums]:
@@ -245,6 +250,19 @@ class FrontEnd:
             return _MUSIC_IS_OFF
         with one_blas_thread():
             return self._listener.music.read(self._hops[-1].health.mask)
+
+    def _tone_stage(self) -> ToneStage | None:
+        chosen = self.settings
+        if chosen.tone_band_hz is None:
+            return None
+        window_s = chosen.tone_hops / chosen.hop_rate_hz
+        return ToneStage(self.array, self.sample_rate_hz, chosen.tone_band_hz, window_s, chosen.tone_channels)
+
+    def _tone_reading(self) -> ToneReading | NotUsable:
+        if self._tone is None:
+            return TONE_IS_OFF
+        with one_blas_thread():
+            return self._tone.read()
 
     def _age_s(self, n_hops: int, end: int) -> float:
         hops = self._last(n_hops)

@@ -27,6 +27,7 @@ FEWEST_SAMPLES = 8
 # lobe.
 ZERO_PADDING = 4
 STEPS = 8
+_ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +113,7 @@ def estimate_tone(
     # The frequencies of complex samples form a circle: a search of all of it has no ends to stop at.
     endless = not real and low_hz is None and high_hz is None
     bounds = (-np.inf, np.inf) if endless else (2 * np.pi * low / rate, 2 * np.pi * high / rate)
-    return _refined(y.real if real else y, omega, bounds, rate)
+    return _tone(y.real if real else y, *climb(y.real if real else y, omega, bounds), rate)
 
 
 def _coarse_peak(y: ComplexArray, rate: float, low: float, high: float) -> float:
@@ -126,66 +127,113 @@ def _coarse_peak(y: ComplexArray, rate: float, low: float, high: float) -> float
     return float(frequency[inside][np.argmax(power[inside])])
 
 
-def _refined(
-    y: NDArray[np.float64] | ComplexArray, omega: float, bounds: tuple[float, float], rate: float
-) -> Tone:
-    """Gauss-Newton from the coarse peak, steps held within the main lobe."""
+def climb(
+    y: NDArray[np.float64] | ComplexArray,
+    omega: float,
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+    tolerance: float = 1e-7,
+) -> tuple[float, complex]:
+    """Fit one tone by Gauss-Newton from a coarse peak, unchecked; steps are held within the main lobe.
+
+    Parameters
+    ----------
+    y : (n,) float64 or complex128
+        Real samples are fitted by a cosine and a sine.
+    omega : float
+        Where to begin, radians a sample; within half a resolution, pi / n, of the peak.
+    bounds : (float, float)
+        Where to stay, radians a sample.
+    tolerance : float
+        A step below this share of the resolution is the last; where the fit is good, the next would be its
+        square.
+
+    Returns
+    -------
+    float, complex
+        Radians a sample, and A exp(j phase) at the centre of the samples.
+
+    Examples
+    --------
+    >>> omega, amplitude = climb(np.cos(1.0 * np.arange(101)), omega=1.01)
+    >>> round(omega, 9), round(abs(amplitude), 6)
+    (1.0, 1.0)
+    """
     n: NDArray[np.float64] = np.arange(len(y), dtype=np.float64) - 0.5 * (len(y) - 1)
     reach = np.pi / len(y)
     for _ in range(STEPS):
-        amplitudes, model, slope = _linear_fit(y, omega, n)
-        step = _frequency_step(y - model, slope, omega, n, complex_signal=np.iscomplexobj(y))
-        omega = float(np.clip(omega + np.clip(step, -reach, reach), *bounds))
-        if abs(step) < 1e-9 * reach:
+        step, fit = _step(y, omega, n)
+        target = min(max(omega + min(max(step, -reach), reach), bounds[0]), bounds[1])
+        moved, omega = abs(target - omega), target
+        if moved < tolerance * reach:
             break
-    amplitudes, model, _ = _linear_fit(y, omega, n)
-    return _tone(y - model, amplitudes, omega, rate)
+    return omega, complex(fit[0]) if np.iscomplexobj(y) else complex(fit[0], fit[1])
 
 
-def _basis(omega: float, n: NDArray[np.float64], complex_signal: bool) -> NDArray[np.float64] | ComplexArray:
-    wave = np.exp(1j * omega * n)
-    return wave[:, None] if complex_signal else np.stack([wave.real, -wave.imag], axis=1)
+def tone_wave(omega: float, count: int) -> ComplexArray:
+    """Give e^(j omega n), n counted from the centre, as a product of two short ones: few exponentials.
+
+    Examples
+    --------
+    >>> np.angle(tone_wave(0.1, 2)).round(3)
+    array([-0.05,  0.05])
+    """
+    width = int(np.sqrt(count)) + 1
+    fine = np.exp(1j * omega * np.arange(width))
+    coarse = np.exp(1j * omega * (width * np.arange(width) - 0.5 * (count - 1)))
+    return np.asarray(np.multiply.outer(coarse, fine).ravel()[:count])
 
 
-def _linear_fit(
+def _step(
     y: NDArray[np.float64] | ComplexArray, omega: float, n: NDArray[np.float64]
-) -> tuple[ComplexArray, NDArray[np.float64] | ComplexArray, NDArray[np.float64] | ComplexArray]:
-    """Complex amplitude at the centre, the fitted tone, and its derivative by the frequency."""
-    H = _basis(omega, n, np.iscomplexobj(y))
-    fit = np.linalg.lstsq(H, y, rcond=None)[0]
-    amplitude = fit if np.iscomplexobj(y) else fit[:1] + 1j * fit[1:]
-    wave = amplitude * np.exp(1j * omega * n)
-    slope = 1j * n * wave
-    return (amplitude, wave, slope) if np.iscomplexobj(y) else (amplitude, wave.real, slope.real)
+) -> tuple[float, NDArray[np.float64] | ComplexArray]:
+    """Least-squares step in frequency, the amplitude being refitted along with it (variable projection).
+
+    Everything is a product of few rows: the tone's H, its derivative by omega, and y.
+    """
+    rows = _rows(y, omega, n)
+    gram = rows.conj() @ rows.T
+    k = len(rows) // 2
+    # A row of zeros, the sine of 0 Hz, gets no amplitude.
+    inner = gram[:k, :k].copy()
+    inner.flat[:: k + 1] += _ROUNDING * len(y)
+    onto = np.linalg.solve(inner, gram[:k, k:])
+    fit = onto[:, k]
+    free, rest = np.zeros((2, 2 * k + 1), gram.dtype)
+    free[:k], free[k : 2 * k] = -(onto[:, :k] @ fit), fit
+    rest[:k], rest[-1] = -fit, 1.0
+    image = free.conj() @ gram
+    size = float((image @ free).real)
+    return float((image @ rest).real) / size if size > 0.0 else 0.0, fit
 
 
-def _frequency_step(
-    residual: NDArray[np.float64] | ComplexArray,
-    slope: NDArray[np.float64] | ComplexArray,
-    omega: float,
-    n: NDArray[np.float64],
-    *,
-    complex_signal: bool,
-) -> float:
-    """Least-squares step in frequency, the amplitude being refitted along with it (variable projection)."""
-    H = _basis(omega, n, complex_signal)
-    free = slope - H @ np.linalg.lstsq(H, slope, rcond=None)[0]
-    size = float(np.vdot(free, free).real)
-    return float(np.vdot(free, residual).real) / size if size > 0 else 0.0
+def _rows(
+    y: NDArray[np.float64] | ComplexArray, omega: float, n: NDArray[np.float64]
+) -> NDArray[np.float64] | ComplexArray:
+    """Columns of H, their derivatives by omega, and y: (3, n) complex, or (5, n) real."""
+    wave = tone_wave(omega, len(y))
+    if np.iscomplexobj(y):
+        return np.asarray(np.stack([wave, 1j * n * wave, y]), np.complex128)
+    rows = np.empty((5, len(y)))
+    rows[0] = wave.real
+    np.negative(wave.imag, out=rows[1])
+    np.multiply(rows[1], n, out=rows[2])
+    np.multiply(wave.real, -n, out=rows[3])
+    rows[4] = y
+    return rows
 
 
 def _tone(
-    residual: NDArray[np.float64] | ComplexArray, amplitude: ComplexArray, omega: float, rate: float
+    y: NDArray[np.float64] | ComplexArray, omega: float, amplitude: complex, rate: float
 ) -> Tone:
-    size = float(np.abs(amplitude[0]))
-    complex_signal = np.iscomplexobj(residual)
-    count = len(residual)
+    complex_signal, count, size = np.iscomplexobj(y), len(y), abs(amplitude)
+    model = amplitude * tone_wave(omega, count)
+    residual = y - (model if complex_signal else model.real)
     # Three real parameters are fitted; a complex sample is worth two real ones.
     power = float(np.vdot(residual, residual).real) / (2 * count - 3 if complex_signal else count - 3)
     snr = size**2 / max(power if complex_signal else 2.0 * power, np.finfo(float).tiny)
     snr = min(max(snr, np.finfo(float).tiny), 1e300)
     std = float(np.sqrt(tone_crb_hz2(snr, count, rate)))
-    phase = float(np.angle(amplitude[0]) - omega * 0.5 * (count - 1))
+    phase = float(np.angle(amplitude) - omega * 0.5 * (count - 1))
     frequency = wrap_angle(omega) * rate / (2 * np.pi)
     return Tone(frequency, size, wrap_angle(phase), snr, std)
 

@@ -12,15 +12,18 @@ from worldstate.errors import InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.bins import band_bins, bin_frequencies_hz
 from worldstate.frontend.looming import Looming
+from worldstate.frontend.music_stage import MusicReading
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.srp import srp_phat
 from worldstate.frontend.steering import Steering
 from worldstate.frontend.stft import StreamingStft
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.frontend.tone_stage import ToneReading
 from worldstate.values import NotUsable
 
 SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
 RATE = 16_000
+EVERYTHING = FrontEndSettings(music_sources=1, tone_band_hz=(20.0, 400.0))
 
 
 def noise_from(
@@ -43,17 +46,28 @@ def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: fl
         if isinstance(a.looming, Looming) and isinstance(b.looming, Looming):
             assert a.looming.inverse_tta_hz == pytest.approx(b.looming.inverse_tta_hz, rel=rtol, abs=1e-7)
             assert a.looming.std_hz == pytest.approx(b.looming.std_hz, rel=rtol)
+        assert_same_options(a, b)
+
+
+def assert_same_options(a: AcousticFrame, b: AcousticFrame) -> None:
+    """MUSIC and tone, bit for bit: hops are cut before anything is computed."""
+    assert a.tone == b.tone
+    assert isinstance(a.music, MusicReading) == isinstance(b.music, MusicReading)
+    if isinstance(a.music, MusicReading) and isinstance(b.music, MusicReading):
+        np.testing.assert_array_equal(a.music.spectrum, b.music.spectrum)
 
 
 @settings(deadline=None, max_examples=15)
 @given(cuts=st.lists(st.integers(0, 20_000), max_size=12), rate=st.sampled_from([8_000, 15_999.7]))
 def test_block_size_does_not_matter(cuts: list[int], rate: float) -> None:
     sound = noise_from(SQUARE, 0.5, RATE, 1.25)
-    whole = FrontEnd(SQUARE, rate).process(sound)
-    pieces = FrontEnd(SQUARE, rate)
+    sound += np.sin(2 * np.pi * 61.0 / RATE * np.arange(len(sound)), dtype=np.float32)[:, None]
+    whole = FrontEnd(SQUARE, rate, EVERYTHING).process(sound)
+    pieces = FrontEnd(SQUARE, rate, EVERYTHING)
     blocks = np.split(sound, sorted(min(c, len(sound)) for c in cuts))
     assert_same([frame for block in blocks for frame in pieces.process(block)], whole)
-    assert whole
+    assert isinstance(whole[-1].tone, ToneReading)
+    assert isinstance(whole[-1].music, MusicReading)
 
 
 def test_sample_by_sample_is_the_same_too() -> None:

@@ -1,0 +1,229 @@
+r"""The engine line of a stream: one tone a hop, fitted by maximum likelihood at a rate that suits it.
+
+A few microphones around the middle of the array are averaged: at engine frequencies they stand within a
+fraction of a wavelength, so that a tone adds up from wherever it comes. `decimator` keeps the band, at some
+1200 samples a second. In the last second the highest peak over the noise around it is looked for, under a
+Hann window, so that neither harmonics nor rumble leak there, and climbed as in `tone`.
+
+The noise floor is the median power around the line: the standard deviation is the bound of Rife and Boorstyn
+at the signal-to-noise ratio in place, whatever the colour of the noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.values import NotUsable
+
+from .array import MicrophoneArray
+from .bounds import tone_crb_hz2
+from .comb import MEDIAN_OF_EXPONENTIAL
+from .decimator import Decimator
+from .masking import ChannelMask
+from .tone import climb
+
+ENGINE_BAND_HZ = (20.0, 400.0)
+# Bins per resolution (a grid this fine starts the climb within its lobe), resolutions per block of the coarse
+# floor, and the ring of resolutions around the line whose median is its floor: beyond its own side lobes.
+_PADDING = 2
+_BLOCK = 24
+_RING = (5, 40)
+# Peak over floor, A^2 N / 4 sigma^2; 15.6 dB for eta N. White noise exceeds it in one window of a thousand.
+_EVIDENT = 18.0
+# Share of a resolution that the climb may be wrong by: a tone whose eta N is 80 dB is known to as much.
+_TOLERANCE = 1e-4
+# Lowest frequency, periods in the window: below, a tone cannot be told from an offset.
+_FEWEST_PERIODS = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class ToneReading:
+    """A tone that stands out of the noise.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Mean over the window, by the stream's own sample rate.
+    frequency_std_hz : float
+        From the bound at this SNR; a line that wanders within the window is known worse.
+    snr : float
+        eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from the noise around the line.
+    mean_square : float
+        A^2 / 2 of the averaged microphones, squared units of the samples.
+    age_s : float
+        How long before the end of the hop the middle of the window was, seconds.
+
+    Examples
+    --------
+    >>> ToneReading(61.2, 0.02, 0.5, 1e-4, 0.5).frequency_hz
+    61.2
+    """
+
+    frequency_hz: float
+    frequency_std_hz: float
+    snr: float
+    mean_square: float
+    age_s: float
+
+
+class ToneStage:
+    """Remembers the band of one averaged channel over the window; memory does not grow.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        In the order of the channels.
+    sample_rate_hz : float
+        Samples per second.
+    band_hz : (float, float)
+        Where the line is looked for.
+    window_s : float
+        Length of the window.
+    n_channels : int
+        So many microphones are averaged: the living ones next to the middle of the array.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the band reaches half the sample rate or below four periods a window.
+
+    Examples
+    --------
+    >>> stage = ToneStage(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 8_000)
+    >>> rng, t = np.random.default_rng(0), np.arange(8_000) / 8_000
+    >>> engine = np.sin(2 * np.pi * 61.2 * t)[:, None] + 0.5 * rng.standard_normal((8_000, 2))
+    >>> stage.push(engine.astype(np.float32), ChannelMask.all_of(2))
+    >>> reading = stage.read()
+    >>> bool(abs(reading.frequency_hz - 61.2) < 3 * reading.frequency_std_hz < 0.1)
+    True
+    """
+
+    def __init__(
+        self,
+        array: MicrophoneArray,
+        sample_rate_hz: float,
+        band_hz: tuple[float, float] = ENGINE_BAND_HZ,
+        window_s: float = 1.0,
+        n_channels: int = 4,
+    ) -> None:
+        low, high = band_hz
+        in_range("tone_band_hz: lower end", low, _FEWEST_PERIODS / window_s, high, open_high=True)
+        in_range("tone_band_hz: upper end", high, low, 0.5 * sample_rate_hz, open_high=True)
+        self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
+        self._n_channels = n_channels
+        self._weights, self._keep = self._mean_of(np.ones(array.n_microphones, bool))
+        self._sample_rate_hz = sample_rate_hz
+        self._decimator = Decimator(sample_rate_hz, high)
+        self._rate = self._decimator.rate_hz
+        self._n_pushed = 0
+        self._n_out = 0
+        self._heard: NDArray[np.float64] = np.zeros(_window(window_s * sample_rate_hz, self._decimator))
+        self._spectrum = _Spectrum(len(self._heard), self._rate, band_hz)
+
+    def push(self, samples: NDArray[np.float32], mask: ChannelMask) -> None:
+        """Take the samples of a hop (n, M), of which the microphones of a mask count."""
+        if not np.array_equal(mask.keep, self._keep):
+            self._weights, self._keep = self._mean_of(mask.keep)
+        new = self._decimator.push(samples @ self._weights)
+        self._n_pushed += len(samples)
+        self._n_out += len(new)
+        self._heard = np.concatenate([self._heard, new])[len(new) :]
+
+    def read(self) -> ToneReading | NotUsable:
+        """Fit the line of the window that ends with the last hop."""
+        if self._n_out < len(self._heard):
+            return NotUsable(f"needs {len(self._heard) / self._rate:.2f} s of sound")
+        if not self._heard.any():
+            return NotUsable("silence")
+        sound = self._heard - self._spectrum.offset(self._heard)
+        power = self._spectrum.power(sound)
+        begin, band = self._spectrum.peak(power), self._spectrum.omega_range
+        omega, amplitude = climb(sound, begin, band, tolerance=_TOLERANCE)
+        snr = 0.5 * abs(amplitude) ** 2 / self._spectrum.floor_near(power, omega)
+        if not 0.5 * snr * len(sound) > _EVIDENT:
+            return NotUsable("no tone stands out of the noise")
+        std = float(np.sqrt(tone_crb_hz2(snr, len(sound), self._rate)))
+        frequency = omega * self._rate / (2.0 * np.pi)
+        return ToneReading(frequency, std, snr, 0.5 * abs(amplitude) ** 2, self._age_s())
+
+    def _mean_of(self, keep: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Weights of the nearest living microphones; of the nearest, where none lives."""
+        living = self._nearest[keep[self._nearest]] if keep.any() else self._nearest
+        chosen = living[: self._n_channels]
+        weights = np.zeros(len(keep), np.float32)
+        weights[chosen] = 1.0 / len(chosen)
+        return weights, keep.copy()
+
+    def _age_s(self) -> float:
+        """From the middle of the window to the last sample pushed."""
+        middle = self._n_out - 0.5 * (len(self._heard) + 1)
+        centre = middle * self._decimator.factor + 0.5 * self._decimator.n_taps
+        return float((self._n_pushed - centre) / self._sample_rate_hz)
+
+
+def _window(n_samples: float, decimator: Decimator) -> int:
+    """How many outputs are sure to lie within so many input samples."""
+    count = int((n_samples - decimator.n_taps) // decimator.factor)
+    if count < 2 * _PADDING * _RING[1]:
+        raise InvalidArgumentError(
+            f"tone_hops: expected a window well above the filter's {decimator.n_taps} samples, "
+            f"got {n_samples:.0f}"
+        )
+    return count
+
+
+class _Spectrum:
+    """Hann-windowed, zero-padded power around a band, in units of the mean square of white noise."""
+
+    def __init__(self, n_samples: int, rate: float, band_hz: tuple[float, float]) -> None:
+        hann = np.hanning(n_samples + 2)[1:-1]
+        self._window = hann / np.sqrt(np.square(hann).sum())
+        self._size = scipy.fft.next_fast_len(_PADDING * n_samples, real=True)
+        self._step = float(2.0 * np.pi / self._size)
+        low, high = (2.0 * np.pi * f / rate for f in band_hz)
+        self.omega_range = (low, high)
+        self._band = slice(int(np.ceil(low / self._step)), int(high / self._step) + 1)
+
+    def offset(self, sound: NDArray[np.float64]) -> float:
+        """Mean under the window, to which no tone of a few periods contributes."""
+        return float(self._window @ sound) / float(self._window.sum())
+
+    def power(self, sound: NDArray[np.float64]) -> NDArray[np.float64]:
+        spectrum = scipy.fft.rfft(sound * self._window, self._size)
+        return np.asarray(np.square(spectrum.real) + np.square(spectrum.imag))
+
+    def peak(self, power: NDArray[np.float64]) -> float:
+        """Radians a sample where the power stands highest over that of its block."""
+        inside = power[self._band]
+        width = min(_PADDING * _BLOCK, len(inside))
+        n_blocks = len(inside) // width
+        blocks = inside[: n_blocks * width].reshape(n_blocks, width)
+        floor = np.partition(blocks, width // 2, axis=1)[:, width // 2] + _least(power)
+        ratio = inside / np.repeat(floor, width)[np.minimum(np.arange(len(inside)), n_blocks * width - 1)]
+        index = self._band.start + int(np.argmax(ratio))
+        near = np.log(power[index - 1 : index + 2] + _least(power))
+        return self._step * (index + _vertex(float(near[0]), float(near[1]), float(near[2])))
+
+    def floor_near(self, power: NDArray[np.float64], omega: float) -> float:
+        """Mean square of white noise as strong as that around a line."""
+        centre = round(omega / self._step)
+        inner, outer = (_PADDING * r for r in _RING)
+        below = power[max(centre - outer, 1) : max(centre - inner, 1)]
+        above = power[centre + inner : centre + outer]
+        median = np.median(np.concatenate([below, above])) / MEDIAN_OF_EXPONENTIAL
+        return float(median) + _least(power)
+
+
+def _vertex(left: float, middle: float, right: float) -> float:
+    """Where a parabola through three points is highest, from the second, in steps; at most half a step."""
+    bend = left - 2.0 * middle + right
+    return min(max(0.5 * (left - right) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
+
+
+def _least(power: NDArray[np.float64]) -> float:
+    """Noise that single precision makes by itself."""
+    return float(np.finfo(np.float32).eps ** 2 * power.max()) + np.finfo(np.float64).tiny
