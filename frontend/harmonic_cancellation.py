@@ -19,6 +19,7 @@ H. Vold and J. Leuridan, "High resolution order tracking at extreme slew rates",
 orders at once); the window's kernel: F. J. Harris, Proc. IEEE 66, 1978.
 """
 
+import cmath
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -189,9 +190,8 @@ class HarmonicCanceller:
         if not len(orders):
             return spectra
         time: FloatArray = self._frame_s * np.arange(1.0, len(spectra) + 1)
-        shapes = _line_shapes(self._engine, time, orders, self._bins, self._bin_hz)
-        scale = _inverse_rms(spectra)
-        now = _Fit.of(shapes, spectra, scale, orders)
+        shapes = _LineShapes.of(self._engine, time, orders, self._bins, self._bin_hz)
+        now = _Fit.of(shapes, spectra)
         error = 0.0
         if self._fit is not None:
             error = now.phase_ahead(self._fit, self._evident)
@@ -199,7 +199,7 @@ class HarmonicCanceller:
         self._fit, self._evident = now, now.evident_amplitudes()
         self._engine = self._engine.after(float(time[-1]), error).within(*self._limits_hz)
         turn = np.exp(1j * orders * error).astype(np.complex64)
-        lines = shapes @ (turn[:, None] * self._evident)
+        lines = shapes.whole @ (turn[:, None] * self._evident)
         return np.asarray(spectra - lines.reshape(spectra.shape))
 
     def _orders(self, frequency_hz: float) -> NDArray[np.int64]:
@@ -210,8 +210,47 @@ class HarmonicCanceller:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _LineShapes:
+    """The g of the module's equation for unit N, as the product of what bins and frames see.
+
+    Parameters
+    ----------
+    orders : (H,) int
+        Successive.
+    kernel : (bins, H) float
+        Over a hop that of its middle: the frequency moves by a small part of a bin.
+    turn : (frames, H) complex
+    """
+
+    orders: NDArray[np.int64]
+    kernel: NDArray[np.float32]
+    turn: NDArray[np.complex64]
+    whole: NDArray[np.complex64]
+
+    @classmethod
+    def of(
+        cls,
+        engine: EngineState,
+        time_s: FloatArray,
+        orders: NDArray[np.int64],
+        bins: NDArray[np.int64],
+        bin_hz: float,
+    ) -> "_LineShapes":
+        kernel = _signed_kernel(engine.frequencies(time_s.mean()) * orders / bin_hz, bins)
+        angle = np.mod(engine.phases(time_s), 2.0 * np.pi)[:, None] * orders
+        turn = np.exp(1j * angle).astype(np.complex64)
+        whole = (kernel * turn[:, None, :]).reshape(-1, len(orders))
+        return cls(orders, kernel, turn, whole)
+
+    def weighted_gram(self, weights: NDArray[np.float32]) -> ComplexArray:
+        """Return G^H W G with a weight per bin (bins,), without the product over all frames and bins."""
+        over_bins = self.kernel.T @ (weights[:, None] * self.kernel)
+        return np.asarray((self.turn.conj().T @ self.turn) * over_bins)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """Normal equations of the amplitudes, and their solution.
+    """Normal equations of the amplitudes.
 
     Parameters
     ----------
@@ -220,7 +259,6 @@ class _Fit:
     moment : (H, M) complex
     energy, count : float
         Weighted sum of |X|^2 per microphone and number of values behind it.
-    amplitudes : (H, M) complex
     """
 
     orders: NDArray[np.int64]
@@ -228,31 +266,18 @@ class _Fit:
     moment: ComplexArray
     energy: float
     count: float
-    amplitudes: ComplexArray
 
     @classmethod
-    def of(
-        cls,
-        shapes: NDArray[np.complex64],
-        spectra: NDArray[np.complex64],
-        scale: NDArray[np.float32],
-        orders: NDArray[np.int64],
-    ) -> "_Fit":
+    def of(cls, shapes: _LineShapes, spectra: NDArray[np.complex64]) -> "_Fit":
         n_frames, n_bins, n_microphones = spectra.shape
-        weights = np.tile(scale, n_frames)[:, None]
-        weighted = weights * spectra.reshape(-1, n_microphones)
-        adjoint = (weights * shapes).conj().T
-        energy = float(np.vdot(weighted, weighted).real) / n_microphones
-        gram = adjoint @ adjoint.conj().T
-        return cls._solved(orders, gram, adjoint @ weighted, energy, float(n_frames * n_bins))
-
-    @classmethod
-    def _solved(
-        cls, orders: NDArray[np.int64], gram: ComplexArray, moment: ComplexArray, energy: float, count: float
-    ) -> "_Fit":
-        diagonal = np.einsum("hh->h", gram).real
-        loaded = gram + np.diag(_RIDGE * diagonal + _TINY).astype(gram.dtype)
-        return cls(orders, gram, moment, energy, count, np.linalg.solve(loaded, moment))
+        weights = _inverse_power(spectra)
+        weighted = (shapes.whole.reshape(n_frames, n_bins, -1) * weights[:, None]).reshape(
+            -1, len(shapes.orders)
+        )
+        moment = weighted.conj().T @ spectra.reshape(-1, n_microphones)
+        # In every bin that is not silent the mean power is one.
+        energy = float(n_frames * np.count_nonzero(weights))
+        return cls(shapes.orders, shapes.weighted_gram(weights), moment, energy, float(n_frames * n_bins))
 
     def _shared(self, other: "_Fit") -> tuple[slice, slice]:
         """Return where both have the same orders; orders are successive."""
@@ -264,28 +289,29 @@ class _Fit:
     def phase_ahead(self, remembered: "_Fit", evident: ComplexArray) -> float:
         """Angle of the fundamental by which this hop is ahead of what is remembered, radians."""
         mine, theirs = self._shared(remembered)
-        turned = (self.amplitudes[mine] * evident[theirs].conj()).sum(axis=1)
+        # Against the moments that the remembered amplitudes would give: nothing has to be solved.
+        expected = self.gram[mine, mine] @ evident[theirs]
+        turned = np.einsum("hm,hm->h", self.moment[mine], expected.conj()).astype(np.complex128)
         # Lines of like strength say more than one loud one that has no neighbour.
-        turned = turned.astype(np.complex128) / np.sqrt(np.abs(turned) + _TINY)
+        turned /= np.sqrt(np.abs(turned) + _TINY) * np.einsum("hh->h", self.gram[mine, mine]).real + _TINY
         angle = 0.0
         for step in _ORDER_STEPS:
             if len(turned) > step:
-                pairs = turned[step:] * turned[:-step].conj()
-                angle += float(np.angle(pairs.sum() * np.exp(-1j * step * angle))) / step
+                pairs = np.vdot(turned[:-step], turned[step:])
+                angle += cmath.phase(pairs * cmath.exp(-1j * step * angle)) / step
         orders = self.orders[mine]
         rest = turned * np.exp(-1j * orders * angle)
         weight = np.abs(rest) * orders
-        angle += float((weight * np.angle(rest)).sum() / max((weight * orders).sum(), _TINY))
-        agreement = np.abs((turned * np.exp(-1j * orders * angle)).sum()) / max(np.abs(turned).sum(), _TINY)
+        correction = float(weight @ np.angle(rest)) / max(float(weight @ orders), _TINY)
+        agreement = abs((rest * np.exp(-1j * orders * correction)).sum()) / max(np.abs(rest).sum(), _TINY)
         # Orders that disagree are noise: the loop coasts.
-        return angle * float(agreement) ** 2
+        return (angle + correction) * float(agreement) ** 2
 
     def turned(self, angle: float) -> "_Fit":
         """Refer to a fundamental whose phase is ahead by an angle."""
         turn = np.exp(-1j * self.orders * angle).astype(self.gram.dtype)
         gram = turn[:, None] * self.gram * turn.conj()
-        moment, amplitudes = turn[:, None] * self.moment, turn[:, None] * self.amplitudes
-        return _Fit(self.orders, gram, moment, self.energy, self.count, amplitudes)
+        return _Fit(self.orders, gram, turn[:, None] * self.moment, self.energy, self.count)
 
     def joined(self, remembered: "_Fit", kept: float) -> "_Fit":
         """Add what is remembered, forgotten by a factor; orders that have left are dropped."""
@@ -294,48 +320,41 @@ class _Fit:
         gram[mine, mine] += np.float32(kept) * remembered.gram[theirs, theirs]
         moment[mine] += np.float32(kept) * remembered.moment[theirs]
         energy = self.energy + kept * remembered.energy
-        return self._solved(self.orders, gram, moment, energy, self.count + kept * remembered.count)
+        return _Fit(self.orders, gram, moment, energy, self.count + kept * remembered.count)
 
     def evident_amplitudes(self) -> ComplexArray:
         """Amplitudes (H, M), each shrunk by what noise alone would have left of it."""
-        explained = float(np.vdot(self.amplitudes, self.moment).real) / self.moment.shape[1]
+        diagonal = np.einsum("hh->h", self.gram).real
+        loaded = self.gram + np.diag(_RIDGE * diagonal + _TINY).astype(self.gram.dtype)
+        amplitudes = np.linalg.solve(loaded, self.moment)
+        explained = float(np.vdot(amplitudes, self.moment).real) / self.moment.shape[1]
         noise = max(self.energy - explained, 1e-6 * self.energy) / self.count
-        power = np.square(np.abs(self.amplitudes)).mean(axis=1) * np.einsum("hh->h", self.gram).real
+        power = np.square(np.abs(amplitudes)).mean(axis=1) * diagonal
         kept = np.maximum(1.0 - _NO_LINE * noise / np.maximum(power, _TINY), 0.0)
-        return np.asarray(self.amplitudes * kept[:, None].astype(np.float32))
+        return np.asarray(amplitudes * kept[:, None].astype(np.float32))
 
 
-def _line_shapes(
-    engine: EngineState, time_s: FloatArray, orders: NDArray[np.int64], bins: NDArray[np.int64], bin_hz: float
-) -> NDArray[np.complex64]:
-    """Return g of the module's equation for unit N, (frames * bins, H).
+def _signed_kernel(place: FloatArray, bins: NDArray[np.int64]) -> NDArray[np.float32]:
+    r"""Spectrum of the Hann window per sample for lines at `place`, bins, times (-1)^k: (bins, H).
 
-    Over a hop the kernel is that of its middle: the frequency moves by a small part of a bin.
-    """
-    place = engine.frequencies(time_s.mean()) * orders / bin_hz
-    kernel = _hann_kernel(place - bins[:, None]) * np.where(bins % 2, -1.0, 1.0)[:, None]
-    angle = np.mod(engine.phases(time_s)[:, None] * orders, 2.0 * np.pi)
-    turn = np.exp(1j * angle).astype(np.complex64)
-    return np.asarray((kernel.astype(np.float32) * turn[:, None, :]).reshape(-1, len(orders)))
-
-
-def _hann_kernel(distance: FloatArray) -> FloatArray:
-    r"""Spectrum of the Hann window per sample: sinc(u) / (2 (1 - u^2)), cut beyond four bins.
+    sinc(u) / (2 (1 - u^2)) with u = place - k, cut beyond four bins. As sin(pi u) = (-1)^k sin(pi place), the
+    sign goes into one sine a line.
 
     Examples
     --------
-    >>> _hann_kernel(np.array([0.0, 1.0, 5.0])).round(3)
-    array([0.5 , 0.25, 0.  ])
+    >>> _signed_kernel(np.array([4.0]), np.array([3, 4, 5, 9])).round(3).ravel() + 0.0
+    array([-0.25,  0.5 , -0.25,  0.  ], dtype=float32)
     """
-    below = 1.0 - np.square(distance)
-    # At u = 1 both numerator and denominator vanish: stand a hair beside it.
-    below = np.where(np.abs(below) < 1e-6, 1e-6, below)
-    u = np.sqrt(np.maximum(1.0 - below, 0.0))
-    kernel = 0.5 * np.sinc(u) / below
-    return np.where(u < 4.0, kernel, 0.0)
+    # Numerator and denominator both vanish at whole distances: stand a hair beside them.
+    place = np.where(np.abs(place - np.round(place)) < 1e-6, place + 1e-6, place)
+    u = place - bins[:, None]
+    kernel = (np.sin(np.pi * place) / (2.0 * np.pi)) / (u * (1.0 - u * u))
+    kernel[np.abs(u) >= 4.0] = 0.0
+    return kernel.astype(np.float32)
 
 
-def _inverse_rms(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Scale every bin to unit power, (bins,); silent bins get no say."""
-    power = (np.square(spectra.real) + np.square(spectra.imag)).mean(axis=(0, 2))
-    return np.where(power > _TINY, 1.0 / np.sqrt(np.maximum(power, _TINY)), 0.0).astype(np.float32)
+def _inverse_power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the weights that give every bin unit power, (bins,); silent bins get no say."""
+    parts = np.ascontiguousarray(spectra).view(np.float32)
+    power = np.einsum("tbm,tbm->b", parts, parts) / np.float32(spectra.shape[0] * spectra.shape[2])
+    return np.where(power > _TINY, 1.0 / np.maximum(power, _TINY), 0.0).astype(np.float32)
