@@ -7,7 +7,9 @@ from pathlib import Path
 
 from worldstate.abduction.any_signature import AnySignature
 from worldstate.abduction.cueing import CueingPolicy
-from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.abduction.ensemble import EnsembleModel
+from worldstate.abduction.site_estimate import SiteEstimate, SiteEstimateSettings
+from worldstate.adapters.acoustic import AcousticAdapter, Signature
 from worldstate.adapters.array_xml import read_array_xml
 from worldstate.adapters.audio import open_audio
 from worldstate.adapters.camera import PinholeCamera
@@ -16,6 +18,7 @@ from worldstate.adapters.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.ovad import Recording
 from worldstate.adapters.sector import Sector
+from worldstate.adapters.site_signature import SiteSignature
 from worldstate.adapters.video import VIDEO_NAME, open_video
 from worldstate.adapters.vision import VisionQuery
 from worldstate.adapters.watched_camera import video_degradation
@@ -54,6 +57,11 @@ class Source:
         Measured for the camera's detector; the defaults of `VisionQuery` without.
     degradation : float or callable
         d of the camera, or a function from the stamp to it.
+    site_settings : SiteEstimateSettings or None
+        How the site is learned while listening; None for not at all, and without effect on a model that does
+        not compare windows with their site.
+    site : SiteEstimate or None
+        What is known of the site beforehand, from a checkpoint.
     """
 
     audio_path: Path
@@ -66,6 +74,14 @@ class Source:
     mask_dead: bool = False
     miss_rates: MissRates | None = None
     degradation: float | Callable[[int], float] = 0.0
+    site_settings: SiteEstimateSettings | None = None
+    site: SiteEstimate | None = None
+
+    def signature(self) -> Signature:
+        """Return the model as it is at the start of the recording; one that learns its site learns anew."""
+        if self.site_settings is None or not isinstance(self.model, EnsembleModel):
+            return self.model
+        return SiteSignature(self.model, self.site_settings, estimate=self.site)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +103,9 @@ def open_source(
     context: Context | None = None,
     mask_dead: bool = False,
     miss_rates: Path | str | MissRates | None = None,
+    site_adaptation: bool = True,
+    forgetting_s: float | None = None,
+    site: SiteEstimate | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
@@ -110,13 +129,19 @@ def open_source(
     miss_rates : path or MissRates, optional
         What `worldstate measure-absence` wrote. Where it holds the camera's scale of health and the recording
         folder has a video, the degradation is read from that.
+    site_adaptation : bool
+        Learn what the site is like while listening, where the model compares windows with their site.
+    forgetting_s : float, optional
+        Time constant of that, seconds; see `SiteEstimateSettings`.
+    site : SiteEstimate, optional
+        What is known of the site beforehand, from a checkpoint.
 
     Raises
     ------
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
-        If the model holds no threshold for `alpha`.
+        If the model holds no threshold for `alpha` or the time constant is not positive.
     """
     path = Path(path)
     recording = Recording.open(path) if path.is_dir() else None
@@ -134,7 +159,13 @@ def open_source(
         mask_dead=mask_dead,
         miss_rates=rates,
         degradation=_degradation(recording, rates),
+        site_settings=_site_settings(forgetting_s) if site_adaptation else None,
+        site=site,
     )
+
+
+def _site_settings(forgetting_s: float | None) -> SiteEstimateSettings:
+    return SiteEstimateSettings() if forgetting_s is None else SiteEstimateSettings(forgetting_s=forgetting_s)
 
 
 def _degradation(recording: Recording | None, rates: MissRates | None) -> float | Callable[[int], float]:
@@ -199,7 +230,7 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
             line_of_sight=sight,
             clutter=rates.clutter_rate if rates is not None else None,
         )
-        adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.model, vision=vision)
+        adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.signature(), vision=vision)
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):
                 yield frame, adapter.interpret(frame)

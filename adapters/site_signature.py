@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.ensemble import EnsembleModel
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.site_estimate import SiteEstimate, SiteEstimateSettings
-from worldstate.checks import finite_array, in_range
+from worldstate.checks import check_shape, finite_array, in_range
 
 HOP_S = 0.1
 
@@ -24,6 +24,11 @@ class SiteSignature:
         Seconds between two windows.
     estimate : SiteEstimate, optional
         From a checkpoint; a fresh one unless given.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the estimate is of another number of features.
 
     Attributes
     ----------
@@ -53,6 +58,7 @@ class SiteSignature:
         self._settings = settings or SiteEstimateSettings()
         self._hop_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True, open_high=True)
         self.estimate = estimate or SiteEstimate.start(model.n_features)
+        check_shape("estimate", self.estimate.level.shape, (model.n_features,))
 
     @property
     def reference_prior(self) -> tuple[float, ...]:

@@ -41,6 +41,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--miss-rates", type=Path, metavar="JSON", help="of the camera, as measure-absence wrote them"
     )
+    parser.add_argument(
+        "--site-adaptation",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="learn what the site is like while listening (default: on)",
+    )
+    parser.add_argument(
+        "--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)"
+    )
     parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
@@ -62,6 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
         alpha=arguments.alpha,
         mask_dead=arguments.mask_dead,
         miss_rates=arguments.miss_rates,
+        site_adaptation=arguments.site_adaptation,
+        forgetting_s=arguments.forgetting,
     )
     try:
         report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)

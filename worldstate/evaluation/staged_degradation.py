@@ -108,5 +108,5 @@ def _asked(
     """Ask the camera again about what was heard."""
     query = seen.query(staging.camera, staging.settings, line_of_sight(source.context))
     # Frames are only interpreted, so the rate of the sound does not matter here.
-    adapter = AcousticAdapter(source.array, 48_000.0, source.model, vision=query)
+    adapter = AcousticAdapter(source.array, 48_000.0, source.signature(), vision=query)
     return map(adapter.interpret, heard)

@@ -1,0 +1,95 @@
+"""All that a running chain carries, on disk: the filter's memory and what was learned of the site."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from worldstate.abduction.site_estimate import SiteEstimate
+from worldstate.adapters.atomic import write_text
+from worldstate.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+from worldstate.filter import WorldFilter
+from worldstate.state.reading import decode_json
+
+MAX_BYTES = 16 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A chain between two hops; what is read back continues bit for bit.
+
+    Parameters
+    ----------
+    world : WorldFilter
+        The belief.
+    site : SiteEstimate or None
+        `SiteSignature.estimate`; None where no site is learned.
+
+    Examples
+    --------
+    >>> checkpoint = Checkpoint(WorldFilter().predict(0.3), SiteEstimate.start(60))
+    >>> again = Checkpoint.from_dict(checkpoint.to_dict())
+    >>> again.world.stamp_ns, again.site.heard_s
+    (300000000, 0.0)
+    """
+
+    world: WorldFilter
+    site: SiteEstimate | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-able values: the filter's checkpoint with the site beside its memory."""
+        return self.world.to_dict() | {"site": None if self.site is None else self.site.to_dict()}
+
+    @classmethod
+    def from_dict(cls, data: object) -> "Checkpoint":
+        """Return what `to_dict` wrote; the filter's own checkpoint reads as one without a site.
+
+        Raises
+        ------
+        SchemaVersionError
+            On another schema or another major version.
+        InvalidArgumentError
+            If a value is missing, of the wrong type or out of range; the message says where.
+        """
+        world = WorldFilter.from_dict(data)
+        site = data.get("site") if isinstance(data, Mapping) else None
+        return cls(world, None if site is None else SiteEstimate.from_dict(site))
+
+
+def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint to exactly this path, whole or not at all.
+
+    Raises
+    ------
+    InputFileError
+        If the folder is missing.
+    """
+    write_text(path, json.dumps(checkpoint.to_dict(), allow_nan=False) + "\n")
+
+
+def read_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing, too large, truncated or no JSON, or a value is missing or out of range.
+    SchemaVersionError
+        If it is of another major version.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputFileError(path, f"expected a checkpoint ({error.strerror})") from error
+    if len(data) > MAX_BYTES:
+        raise InputFileError(path, f"expected a checkpoint of at most {MAX_BYTES >> 20} MiB")
+    try:
+        return Checkpoint.from_dict(decode_json(data.decode("utf-8"), "checkpoint"))
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, "expected a checkpoint in UTF-8") from error
+    except SchemaVersionError as error:
+        raise SchemaVersionError(path, error.problem) from error
+    except InvalidArgumentError as error:
+        raise InputFileError(path, str(error)) from error
