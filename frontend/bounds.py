@@ -226,14 +226,40 @@ def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> NDAr
     >>> endfire_information(across, np.deg2rad([0, 60, 90])).round(3)
     array([1.  , 0.25, 0.  ])
     """
-    positions = finite_array("positions_m", positions_m, (None, 3))
-    horizontal = (positions - positions.mean(axis=0))[:, :2]
-    best = float(np.linalg.eigvalsh(horizontal.T @ horizontal)[-1])
-    if best <= 0:
-        raise InvalidArgumentError("positions_m: expected a horizontal extent, got none")
+    moments, _ = _horizontal_moments(positions_m)
     azimuth = np.asarray(azimuths_rad, dtype=np.float64)
     slope = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
-    return np.asarray(((slope @ horizontal.T) ** 2).sum(axis=-1) / best)
+    return np.asarray(((slope @ moments) * slope).sum(axis=-1) / np.linalg.eigvalsh(moments)[-1])
+
+
+def broadside_rad(positions_m: ArrayLike) -> float:
+    r"""Azimuth at which an array tells bearings best: where `endfire_information` is one.
+
+    .. math:: \theta = \arg\max_\theta \dot u_\theta^T S\, \dot u_\theta
+
+    Parameters
+    ----------
+    positions_m : (M, 3) float
+        Microphones in `base_link` axes, metres.
+
+    Returns
+    -------
+    float
+        In (-pi/2, pi/2]; any direction where all are equal.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the microphones have no horizontal extent.
+
+    Examples
+    --------
+    >>> broadside_rad([[0, -0.4, 0], [0, 0.4, 0]]), broadside_rad([[0.4, 0, 0], [-0.4, 0, 0]]).__round__(4)
+    (0.0, 1.5708)
+    """
+    _, axis = _horizontal_moments(positions_m)
+    x, y = axis if axis[1] > 0.0 or (axis[1] == 0.0 and axis[0] < 0.0) else -axis
+    return float(np.arctan2(-x, y)) + 0.0
 
 
 def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
@@ -328,6 +354,17 @@ def _direction_slopes(azimuth_rad: float, elevation_rad: float) -> NDArray[np.fl
     by_azimuth = np.cos(elevation) * direction_vectors(azimuth + np.pi / 2)
     by_elevation = direction_vectors(azimuth, elevation + np.pi / 2)
     return np.stack([by_azimuth, by_elevation], axis=1)
+
+
+def _horizontal_moments(positions_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Second moments S of the microphones in x and y, (2, 2), and the axis of the largest, (2,)."""
+    positions = finite_array("positions_m", positions_m, (None, 3))
+    horizontal = (positions - positions.mean(axis=0))[:, :2]
+    moments = horizontal.T @ horizontal
+    best, axes = np.linalg.eigh(moments)
+    if best[-1] <= 0:
+        raise InvalidArgumentError("positions_m: expected a horizontal extent, got none")
+    return np.asarray(moments), np.asarray(axes[:, -1])
 
 
 def _inverse(information: float) -> float:

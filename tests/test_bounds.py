@@ -12,6 +12,7 @@ from worldstate.frontend.array import roof_array_56
 from worldstate.frontend.bounds import (
     bearing_crb_rad2,
     bearing_information,
+    broadside_rad,
     delay_crb_s2,
     endfire_information,
     radial_speed_crb_m2_s2,
@@ -88,13 +89,23 @@ def test_endfire_corollary(azimuth):
         assert bearing_crb_rad2(positions, azimuth, 1000.0, 1.0, 1) == pytest.approx(broadside / share)
 
 
+@settings(max_examples=30, deadline=None)
+@given(positions=positions_strategy, azimuth=st.floats(-np.pi, np.pi))
+def test_nowhere_is_better_than_broadside(positions, azimuth):
+    best = broadside_rad(positions)
+    assert -np.pi / 2 < best <= np.pi / 2
+    assert endfire_information(positions, best) == pytest.approx(1.0)
+    assert endfire_information(positions, azimuth) <= 1.0 + 1e-12
+
+
 def test_endfire_has_no_bearing():
     y = np.linspace(-0.4, 0.4, 5)
     line = np.column_stack([0 * y, y, 0 * y])
     assert bearing_crb_rad2(line, np.pi / 2, 1000.0, 1.0, 1) > 1e20
     assert bearing_crb_rad2(line, 0.1, 1000.0, 0.0, 1) == np.inf
-    with pytest.raises(InvalidArgumentError):
-        endfire_information([[0, 0, 0], [0, 0, 1.0]], 0.0)
+    for ask in (broadside_rad, lambda pole: endfire_information(pole, 0.0)):
+        with pytest.raises(InvalidArgumentError, match="horizontal extent"):
+            ask([[0, 0, 0], [0, 0, 1.0]])
 
 
 @pytest.mark.parametrize(("azimuth_deg", "snr"), [(0.0, 0.3), (0.0, 3.0), (20.0, 1.0), (65.0, 3.0)])

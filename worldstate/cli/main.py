@@ -13,6 +13,7 @@ COMMANDS = (
     "demo",
     "run",
     "doctor",
+    "bounds",
     "simulate",
     "train",
     "calibrate",

@@ -1,0 +1,144 @@
+"""What the places of the microphones allow: moment, aperture, alias frequency and the bearing bound."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.bounds import bearing_crb_rad2, broadside_rad
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayBounds:
+    """Limits of one array at one frequency.
+
+    Parameters
+    ----------
+    microphones : int
+        M.
+    horizontal_moment_m2 : float
+        S_xx of eq. (crbtheta).
+    aperture_m : tuple of float
+        Extent along x, y and z, metres.
+    mean_spacing_m, alias_hz : float
+        Mean distance to the nearest neighbour, and the frequency c / (2 d) that goes with it.
+    ambiguity : str
+        What the array cannot tell apart: see `MicrophoneArray.ambiguity`.
+    broadside_deg : float
+        Azimuth at which it tells bearings best, degrees.
+    frequency_hz : float
+        What the bounds hold for.
+    sigma_deg : dict of float to (float or None)
+        By azimuth in degrees: smallest standard deviation of a bearing times sqrt(2 N SNR), degrees; None
+        where the array hears no azimuth at all.
+
+    Examples
+    --------
+    >>> two = array_bounds(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 500.0, [0.0, 90.0])
+    >>> round(two.alias_hz, 1), two.sigma_deg[0.0].__round__(1), two.sigma_deg[90.0]
+    (857.5, 44.2, None)
+    """
+
+    microphones: int
+    horizontal_moment_m2: float
+    aperture_m: tuple[float, float, float]
+    mean_spacing_m: float
+    alias_hz: float
+    ambiguity: str
+    broadside_deg: float
+    frequency_hz: float
+    sigma_deg: dict[float, float | None]
+
+    def at(self, azimuth_deg: float, snr_db: float, snapshots: int) -> float | None:
+        """Return the smallest standard deviation of a bearing, degrees; None where there is none.
+
+        Parameters
+        ----------
+        azimuth_deg : float
+            One of those asked for.
+        snr_db : float
+            Per microphone and snapshot, dB.
+        snapshots : int
+            N.
+
+        Returns
+        -------
+        float or None
+            A standard deviation.
+
+        Examples
+        --------
+        >>> two = array_bounds(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 500.0, [0.0])
+        >>> round(two.at(0.0, snr_db=10.0, snapshots=20), 2)
+        2.21
+        """
+        constant = self.sigma_deg[azimuth_deg]
+        snr = 10.0 ** (snr_db / 10.0)
+        return None if constant is None else constant / float(np.sqrt(2.0 * snapshots * snr))
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the same as JSON-able values, azimuths as text.
+
+        Returns
+        -------
+        dict
+            One entry a field.
+
+        Examples
+        --------
+        >>> array_bounds(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 500.0, [90.0]).to_dict()["sigma_deg"]
+        {'90': None}
+        """
+        constants = {f"{azimuth:g}": sigma for azimuth, sigma in self.sigma_deg.items()}
+        return asdict(self) | {"aperture_m": list(self.aperture_m), "sigma_deg": constants}
+
+
+def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequence[float]) -> ArrayBounds:
+    """Say what an array allows at a frequency.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Microphones.
+    frequency_hz : float
+        Of a far-field source.
+    azimuths_deg : sequence of float
+        Where it stands, left positive, degrees.
+
+    Returns
+    -------
+    ArrayBounds
+        For elevation zero.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the frequency is negative, a number is not finite, or the array has no horizontal extent.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import roof_array_56
+    >>> limits = array_bounds(roof_array_56(), 1000.0, [0.0])
+    >>> round(limits.horizontal_moment_m2, 2), round(limits.sigma_deg[0.0], 1), round(limits.alias_hz, -2)
+    (3.03, 1.8, 1900.0)
+    """
+    x, y, z = array.aperture_m.tolist()
+    return ArrayBounds(
+        microphones=array.n_microphones,
+        horizontal_moment_m2=array.horizontal_moment_m2,
+        aperture_m=(x, y, z),
+        mean_spacing_m=array.mean_spacing_m,
+        alias_hz=array.alias_hz(),
+        ambiguity=array.ambiguity,
+        broadside_deg=float(np.degrees(broadside_rad(array.positions_m))),
+        frequency_hz=frequency_hz,
+        sigma_deg={azimuth: _constant_deg(array, frequency_hz, azimuth) for azimuth in azimuths_deg},
+    )
+
+
+def _constant_deg(array: MicrophoneArray, frequency_hz: float, azimuth_deg: float) -> float | None:
+    """Bound at 2 N SNR = 1; a million degrees is a division by nothing."""
+    variance = bearing_crb_rad2(array.positions_m, np.radians(azimuth_deg), frequency_hz, 0.5, 1)
+    sigma = float(np.degrees(np.sqrt(variance)))
+    return sigma if sigma < 1e6 else None

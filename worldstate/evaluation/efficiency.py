@@ -1,0 +1,345 @@
+r"""How near the front-end's estimators come to their bounds: Monte-Carlo variance beside Cramer-Rao.
+
+The waves are of the kind that each bound assumes: a tone in white noise, Gaussian noise heard by two
+microphones, a plane wave of constant modulus and random phase at an array. Whatever is estimated is estimated
+by the functions that the front-end is made of.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.bounds import bearing_crb_rad2, broadside_rad, delay_crb_s2, tone_crb_hz2
+from worldstate.frontend.gcc import gcc_delays
+from worldstate.frontend.peaks import find_peaks
+from worldstate.frontend.srp import srp_phat
+from worldstate.frontend.steering import Steering
+from worldstate.frontend.threads import one_blas_thread
+from worldstate.frontend.tone import estimate_tone
+
+Numbers = NDArray[np.float64]
+Generator = np.random.Generator
+Complex = NDArray[np.complexfloating[Any, Any]]
+
+TONE_SAMPLES, TONE_RATE_HZ, TONE_BAND_HZ = 256, 1000.0, (40.0, 460.0)
+PAIR_FRAMES, PAIR_BIN_HZ, PAIR_LIMIT_S = 60, 50.0, 3e-3
+PAIR_FREQUENCIES_HZ = np.arange(300.0, 1800.0, PAIR_BIN_HZ)
+PAIR_DELAY_S = 1.37e-4
+# About the array's own broadside.
+GRID_RAD = np.radians(np.arange(-90.0, 91.0))
+# Truths are spread over one step of the grid, so that its interpolation is tried where it is worst, too.
+SPREAD_RAD = float(GRID_RAD[1] - GRID_RAD[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One estimation problem that can be tried at any SNR.
+
+    Parameters
+    ----------
+    name : str
+        For the legend.
+    bound : callable
+        Cramer-Rao bound at an SNR (power ratio), squared units of the error.
+    error : callable
+        One estimate less its truth, at an SNR, from a generator.
+    """
+
+    name: str
+    bound: Callable[[float], float]
+    error: Callable[[float, Generator], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Efficiency:
+    r"""Mean squared error beside the bound, one point an abscissa.
+
+    Parameters
+    ----------
+    name : str
+        Of the estimator.
+    at : ndarray, shape (n,)
+        SNR in dB, or azimuth in radians.
+    bound, mean_square : ndarray, shape (n,)
+        Cramer-Rao bound and mean squared error, the same squared units.
+    trials : int
+        Estimates behind each mean.
+
+    Examples
+    --------
+    >>> two = Efficiency("tone", np.array([0.0, 10.0]), np.ones(2), np.array([2.0, 1.0]), trials=200)
+    >>> two.ratio_db.round(2), two.sampling_db()
+    (array([3.01, 0.  ]), (-1.38..., 1.22...))
+    """
+
+    name: str
+    at: Numbers
+    bound: Numbers
+    mean_square: Numbers
+    trials: int
+
+    @property
+    def ratio_db(self) -> Numbers:
+        """Mean squared error over the bound, dB, shape (n,)."""
+        return np.asarray(10.0 * np.log10(self.mean_square / self.bound))
+
+    def sampling_db(self, level: float = 0.9973) -> tuple[float, float]:
+        """Return the interval in which the ratio of an efficient Gaussian estimator falls, dB.
+
+        Parameters
+        ----------
+        level : float
+            Its probability; three standard deviations by default.
+
+        Returns
+        -------
+        low, high : float
+            From the chi-square distribution with `trials` degrees of freedom.
+        """
+        low, high = scipy.stats.chi2.interval(level, self.trials) / np.float64(self.trials)
+        return float(10.0 * np.log10(low)), float(10.0 * np.log10(high))
+
+
+def measure_over_snr(
+    trial: Trial,
+    snr_db: Sequence[float],
+    trials: int,
+    rng: Generator,
+    on_point: Callable[[], None] = lambda: None,
+) -> Efficiency:
+    """Try an estimator at several SNRs.
+
+    Parameters
+    ----------
+    trial : Trial
+        From `tone_trial`, `delay_trial` or `bearing_trial`.
+    snr_db : sequence of float
+        SNRs, dB.
+    trials : int
+        Estimates at each, >= 2.
+    rng : numpy.random.Generator
+        Draws noise and truths.
+    on_point : callable
+        Called after each SNR, for progress.
+
+    Returns
+    -------
+    Efficiency
+        Over the SNR in dB.
+
+    Raises
+    ------
+    InvalidArgumentError
+        With fewer than two trials, or an SNR that is no finite number.
+
+    Examples
+    --------
+    >>> found = measure_over_snr(tone_trial(complex_signal=True), [20.0], 100, np.random.default_rng(0))
+    >>> bool(abs(found.ratio_db[0]) < 1.5)
+    True
+    """
+    count = int(in_range("trials", trials, 2, np.inf))
+    ratios = [10.0 ** (in_range("snr_db", level, -200.0, 200.0) / 10.0) for level in snr_db]
+    squares = []
+    with one_blas_thread():
+        for ratio in ratios:
+            squares.append(_mean_square(trial, ratio, count, rng))
+            on_point()
+    bounds = np.array([trial.bound(ratio) for ratio in ratios])
+    return Efficiency(trial.name, np.array(snr_db, dtype=np.float64), bounds, np.array(squares), count)
+
+
+def measure_toward_endfire(
+    array: MicrophoneArray,
+    azimuths_rad: Sequence[float],
+    snr_db: float,
+    trials: int,
+    rng: Generator,
+    *,
+    frequency_hz: float = 1000.0,
+    snapshots: int = 20,
+    on_point: Callable[[], None] = lambda: None,
+) -> Efficiency:
+    """Try the bearing at several azimuths: the lateral corollary, achieved.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Microphones.
+    azimuths_rad : sequence of float
+        Of the source, from the array's broadside.
+    snr_db : float
+        Per microphone and snapshot, dB.
+    trials : int
+        Estimates at each azimuth, >= 2.
+    rng : numpy.random.Generator
+        Draws noise and truths.
+    frequency_hz, snapshots
+        As for `bearing_trial`.
+    on_point : callable
+        Called after each azimuth, for progress.
+
+    Returns
+    -------
+    Efficiency
+        Over the azimuth in radians.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As `measure_over_snr` and `bearing_crb_rad2`.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import roof_array_56
+    >>> rng = np.random.default_rng(0)
+    >>> found = measure_toward_endfire(roof_array_56(), np.radians([0.0, 60.0]), 20.0, 100, rng)
+    >>> bool(3.0 < found.mean_square[1] / found.mean_square[0] < 5.5)
+    True
+    """
+    each = [
+        measure_over_snr(
+            bearing_trial(array, azimuth_rad=azimuth, frequency_hz=frequency_hz, snapshots=snapshots),
+            [snr_db], trials, rng, on_point,
+        )
+        for azimuth in azimuths_rad
+    ]  # fmt: skip
+    name = f"SRP-PHAT, {array.n_microphones} microphones"
+    bounds, squares = ([getattr(one, key)[0] for one in each] for key in ("bound", "mean_square"))
+    return Efficiency(name, np.array(azimuths_rad), np.array(bounds), np.array(squares), trials)
+
+
+def tone_trial(*, complex_signal: bool) -> Trial:
+    r"""Frequency of a single tone by `estimate_tone`, against the bound of Rife and Boorstyn, Hz.
+
+    Parameters
+    ----------
+    complex_signal : bool
+        Complex: :math:`\eta = A^2 / \sigma^2`, sigma^2 the variance of either part of the noise. Real:
+        :math:`\eta = A^2 / 2\sigma^2`.
+
+    Returns
+    -------
+    Trial
+        256 samples, frequency and phase uniform.
+
+    Examples
+    --------
+    >>> trial = tone_trial(complex_signal=False)
+    >>> trial.name, bool(abs(trial.error(1e6, np.random.default_rng(0))) < 1e-3)
+    ('tone, real, eta = A^2 / 2 s^2', True)
+    """
+    time_s = np.arange(TONE_SAMPLES) / TONE_RATE_HZ
+
+    def error(eta: float, rng: Generator) -> float:
+        frequency_hz, phase_rad = rng.uniform(*TONE_BAND_HZ), rng.uniform(-np.pi, np.pi)
+        wave = np.exp(1j * (2.0 * np.pi * frequency_hz * time_s + phase_rad))
+        if complex_signal:
+            samples = wave + np.sqrt(2.0 / eta) * _circular(rng, TONE_SAMPLES)
+        else:
+            samples = wave.real + np.sqrt(0.5 / eta) * rng.standard_normal(TONE_SAMPLES)
+        return estimate_tone(samples, TONE_RATE_HZ).frequency_hz - float(frequency_hz)
+
+    name = "tone, complex, eta = A^2 / s^2" if complex_signal else "tone, real, eta = A^2 / 2 s^2"
+    return Trial(name, lambda eta: tone_crb_hz2(eta, TONE_SAMPLES, TONE_RATE_HZ), error)
+
+
+def delay_trial() -> Trial:
+    """Delay between two microphones by GCC-PHAT, against eq. (crbtau), seconds.
+
+    Returns
+    -------
+    Trial
+        60 frames of 300-1800 Hz; the SNR at either microphone, coherence (SNR / (1 + SNR))^2.
+
+    Examples
+    --------
+    >>> bool(abs(delay_trial().error(1e6, np.random.default_rng(0))) < 1e-7)
+    True
+    """
+    shift = np.exp(-2j * np.pi * PAIR_FREQUENCIES_HZ * PAIR_DELAY_S)
+    arrivals = np.stack([shift, np.ones_like(shift)], axis=-1)
+    shape = (PAIR_FRAMES, len(PAIR_FREQUENCIES_HZ))
+    # The sum over bins as an integral: half a bin added at either end.
+    fine = np.linspace(-0.5, len(PAIR_FREQUENCIES_HZ) - 0.5, 2000) * PAIR_BIN_HZ + PAIR_FREQUENCIES_HZ[0]
+
+    def bound(snr: float) -> float:
+        coherence = np.full(fine.size, (snr / (1.0 + snr)) ** 2)
+        return delay_crb_s2(fine, coherence, PAIR_FRAMES / PAIR_BIN_HZ)
+
+    def error(snr: float, rng: Generator) -> float:
+        spectra = _circular(rng, *shape, 1) * arrivals + _circular(rng, *shape, 2) / np.sqrt(snr)
+        return float(gcc_delays(spectra, PAIR_FREQUENCIES_HZ, PAIR_LIMIT_S).delay_s[0]) - PAIR_DELAY_S
+
+    return Trial("delay, GCC-PHAT", bound, error)
+
+
+def bearing_trial(
+    array: MicrophoneArray,
+    *,
+    azimuth_rad: float = 0.0,
+    frequency_hz: float = 1000.0,
+    snapshots: int = 20,
+) -> Trial:
+    """Azimuth by SRP-PHAT on the front-end's grid of one degree, against eq. (crbtheta), radians.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Microphones.
+    azimuth_rad : float
+        Middle of the truths, which are uniform over one step of the grid; from `broadside_rad` of the array.
+    frequency_hz : float
+        Of the plane wave.
+    snapshots : int
+        N.
+
+    Returns
+    -------
+    Trial
+        The SNR per microphone and snapshot. Far below the threshold the error is bounded by the grid, and
+        may be less than the bound.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As `bearing_crb_rad2`.
+
+    Examples
+    --------
+    >>> trial = bearing_trial(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]))
+    >>> bool(abs(trial.error(1e6, np.random.default_rng(0))) < 1e-3)
+    True
+    """
+    broadside = broadside_rad(array.positions_m)
+    grid, middle = broadside + GRID_RAD, broadside + azimuth_rad
+    steering = Steering.towards(array, [frequency_hz], grid)
+
+    def bound(snr: float) -> float:
+        return bearing_crb_rad2(array.positions_m, middle, frequency_hz, snr, snapshots)
+
+    def error(snr: float, rng: Generator) -> float:
+        truth = middle + SPREAD_RAD * rng.uniform(-0.5, 0.5)
+        wave = np.exp(2j * np.pi * rng.uniform(size=(snapshots, 1, 1)))
+        heard = wave * array.steering(frequency_hz, truth)[:, :, 0]
+        noise = _circular(rng, snapshots, 1, array.n_microphones) / np.sqrt(snr)
+        spectrum = srp_phat((heard + noise).astype(np.complex64), steering)
+        return find_peaks(spectrum, grid, max_peaks=1)[0].azimuth_rad - truth
+
+    bound(1.0)  # refuses what cannot be tried, before hours of it
+    return Trial(f"broadside bearing, SRP-PHAT, {array.n_microphones} microphones", bound, error)
+
+
+def _mean_square(trial: Trial, snr: float, trials: int, rng: Generator) -> float:
+    return float(np.mean([trial.error(snr, rng) ** 2 for _ in range(trials)]))
+
+
+def _circular(rng: Generator, *shape: int) -> Complex:
+    """Circular complex noise of unit power."""
+    return np.asarray(np.sqrt(0.5) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)))
