@@ -14,8 +14,10 @@ from worldstate.adapters.simulation.delay import (
     emission_times,
 )
 from worldstate.adapters.simulation.diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
+from worldstate.adapters.simulation.emission import Emission, MovingSource
 from worldstate.adapters.simulation.late_field import sphere
-from worldstate.adapters.simulation.propagation import Emission, Receiver, add_source
+from worldstate.adapters.simulation.propagation import add_sources
+from worldstate.adapters.simulation.receiver import Receiver
 from worldstate.adapters.simulation.scene import Site
 from worldstate.adapters.simulation.static_field import add_static, plane_wave_delays
 from worldstate.adapters.simulation.vehicle import SOURCE_HEIGHT_M
@@ -33,7 +35,13 @@ def receiver(positions: np.ndarray, blocks: int) -> Receiver:
 def free_field(signal: np.ndarray, y_of_t, lane: float, positions: np.ndarray, start_s: float, blocks: int):
     emission = Emission.of(signal.astype(np.float32), start_s, FS)
     out = np.zeros((len(positions), blocks * KNOT_SAMPLES), np.float32)
-    add_source(out, emission, lane, y_of_t(emission.knots_s), FREE_FIELD, receiver(positions, blocks), 40.0)
+    add_sources(
+        out,
+        [MovingSource(emission, lane, y_of_t(emission.knots_s))],
+        FREE_FIELD,
+        receiver(positions, blocks),
+        40.0,
+    )
     return out
 
 
@@ -176,7 +184,13 @@ def test_a_screen_alone_has_the_insertion_loss_of_maekawa(octave_hz):
     tone = np.cos(2 * np.pi * octave_hz * time).astype(np.float32)
     emission = Emission.of(tone, -0.1, FS)
     out = np.zeros((1, blocks * KNOT_SAMPLES), np.float32)
-    add_source(out, emission, lane, np.full(len(emission.knots_s), y), site, receiver(position, blocks), 60.0)
+    add_sources(
+        out,
+        [MovingSource(emission, lane, np.full(len(emission.knots_s), y))],
+        site,
+        receiver(position, blocks),
+        60.0,
+    )
     bent = np.hypot(lane - 4.45, y - 2.8) + np.hypot(4.45, 2.8)
     straight = np.hypot(lane, y)
     level_db = 20 * np.log10(np.sqrt(2) * out[0, 9600:-9600].std() * bent)

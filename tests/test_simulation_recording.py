@@ -25,8 +25,10 @@ from worldstate.adapters.simulation import (
 )
 from worldstate.adapters.simulation.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.detector import line_of_sight
+from worldstate.adapters.simulation.emission import Emission, MovingSource
 from worldstate.adapters.simulation.paths import trace_paths
-from worldstate.adapters.simulation.propagation import Emission, Receiver, add_source
+from worldstate.adapters.simulation.propagation import add_sources
+from worldstate.adapters.simulation.receiver import Receiver
 from worldstate.adapters.simulation.vehicle import drive, propulsion_level_db, rolling_level_db
 from worldstate.cli.main import main
 from worldstate.errors import InputFileError, InvalidArgumentError
@@ -50,7 +52,7 @@ def pass_by(tone_hz: float, name: str, approach: str) -> np.ndarray:
     path = drive(emission.knots_s, entry_s=2.5, entry_y_m=entry, lane_x_m=lane, speed_mps=9.0)
     receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / FS)
     out = np.zeros((1, blocks * KNOT_SAMPLES), np.float32)
-    add_source(out, emission, lane, path.axle_y_m(), plan, receiver, 24.0)
+    add_sources(out, [MovingSource(emission, lane, path.axle_y_m())], plan, receiver, 24.0)
     return out[0].astype(float)
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 KNOT_SAMPLES = 128
 OVERSAMPLING = 4
+ROWS_AT_ONCE = 256
+RAMP = np.arange(KNOT_SAMPLES, dtype=np.float32) / np.float32(KNOT_SAMPLES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,27 +87,45 @@ def add_delayed(
         heard = np.flatnonzero((low >= 0.0) & (high < len(table.values) - 2))
     if not len(heard):
         return
-    first, last = heard[0], heard[-1] + 1  # one span: emission times increase
-    whole, fraction = _positions(low[first:last], high[first:last])
-    start = table.values[whole]
-    value = start + fraction * (table.values[whole + 1] - start)
-    value *= _ramps(gain[first:last], gain[first + 1 : last + 1])
-    out.reshape(-1, KNOT_SAMPLES)[first:last] += value
+    span = slice(int(heard[0]), int(heard[-1]) + 1)  # one span: emission times increase
+    base = np.floor(low[span])
+    lines = _Lines(low[span] - base, high[span] - base), _Lines(gain[:-1][span], gain[1:][span])
+    _add_between_knots(out.reshape(-1, KNOT_SAMPLES)[span], table, base.astype(np.intp)[:, None], *lines)
 
 
-def _positions(
-    low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Table index and fraction of every sample, shape (K, KNOT_SAMPLES)."""
-    base = np.floor(low)
-    offset = _ramps(low - base, high - base)
-    step = offset.astype(np.int32)
-    offset -= step
-    step += base.astype(np.int32)[:, None]
-    return step, offset
+class _Lines:
+    """Straight lines over knot intervals, each from `low` (K,) to `high` (K,)."""
+
+    def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        self._start = low.astype(np.float32)[:, None]
+        self._rise = (high - low).astype(np.float32)[:, None]
+
+    def into(self, out: NDArray[np.float32], rows: slice) -> None:
+        """Write the samples of some intervals, shape (rows, KNOT_SAMPLES)."""
+        np.multiply(self._rise[rows], RAMP, out=out)
+        out += self._start[rows]
 
 
-def _ramps(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Straight lines from `low` to `high` over one knot interval, shape (K, KNOT_SAMPLES)."""
-    ramp = np.arange(KNOT_SAMPLES, dtype=np.float32) / np.float32(KNOT_SAMPLES)
-    return low.astype(np.float32)[:, None] + (high - low).astype(np.float32)[:, None] * ramp
+def _add_between_knots(
+    rows: NDArray[np.float32], table: Table, base: NDArray[np.intp], places: _Lines, gains: _Lines
+) -> None:
+    """Interpolate the table; a few intervals at a time, so that everything stays in the cache."""
+    left, right, fraction = np.empty((3, ROWS_AT_ONCE, KNOT_SAMPLES), np.float32)
+    index, later = np.empty((ROWS_AT_ONCE, KNOT_SAMPLES), np.intp), table.values[1:]
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        some = slice(first, min(first + ROWS_AT_ONCE, len(rows)))
+        count = some.stop - first
+        low, high, part, at = left[:count], right[:count], fraction[:count], index[:count]
+        places.into(part, some)
+        np.floor(part, out=low)
+        np.copyto(at, low, casting="unsafe")
+        part -= low
+        at += base[some]
+        table.values.take(at, out=low, mode="clip")
+        later.take(at, out=high, mode="clip")
+        high -= low
+        high *= part
+        high += low
+        gains.into(low, some)
+        high *= low
+        rows[some] += high

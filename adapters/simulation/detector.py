@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from worldstate.adapters.camera import PinholeCamera
 
+from .kinds import LIGHT, VehicleKind
+from .occluders import hidden_by
 from .scene import Site
-from .vehicle import HEIGHT_M, LENGTH_M, WIDTH_M, Trajectory
+from .vehicle import LENGTH_M, WIDTH_M, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -36,18 +38,25 @@ class Detection:
 Frame = tuple[Detection, ...]
 
 
-def visible_part(trajectory: Trajectory, site: Site, camera: PinholeCamera) -> tuple[Array, Array]:
+def visible_part(
+    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | Array = 0.0
+) -> tuple[Array, Array]:
     """Lateral limits (right, left) of what the camera sees of the vehicle, (T,); empty if right > left."""
-    right_limit, left_limit = site.sight_m(trajectory.lane_x_m, camera.position_m[:2])
-    rear = trajectory.front_y_m - trajectory.heading * LENGTH_M
-    right, left = np.minimum(trajectory.front_y_m, rear), np.maximum(trajectory.front_y_m, rear)
+    ahead, _ = trajectory.behind(0.0)
+    right_limit, left_limit = site.sights_m(ahead, (ego_x_m + camera.position_m[0], camera.position_m[1]))
+    right, left = trajectory.footprint_y_m()
     return np.maximum(right, right_limit), np.minimum(left, left_limit)
 
 
-def line_of_sight(trajectory: Trajectory, site: Site, camera: PinholeCamera) -> NDArray[np.bool_]:
+def line_of_sight(
+    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | Array = 0.0
+) -> NDArray[np.bool_]:
     """Tell when the camera sees the middle of the vehicle's front, shape (T,)."""
-    right, left = site.sight_m(trajectory.lane_x_m, camera.position_m[:2])
-    return (trajectory.front_y_m > right) & (trajectory.front_y_m < left)
+    ahead, across = trajectory.behind(0.0)
+    eye = (ego_x_m + camera.position_m[0], camera.position_m[1])
+    right, left = site.sights_m(ahead, eye)
+    between = (across > right) & (across < left)
+    return np.asarray(between & ~hidden_by(site.occluders, ahead, across, eye))
 
 
 def detect(
@@ -55,17 +64,19 @@ def detect(
 ) -> list[Frame]:
     """Boxes of a passing vehicle, one tuple per frame of `trajectory`."""
     right, left = visible_part(trajectory, site, camera)
+    seen, kind = line_of_sight(trajectory, site, camera), trajectory.kind
     frames: list[Frame] = []
-    for low, high in zip(right, left, strict=True):
-        share = (high - low) / LENGTH_M
-        box = _project(camera, trajectory.lane_x_m, low, high) if share > LEAST_VISIBLE else None
-        missed = rng.random() < _miss_rate(trajectory.lane_x_m, 0.5 * (low + high))
+    for x, low, high, sight in zip(trajectory.behind(0.0)[0], right, left, seen, strict=True):
+        share = (high - low) / min(kind.length_m, LENGTH_M)
+        clear = share > LEAST_VISIBLE and (sight or not site.occluders)
+        box = _project(camera, x, low, high, kind) if clear else None
+        missed = rng.random() < _miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)
         if box is None or missed:
             frames.append(())
         else:
             score = float(np.clip(luck * (0.75 + 0.25 * min(share, 1.0)), 0.3, 0.999))
-            frames.append((Detection(_inside(box + jitter, camera), round(score, 4)),))
+            frames.append((Detection(_inside(box + jitter, camera), round(score, 4), kind.label),))
     return frames
 
 
@@ -107,10 +118,12 @@ def _miss_rate(ahead_m: float, lateral_m: float) -> float:
     return float(np.interp(azimuth_deg, MISS_AZIMUTH_DEG, MISS_RATE))
 
 
-def _project(camera: PinholeCamera, middle_x: float, right_y: float, left_y: float) -> Array | None:
+def _project(
+    camera: PinholeCamera, middle_x: float, right_y: float, left_y: float, kind: VehicleKind = LIGHT
+) -> Array | None:
     """Box (left, top, right, bottom) around the visible cuboid; None where it is outside the image."""
-    x = middle_x + WIDTH_M * np.array([-0.5, 0.5])
-    z = np.array([0.0, HEIGHT_M]) - ARRAY_HEIGHT_M
+    x = middle_x + kind.width_m * np.array([-0.5, 0.5])
+    z = np.array([0.0, kind.height_m]) - ARRAY_HEIGHT_M
     corners = np.array(np.meshgrid(x, [right_y, left_y], z)).reshape(3, -1).T - camera.position_m
     pitch = camera.pitch_rad
     depth = corners[:, 0] * math.cos(pitch) + corners[:, 2] * math.sin(pitch)

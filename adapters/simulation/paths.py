@@ -84,6 +84,10 @@ class Path:
         Length round that corner to the array's centre.
     gain : ndarray, shape (T, 8)
         Amplitude per octave band without spherical spreading.
+    before_m : ndarray, shape (T,)
+        Part of the way round that lies before the corner, seen from above.
+    edge_y_m : ndarray, shape (T,)
+        Where that corner is.
     """
 
     source: SourceImage
@@ -92,6 +96,8 @@ class Path:
     edge: NDArray[np.int8]
     bent_m: Array
     gain: Array
+    before_m: Array
+    edge_y_m: Array
 
 
 def source_images(site: Site, lane_x_m: float | Array) -> list[SourceImage]:
@@ -223,7 +229,7 @@ def through_mouth(
     end_y_m: float,
     height_m: float,
 ) -> Passage:
-    """Follow a line from a source beyond the mouth to an end before it.
+    """Follow a line from a source, beyond the mouth or in it, to an end before it.
 
     Examples
     --------
@@ -234,7 +240,8 @@ def through_mouth(
     """
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     run, depth = source_x_m - end_x_m, mouth - end_x_m
-    crossing = end_y_m + (source_y_m - end_y_m) * depth / run
+    # A source that has turned in stands before the mouth: what counts there is where it is itself.
+    crossing = end_y_m + (source_y_m - end_y_m) * depth / np.maximum(run, depth)
     clearance = np.minimum(left - crossing, crossing - right)
     # The shorter way round: both are equal where the corner changes, so nothing jumps there.
     ways = [
@@ -260,7 +267,9 @@ def _trace(
     passage = through_mouth(site, source.x_m, source_y, receiver_x, end_y, height)
     walls = source.gain * receiver.gain * near_facade(site, source, source_y, passage.aim_y_m)
     gain = walls[:, None] * specular ** (source.order + receiver.order) * passage.screen_gain(cap_db)
-    return Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain)
+    edge_y = np.where(passage.edge == LEFT, site.corner_left_m, -site.corner_right_m)
+    before = np.hypot(source.x_m - site.corner_ahead_m, source_y - edge_y)
+    return Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain, before, edge_y)
 
 
 def _length(dx: float | Array, dy: Array, dz: float) -> Array:

@@ -1,10 +1,13 @@
 """Levels and shapes of everything that is not geometry: named, versioned, frozen.
 
-`street-3` was set by hand on medians of level, peak, prominence and segment-to-segment change of the
-published features of SA1, SB1 and SB2, windows that end up to 0.3 s before T0, no classifier involved. Its
-predecessor `street-2` was not that clean: it was chosen among candidates after one look at a classifier's
-scores on simulated windows. What `street-3` kept of it (ambient octaves, far vehicles) is older than that
-look. `street-2` is no longer offered: the walls and the late field that it was set with are gone.
+`street-4-draft` has the physics of `street-4`: air and ground, two source heights, engine lines that follow
+the drive. Its levels are not settled yet.
+
+They come from `street-3`, which was set by hand on medians of level, peak, prominence and segment-to-segment
+change of the published features of SA1, SB1 and SB2, windows that end up to 0.3 s before T0, no classifier
+involved. Its predecessor `street-2` was not that clean: it was chosen among candidates after one look at a
+classifier's scores on simulated windows. What `street-3` kept of it (ambient octaves, far vehicles) is older
+than that look. Neither is offered any more: the physics that they were set with is gone.
 A change is a new name.
 """
 
@@ -101,7 +104,7 @@ class Preset:
     late_walled_db: float = -14.0
     late_open_db: float = -38.0
     late_decay_s: float = 0.7
-    vehicle_level_db: float = 6.0
+    vehicle_level_db: float = 3.0
     vehicle_spread_db: float = 1.5
     screen_cap_db: float = 24.0
     wall_scattering: float = 0.15
@@ -115,8 +118,8 @@ class Preset:
             in_range(name, getattr(self, name), low, high)
 
 
-PRESETS = {preset.name: preset for preset in (Preset("street-3"),)}
-DEFAULT_PRESET = "street-3"
+PRESETS = {preset.name: preset for preset in (Preset("street-4-draft"),)}
+DEFAULT_PRESET = "street-4-draft"
 
 
 def preset(name: str = DEFAULT_PRESET) -> Preset:
@@ -129,7 +132,7 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
 
     Examples
     --------
-    >>> preset("street-3").ambient_waves
+    >>> preset("street-4-draft").ambient_waves
     72
     """
     if name not in PRESETS:

@@ -1,5 +1,6 @@
 """One recording: sound at every microphone, detections of the camera, and the truth."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,17 +9,23 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera import PinholeCamera
+from worldstate.checks import in_range
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 
 from .background import add_background
 from .delay import KNOT_SAMPLES
 from .detector import ARRAY_HEIGHT_M, FRAME_RATE_HZ, Frame, detect, line_of_sight, park
+from .driving import trajectories
+from .ego import ego_noise
+from .emission import Emission, MovingSource
 from .late_field import add_late_field, street_field
-from .propagation import Emission, Receiver, add_scattered, add_source
+from .propagation import add_sources
+from .receiver import Receiver
 from .scatter import scattering
+from .scattered_sound import add_scattered
 from .settings import SimulationSettings
 from .truth import describe
-from .vehicle import Trajectory, drive, emit
+from .vehicle import SOURCE_HEIGHT_M, Trajectory, emit
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]
@@ -42,7 +49,8 @@ class SimulatedRecording:
     t0_frame : int
         First camera frame with line of sight, 10 frames a second from the start; 70 % of all if no vehicle.
     detections : tuple of tuple of Detection
-        One tuple per camera frame.
+        One tuple per camera frame; no frame at all for a moving ego, of which OVAD has no detections: vision
+        is unqueried there.
     truth : dict
         Settings, trajectory, line of sight and azimuth per frame; see `truth.describe`.
     """
@@ -87,17 +95,55 @@ def simulate_recording(
     to_sound, to_camera = rng.spawn(2)
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
         audio = _listen(settings, roof_array_56() if array is None else array, to_sound)
-    camera = PinholeCamera()
-    frames = _frame_times(settings)
-    trajectory = _trajectory(settings)
-    seen = None if trajectory is None else _at(trajectory, frames)
+    camera, frames = PinholeCamera(), _frame_times(settings)
+    seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
     return SimulatedRecording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
-        t0_frame=_t0_frame(settings, seen, camera),
-        detections=_detections(settings, seen, len(frames), camera, to_camera),
+        t0_frame=_t0_frame(settings, frames, seen, camera),
+        detections=_detections(settings, seen, frames, camera, to_camera),
         truth=describe(settings, frames, seen, camera),
     )
+
+
+def stream_recording(
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+    block_samples: int,
+    array: MicrophoneArray | None = None,
+) -> Iterator[Signal]:
+    """Simulate one recording and hand it out in blocks, as a sound card would, without a file.
+
+    The whole recording is rendered before the first block, for late sound needs what was emitted early.
+
+    Parameters
+    ----------
+    settings, rng, array
+        See `simulate_recording`.
+    block_samples : int
+        Samples per block; the last one may be shorter.
+
+    Yields
+    ------
+    ndarray of float32, shape (block_samples, M)
+        1.0 is `FULL_SCALE_PA`; put together they are `simulate_recording(...).audio`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If `block_samples` is below 1.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.simulation import SimulationSettings, site
+    >>> settings = SimulationSettings(site("SB1"), "none", duration_s=0.5, sample_rate_hz=8e3)
+    >>> [len(block) for block in stream_recording(settings, np.random.default_rng(1), 1500)]
+    [1500, 1500, 1000]
+    """
+    size = int(in_range("block_samples", block_samples, 1, 1 << 31))
+    audio = simulate_recording(settings, rng, array).audio
+    for start in range(0, len(audio), size):
+        yield audio[start : start + size]
 
 
 def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Signal:
@@ -105,11 +151,14 @@ def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     to_emission, to_street, to_channels = rng.spawn(3)
     receiver = _receiver(settings, array, to_channels)
     sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
-    trajectory = _trajectory(settings)
-    if trajectory is not None:
-        _add_vehicle_sound(sound, settings, trajectory, receiver, to_emission)
+    paths = trajectories(settings, _knots(settings))
+    for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
+        _add_vehicle_sound(sound, settings, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
     add_background(sound, settings.site, settings.preset, positions, rate, to_street)
+    if not settings.ego.stands:
+        time = np.arange(receiver.samples) / rate
+        sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_channels.spawn(1)[0]).T
     return _to_samples(sound, settings, to_channels)
 
 
@@ -117,7 +166,8 @@ def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.rand
     positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
     skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
     blocks = -(-_samples(settings) // KNOT_SAMPLES)
-    return Receiver(positions, skew, np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz)
+    knots = np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz
+    return Receiver(positions, skew, knots, settings.ego)
 
 
 def _samples(settings: SimulationSettings) -> int:
@@ -128,23 +178,11 @@ def _frame_times(settings: SimulationSettings) -> Array:
     return np.arange(max(round(settings.duration_s * FRAME_RATE_HZ), 1)) / FRAME_RATE_HZ
 
 
-def _trajectory(settings: SimulationSettings) -> Trajectory | None:
-    """Motion at the emission knots, or None without a vehicle."""
-    if settings.approach == "none":
-        return None
+def _knots(settings: SimulationSettings) -> Array:
+    """Emission knots, from a head start before the recording to its end."""
     knot_s = KNOT_SAMPLES / settings.sample_rate_hz
     before, after = -(-HEAD_START_S // knot_s), -(-settings.duration_s // knot_s)
-    near_lane, far_lane = settings.site.lanes_m
-    lane = near_lane if settings.approach == "left" else far_lane
-    right, left = settings.site.sight_m(lane, PinholeCamera().position_m[:2])
-    return drive(
-        np.arange(-before, after + 1) * knot_s,
-        entry_s=settings.entry_s,
-        entry_y_m=left if settings.approach == "left" else right,
-        lane_x_m=lane,
-        speed_mps=settings.speed_mps,
-        braking_mps2=settings.braking_mps2,
-    )
+    return np.arange(-before, after + 1) * knot_s
 
 
 def _add_vehicle_sound(
@@ -154,27 +192,30 @@ def _add_vehicle_sound(
     receiver: Receiver,
     rng: np.random.Generator,
 ) -> None:
-    preset = settings.preset
+    preset, rate = settings.preset, settings.sample_rate_hz
     level = preset.vehicle_level_db + preset.vehicle_spread_db * rng.standard_normal()
-    rate, samples = settings.sample_rate_hz, (len(path.time_s) - 1) * KNOT_SAMPLES
-    axles = emit(path, samples, rate, level, rng)
-    for axle, signal in enumerate(axles):
-        emission = Emission.of(signal, path.time_s[0], rate)
-        y, cap_db = path.axle_y_m(axle), preset.screen_cap_db
-        mirror = np.sqrt(1.0 - scattering(preset))
-        add_source(sound, emission, path.lane_x_m, y, settings.site, receiver, cap_db, mirror)
-    whole = Emission.of(axles.sum(axis=0), path.time_s[0], rate)
-    middle = 0.5 * (path.axle_y_m(0) + path.axle_y_m(1))
-    add_scattered(sound, whole, path.lane_x_m, middle, settings.site, receiver, preset)
-    dry = axles.sum(axis=0) * _late_gain(settings, path, samples)
+    parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng)
+    sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
+    mirrored = np.sqrt(1.0 - scattering(preset))
+    add_sources(sound, sources, settings.site, receiver, preset.screen_cap_db, mirrored, outdoors=True)
+    whole = np.sum([one.signal for one in parts], axis=0)
+    middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
+    body = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
+    add_scattered(sound, body, settings.site, receiver, preset)
+    dry = whole * _late_gain(settings, path, len(whole))
     heard = dry[: round(-path.time_s[0] * rate) + sound.shape[1]]
     field = street_field(settings.site, preset.late_lobe_share)
     add_late_field(sound, heard, preset.late_decay_s, receiver.positions_m, rate, rng, field)
 
 
+def _moving(path: Trajectory, signal: Signal, behind_m: float, height_m: float, rate: float) -> MovingSource:
+    return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
+
+
 def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> Signal:
-    """How strongly the source feeds the late field: less the farther it is from the mouth."""
-    away = np.hypot(path.lane_x_m - settings.site.corner_ahead_m, path.axle_y_m())
+    """How strongly the source feeds the late field: less the farther it, or the ego, is from the mouth."""
+    x, y = path.behind(0.0)
+    away = np.hypot(x - settings.site.corner_ahead_m, y) - settings.ego.x_m(path.time_s)
     walled = settings.site.opposite_wall_m is not None
     late_db = settings.preset.late_walled_db if walled else settings.preset.late_open_db
     gain = 10.0 ** (late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
@@ -189,32 +230,30 @@ def _to_samples(sound: Signal, settings: SimulationSettings, rng: np.random.Gene
     return np.ascontiguousarray(np.clip(samples, -1.0, 1.0))
 
 
-def _at(path: Trajectory, time_s: Array) -> Trajectory:
-    """Return the same motion at other times."""
-    front = np.interp(time_s, path.time_s, path.front_y_m)
-    speed = np.interp(time_s, path.time_s, path.speed_mps)
-    return Trajectory(time_s, front, speed, path.lane_x_m, path.heading)
-
-
-def _t0_frame(settings: SimulationSettings, seen: Trajectory | None, camera: PinholeCamera) -> int:
-    frames = len(_frame_times(settings))
-    if seen is None:
-        return min(round(NO_VEHICLE_T0 * frames), frames - 1)
-    visible = np.flatnonzero(line_of_sight(seen, settings.site, camera))
-    return int(visible[0]) if len(visible) else frames - 1
+def _t0_frame(
+    settings: SimulationSettings, frames_s: Array, seen: list[Trajectory], camera: PinholeCamera
+) -> int:
+    """First frame in which any vehicle is in line of sight; the last one where none ever is."""
+    if not seen:
+        return min(round(NO_VEHICLE_T0 * len(frames_s)), len(frames_s) - 1)
+    ego_x = settings.ego.x_m(frames_s)
+    sight = np.any([line_of_sight(path, settings.site, camera, ego_x) for path in seen], axis=0)
+    return int(sight.argmax()) if sight.any() else len(frames_s) - 1
 
 
 def _detections(
     settings: SimulationSettings,
-    seen: Trajectory | None,
-    frames: int,
+    seen: list[Trajectory],
+    frames_s: Array,
     camera: PinholeCamera,
     rng: np.random.Generator,
 ) -> tuple[Frame, ...]:
-    boxes: list[Frame] = [()] * frames
+    if not settings.ego.stands:
+        return ()
+    boxes: list[Frame] = [()] * len(frames_s)
     if settings.parked_car:
-        boxes = park(settings.site, camera, frames, rng)
-    if seen is not None:
-        passing = detect(seen, settings.site, camera, rng)
+        boxes = park(settings.site, camera, len(frames_s), rng)
+    for path in seen:
+        passing = detect(path, settings.site, camera, rng)
         boxes = [standing + moving for standing, moving in zip(boxes, passing, strict=True)]
     return tuple(boxes)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from .bands import OCTAVES_HZ
 from .paths import SourceImage, near_facade, source_images, through_mouth
 from .presets import Preset
+from .receiver import NEAREST_M
 from .scene import Site, site_generator
 
 Array = NDArray[np.float64]
@@ -31,7 +32,6 @@ BEHIND_M = 1.5  # side walls scatter from this far behind the array
 OPPOSITE_REACH = 0.9  # of the part of the opposite wall that is seen through the mouth
 SCATTER_HZ = 400.0  # relief of a few decimetres: below, a facade is smooth
 IMAGE_ORDERS = 2  # reflections in the crossing street before a patch is met
-NEAREST_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,3 +181,9 @@ def last_leg(group: Patches, positions_m: Array) -> tuple[Array, Array]:
     distance = np.maximum(np.linalg.norm(away, axis=2), NEAREST_M)
     cosine = np.abs(np.einsum("pmk,pk->pm", away[:, :, :2], group.normals)) / distance
     return distance, np.sqrt(cosine) / distance
+
+
+def seen_through_mouth(site: Site, place_m: Array, x_m: Array) -> Array:
+    """1 where an ego at `x_m` (T,) sees a place in the crossing street, 0 where a corner is in the way."""
+    passage = through_mouth(site, float(place_m[0]), np.full_like(x_m, place_m[1]), x_m, 0.0, 0.0)
+    return passage.lit

@@ -5,14 +5,21 @@ crossing street (along y) between two corners. Type A has a wall across the cros
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
+from .occluders import Occluder
+
+Array = NDArray[np.float64]
+
 SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, in this order
+MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
+MAX_OCCLUDERS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +44,9 @@ class Site:
         Pressure reflection factors of the side walls and of the crossing street's facades, 0..1.
     side_order, facade_order : int
         Highest number of reflections followed in the ego's street and in the crossing street.
+    occluders : tuple of Occluder
+        Bodies in the open that hide a vehicle, at most 4. Where there are any there are no corners and no
+        walls to be heard; the corners only limit what the camera sees.
 
     Raises
     ------
@@ -61,6 +71,7 @@ class Site:
     facade_reflection: float = 0.8
     side_order: int = 3
     facade_order: int = 4
+    occluders: tuple[Occluder, ...] = ()
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -74,6 +85,8 @@ class Site:
         in_range("facade_reflection", self.facade_reflection, 0.0, 0.98)
         in_range("side_order", self.side_order, 0, 8)
         in_range("facade_order", self.facade_order, 0, 8)
+        if len(self.occluders) > MAX_OCCLUDERS:
+            raise InvalidArgumentError(f"occluders: expected at most {MAX_OCCLUDERS}")
         if self.opposite_wall_m is not None:
             nearest = self.corner_ahead_m + self.street_width_m
             in_range("opposite_wall_m", self.opposite_wall_m, nearest, 200.0)
@@ -92,6 +105,11 @@ class Site:
         >>> Site("SA1", 2.8, 2.8, 4.45, 9.9, 2.8, 2.8, 5.45).sight_m(8.9)
         (-5.6, 5.6)
         """
+        right, left = self.sights_m(np.array([ahead_m]), eye_m)
+        return float(right[0]), float(left[0])
+
+    def sights_m(self, ahead_m: Array, eye_m: tuple[float | Array, float]) -> tuple[Array, Array]:
+        """Return those limits for distances, and an eye, that change: shape (T,) each."""
         x, y = eye_m
         reach = (ahead_m - x) / (self.corner_ahead_m - x)
         return y + (-self.corner_right_m - y) * reach, y + (self.corner_left_m - y) * reach
@@ -103,11 +121,12 @@ def _check_name(name: str) -> None:
 
 
 def site(name: str) -> Site:
-    """Return one of the five static sites: measured plans for SA1 and SB1, drawn variations for the others.
+    """Return a site: measured plans for SA1 and SB1, drawn variations for the others.
 
     The two measured plans are those published for a type A and a type B junction (corners 2.8 m to the sides
     and 4.45 m ahead, wall at 9.9 m; 2.78 m and 4.5 m, no wall). The rest of a site is drawn from a generator
-    seeded with its name, so that a site keeps its face from one recording to the next.
+    seeded with its name, so that a site keeps its face from one recording to the next. DA1 is the place of
+    SA1, and so on: there the ego moves.
 
     Raises
     ------
@@ -119,8 +138,10 @@ def site(name: str) -> Site:
     >>> site("SB1").opposite_wall_m is None, site("SA2") == site("SA2")
     (True, True)
     """
+    if name in MOVING_SITES:
+        return replace(site("S" + name[1:]), name=name)
     if name not in SITES:
-        raise InvalidArgumentError(f"site: expected one of {', '.join(SITES)}, got {name!r}")
+        raise InvalidArgumentError(f"site: expected one of {', '.join(SITES + MOVING_SITES)}, got {name!r}")
     rng = site_generator(name)
     with_wall = name.startswith("SA")
     width, ahead, street = (2.8, 4.45, 5.45) if with_wall else (2.78, 4.5, 6.0)
@@ -151,5 +172,6 @@ def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:
     >>> site_generator("SA1").random() == site_generator("SA1").random()
     True
     """
-    digest = hashlib.sha256(f"worldstate {name} {purpose}".encode()).digest()
+    place = "S" + name[1:] if name in MOVING_SITES else name
+    digest = hashlib.sha256(f"worldstate {place} {purpose}".encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:8], "little"))

@@ -1,19 +1,82 @@
-"""What is simulated: a site, an approach, and how the vehicle drives."""
+"""What is simulated: a site, an approach, and how the vehicles drive."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from worldstate.checks import in_range
+from worldstate.checks import finite_array, in_range
 from worldstate.errors import InvalidArgumentError
 
+from .ego_motion import EgoMotion
+from .kinds import vehicle_kind
 from .presets import Preset, preset
-from .scene import Site, site
+from .scene import MOVING_SITES, Site, site
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
+MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
+MAX_OTHERS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 64, 0.1
 # Narrow streets and a blind junction ahead: most drivers slow down before it.
 SPEEDS_MPS, BRAKING_SHARE, BRAKING_MPS2 = (5.0, 12.0), 0.75, (0.5, 3.0)
+EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSettings:
+    """One vehicle.
+
+    Parameters
+    ----------
+    approach : str
+        "left" or "right".
+    entry_s : float
+        When its front comes into the camera's line of sight, -60 to 120 s.
+    speed_mps : float
+        Speed before braking, 1 to 30.
+    braking_mps2 : float
+        Deceleration in the two seconds before line of sight, 0 to 8.
+    kind : str
+        One of `KINDS`.
+    manoeuvre : str
+        "pass" or "turn": turn into the ego's street, and stop there.
+    route_m : tuple of (float, float)
+        Where it goes instead of along the crossing street: points x, y, at least 2; empty for none.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or a word unknown.
+    """
+
+    approach: str
+    entry_s: float = 7.0
+    speed_mps: float = 30.0 / 3.6
+    braking_mps2: float = 0.0
+    kind: str = "light"
+    manoeuvre: str = "pass"
+    route_m: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        _one_of("approach", self.approach, ("left", "right"))
+        _one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
+        vehicle_kind(self.kind)
+        in_range("entry_s", self.entry_s, -60.0, 120.0)
+        in_range("speed_mps", self.speed_mps, 1.0, 30.0)
+        in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
+        if self.route_m:
+            _check_route(self.route_m)
+
+
+def _check_route(route_m: tuple[tuple[float, float], ...]) -> None:
+    points = finite_array("route_m", route_m, (None, 2))
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    if not 2 <= len(points) <= MAX_ROUTE_POINTS or steps.min() < SHORTEST_STEP_M:
+        raise InvalidArgumentError(f"route_m: expected 2 to {MAX_ROUTE_POINTS} points apart from each other")
+
+
+def _one_of(name: str, value: str, expected: tuple[str, ...]) -> None:
+    if value not in expected:
+        raise InvalidArgumentError(f"{name}: expected {', '.join(expected)}, got {value!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +103,12 @@ class SimulationSettings:
         8 to 96 kHz.
     preset : Preset
         Levels of everything else.
+    kind, manoeuvre, route_m
+        Of the vehicle: see `VehicleSettings`.
+    others : tuple of VehicleSettings
+        More vehicles, at most 8; none where `approach` is "none".
+    ego : EgoMotion
+        How the ego moves; it stands if not given.
 
     Raises
     ------
@@ -61,15 +130,38 @@ class SimulationSettings:
     parked_car: bool = False
     sample_rate_hz: float = SAMPLE_RATE_HZ
     preset: Preset = field(default_factory=preset)
+    kind: str = "light"
+    manoeuvre: str = "pass"
+    route_m: tuple[tuple[float, float], ...] = ()
+    others: tuple[VehicleSettings, ...] = ()
+    ego: EgoMotion = field(default_factory=EgoMotion)
 
     def __post_init__(self) -> None:
-        if self.approach not in APPROACHES:
-            raise InvalidArgumentError(f"approach: expected left, none or right, got {self.approach!r}")
+        _one_of("approach", self.approach, APPROACHES)
         in_range("duration_s", self.duration_s, 0.5, 60.0)
         in_range("entry_s", self.entry_s, 0.0, self.duration_s if self.approach != "none" else 60.0)
         in_range("speed_mps", self.speed_mps, 1.0, 30.0)
         in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
         in_range("sample_rate_hz", self.sample_rate_hz, 8_000.0, 96_000.0)
+        most = 0 if self.approach == "none" else MAX_OTHERS
+        in_range("others: number of vehicles", len(self.others), 0, most)
+        self.traffic  # noqa: B018  (building the first vehicle checks what is left)
+
+    @property
+    def traffic(self) -> tuple[VehicleSettings, ...]:
+        """All vehicles, the one that `approach` names first."""
+        if self.approach == "none":
+            return ()
+        first = VehicleSettings(
+            self.approach,
+            self.entry_s,
+            self.speed_mps,
+            self.braking_mps2,
+            self.kind,
+            self.manoeuvre,
+            self.route_m,
+        )
+        return (first, *self.others)
 
 
 def draw_settings(
@@ -80,7 +172,7 @@ def draw_settings(
     Parameters
     ----------
     site_name : str
-        One of `SITES`.
+        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h.
     approach : str
         "left", "right" or "none".
     rng : numpy.random.Generator
@@ -103,4 +195,11 @@ def draw_settings(
         speed_mps=rng.uniform(*SPEEDS_MPS),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
         parked_car=bool(rng.random() < 0.3),
+        ego=_draw_ego(rng, duration_s) if site_name in MOVING_SITES else EgoMotion(),
     )
+
+
+def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:
+    """Stop shortly after the vehicle comes into sight."""
+    stop_s = 0.7 * duration_s + rng.uniform(*EGO_STOPS_AFTER_S)
+    return EgoMotion(rng.uniform(*EGO_SPEEDS_MPS), stop_s)

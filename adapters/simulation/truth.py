@@ -13,45 +13,64 @@ from .settings import SimulationSettings
 from .vehicle import Trajectory
 
 SCHEMA = "worldstate.simulation.truth"
-SCHEMA_VERSION = "1.0.0"
+SCHEMA_VERSION = "1.1.0"
 
 
 def describe(
     settings: SimulationSettings,
     frames_s: NDArray[np.float64],
-    seen: Trajectory | None,
+    seen: list[Trajectory],
     camera: PinholeCamera,
 ) -> dict[str, Any]:
-    """Return settings and, per camera frame, where the vehicle is, ready for JSON.
+    """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON.
 
     Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`, `azimuth_rad`
     (of the front axle, left positive), `range_m`, `line_of_sight`, `time_to_visible_s` (negative afterwards).
-    Without a vehicle there are no frames and `entry_s` is null.
+    `frames` are those of the vehicle that `approach` names, `others` those of the rest. Without a vehicle
+    there are no frames and `entry_s` is null. `ego` has the ego's way along its street, 0 where it stops.
     """
+    ego_x = settings.ego.x_m(frames_s)
+    entries = [vehicle.entry_s for vehicle in settings.traffic]
+    frames = [
+        _frames(settings, frames_s, ego_x, path, entry, camera)
+        for path, entry in zip(seen, entries, strict=True)
+    ]
     return {
         "schema": SCHEMA,
         "version": SCHEMA_VERSION,
         "settings": asdict(settings),
         "frame_rate_hz": FRAME_RATE_HZ,
-        "entry_s": None if seen is None else settings.entry_s,
-        "frames": [] if seen is None else _frames(settings, frames_s, seen, camera),
+        "entry_s": settings.entry_s if frames else None,
+        "frames": frames[0] if frames else [],
+        "others": frames[1:],
+        "ego": {
+            "x_m": ego_x.round(6).tolist(),
+            "speed_mps": settings.ego.at_mps(frames_s).round(6).tolist(),
+        },
     }
 
 
 def _frames(
-    settings: SimulationSettings, frames_s: NDArray[np.float64], seen: Trajectory, camera: PinholeCamera
+    settings: SimulationSettings,
+    frames_s: NDArray[np.float64],
+    ego_x_m: NDArray[np.float64],
+    seen: Trajectory,
+    entry_s: float,
+    camera: PinholeCamera,
 ) -> list[dict[str, Any]]:
+    axle_x, axle_y = seen.behind(seen.kind.axles_m[0])
     columns = {
         "time_s": frames_s,
         "speed_mps": seen.speed_mps,
-        "azimuth_rad": np.arctan2(seen.axle_y_m(), seen.lane_x_m),
-        "range_m": np.hypot(seen.axle_y_m(), seen.lane_x_m),
-        "time_to_visible_s": settings.entry_s - frames_s,
+        "azimuth_rad": np.arctan2(axle_y, axle_x - ego_x_m),
+        "range_m": np.hypot(axle_y, axle_x - ego_x_m),
+        "time_to_visible_s": entry_s - frames_s,
     }
-    sight = line_of_sight(seen, settings.site, camera)
+    ahead = seen.behind(0.0)[0] - ego_x_m
+    sight = line_of_sight(seen, settings.site, camera, ego_x_m)
     return [
         {name: round(float(values[i]), 6) for name, values in columns.items()}
-        | {"position_m": [round(seen.lane_x_m, 6), round(float(seen.front_y_m[i]), 6)]}
+        | {"position_m": [round(float(ahead[i]), 6), round(float(seen.front_y_m[i]), 6)]}
         | {"line_of_sight": bool(sight[i])}
         for i in range(len(frames_s))
     ]

@@ -1,46 +1,56 @@
-"""A vehicle on the crossing street: where it is, and how loud it is by itself."""
+"""A vehicle on its way: where it is, and how loud it is by itself."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
+from .kinds import LIGHT, TYRE_M, VehicleKind
+from .route import Route
 
-LENGTH_M, WIDTH_M, HEIGHT_M = 4.3, 1.8, 1.5
-AXLES_BEHIND_FRONT_M = (0.9, 3.5)  # each axle is a source of its own; the engine is at the first
+LENGTH_M, WIDTH_M, HEIGHT_M = LIGHT.length_m, LIGHT.width_m, LIGHT.height_m
+AXLES_BEHIND_FRONT_M = LIGHT.axles_m  # each axle is a source of its own; the engine is at the first
 SOURCE_HEIGHT_M = 0.3
 
-# CNOSSOS-EU, Directive (EU) 2015/996 as amended by (EU) 2021/1226, table F-1, category 1 (light vehicles):
-# sound power level in dB per octave 63 Hz .. 8 kHz at 70 km/h, and its slope with speed.
-ROLLING_A_DB = np.array([83.1, 89.2, 87.7, 93.1, 100.1, 96.7, 86.8, 76.2])
-ROLLING_B_DB = np.array([30.0, 41.5, 38.9, 25.7, 32.5, 37.2, 39.0, 40.0])
-PROPULSION_A_DB = np.array([97.9, 92.5, 90.7, 87.2, 84.7, 88.0, 84.4, 77.1])
-PROPULSION_B_DB = np.array([-1.3, 7.2, 7.7, 8.0, 8.0, 8.0, 8.0, 8.0])
 REFERENCE_KMH = 70.0
 # Sound power to pressure at 1 m over hard ground: -11 dB of a free sphere, +3 dB of the ground's half-space.
 POWER_TO_1M_DB = -8.0
 SLOWEST_KMH = 10.0  # the law is fitted above 20; a log of zero speed would be silence
 HARMONIC_SHARE = 0.5  # of the propulsion power; the rest is broadband
 HARMONICS = 24
+# Firing frequency of four cylinders over speed in gears 1 to 4, Hz per m/s; up at 2400 rpm, idle at 850 rpm.
+GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0)
+SHIFT_UP_HZ, IDLE_HZ = 80.0, 28.0
+SHIFT_S = 0.4
+WANDER, WANDER_STEP_S = 0.05, 0.5
+TURN_MPS, TURN_BRAKING_MPS2 = 3.5, 2.0
+TURN_BEGINS_M = 12.0  # braking for the turn begins at most so long before line of sight
+SILENCE_DB = 0.0  # an engine whose every octave is below emits nothing that matters
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Motion of the front bumper along the crossing street (y), at a fixed lane (x).
+    """Motion along a route; for a vehicle that passes, along the crossing street (y) at a fixed lane (x).
 
     Parameters
     ----------
     time_s : ndarray, shape (T,)
         Increasing, evenly spaced.
     front_y_m : ndarray, shape (T,)
-        Position of the front bumper.
+        Lateral position of the front bumper.
     speed_mps : ndarray, shape (T,)
         Speed, >= 0.
     lane_x_m : float
-        Middle of the lane, m ahead of the ego.
+        Middle of the lane on which it comes, m ahead of the origin.
     heading : int
         +1 towards +y (comes from the right), -1 towards -y (comes from the left).
+    kind : VehicleKind
+        What drives there.
+    route : Route, optional
+        Where it goes if not straight along its lane.
+    driven_m : ndarray, shape (T,), optional
+        Distance of the front along the route.
     """
 
     time_s: NDArray[np.float64]
@@ -48,10 +58,36 @@ class Trajectory:
     speed_mps: NDArray[np.float64]
     lane_x_m: float
     heading: int
+    kind: VehicleKind = LIGHT
+    route: Route | None = None
+    driven_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def axle_y_m(self, axle: int = 0) -> NDArray[np.float64]:
-        """Lateral position of the front (0) or rear axle (1), shape (T,)."""
-        return self.front_y_m - self.heading * AXLES_BEHIND_FRONT_M[axle]
+        """Lateral position of an axle, 0 the foremost, shape (T,)."""
+        return self.behind(self.kind.axles_m[axle])[1]
+
+    def behind(self, distance_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position x, y of what is so far behind the front, shape (T,) each."""
+        if self.route is None:
+            y = self.front_y_m - self.heading * distance_m
+            return np.full_like(y, self.lane_x_m), y
+        return self.route.at(self.driven_m - distance_m)
+
+    def footprint_y_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lateral limits (right, left) of the whole vehicle, shape (T,) each."""
+        ends = np.stack([self.front_y_m, self.behind(self.kind.length_m)[1]])
+        if self.route is None:
+            return ends.min(axis=0), ends.max(axis=0)
+        wide = np.maximum(ends.max(axis=0) - ends.min(axis=0), self.kind.width_m)
+        middle = ends.mean(axis=0)
+        return middle - 0.5 * wide, middle + 0.5 * wide
+
+    def at(self, time_s: NDArray[np.float64]) -> "Trajectory":
+        """Return the same motion at other times."""
+        front = np.interp(time_s, self.time_s, self.front_y_m)
+        speed = np.interp(time_s, self.time_s, self.speed_mps)
+        driven = self.driven_m if self.route is None else np.interp(time_s, self.time_s, self.driven_m)
+        return Trajectory(time_s, front, speed, self.lane_x_m, self.heading, self.kind, self.route, driven)
 
 
 def drive(
@@ -62,6 +98,7 @@ def drive(
     lane_x_m: float,
     speed_mps: float,
     braking_mps2: float = 0.0,
+    kind: VehicleKind = LIGHT,
 ) -> Trajectory:
     """Pass `entry_y_m` at `entry_s`, braking at a constant rate during the two seconds before.
 
@@ -77,6 +114,8 @@ def drive(
         Speed before braking.
     braking_mps2 : float
         Deceleration >= 0; the vehicle never falls below a quarter of its speed.
+    kind : VehicleKind
+        What drives there.
 
     Examples
     --------
@@ -90,10 +129,54 @@ def drive(
     mean = np.r_[0.0, 0.5 * (speed[1:] + speed[:-1])]
     driven = np.cumsum(mean) * (time_s[1] - time_s[0])
     front = entry_y_m + heading * (driven - np.interp(entry_s, time_s, driven))
-    return Trajectory(time_s, front, speed, lane_x_m, heading)
+    return Trajectory(time_s, front, speed, lane_x_m, heading, kind)
 
 
-def rolling_level_db(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = np.inf) -> Trajectory:
+    """Drive along another route as `passing` drives along its lane, slowly where the route has an end.
+
+    Parameters
+    ----------
+    passing : Trajectory
+        Gives the distance driven over time.
+    entry_y_m : float
+        Where `passing` is when it has driven 0 m.
+    route : Route
+        Where to drive.
+    end_m : float
+        Distance at which the vehicle stops; where it has an end, it takes it no faster than a turn allows.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.simulation.route import along
+    >>> time = np.linspace(0, 20, 2001)
+    >>> passing = drive(time, entry_s=5, entry_y_m=4, lane_x_m=6, speed_mps=8)
+    >>> path = follow(passing, 4.0, along([[6, 8], [6, 2]], 4.0), 2.0)
+    >>> round(float(path.driven_m[-1]), 1), round(float(path.speed_mps[-1]), 1)
+    (2.0, 0.0)
+    """
+    step = passing.time_s[1] - passing.time_s[0]
+    driven = (passing.front_y_m - entry_y_m) * passing.heading
+    speed = passing.speed_mps.copy()
+    if np.isfinite(end_m):
+        for i in np.flatnonzero(driven > -TURN_BEGINS_M).tolist():
+            if i:
+                speed[i] = min(speed[i], _turn_speed(driven[i - 1], end_m))
+                driven[i] = min(driven[i - 1] + speed[i] * step, end_m)
+    y = route.at(driven)[1]
+    return Trajectory(
+        passing.time_s, y, speed, passing.lane_x_m, passing.heading, passing.kind, route, driven
+    )
+
+
+def _turn_speed(driven_m: float, end_m: float) -> float:
+    """Highest speed from which the vehicle can still slow down to the turn, and to its end."""
+    to_turn, to_end = max(-driven_m, 0.0), max(end_m - driven_m, 0.0)
+    turning = np.sqrt(TURN_MPS**2 + 2.0 * TURN_BRAKING_MPS2 * to_turn)
+    return float(min(turning, np.sqrt(2.0 * TURN_BRAKING_MPS2 * to_end)))
+
+
+def rolling_level_db(speed_mps: NDArray[np.float64], kind: VehicleKind = LIGHT) -> NDArray[np.float64]:
     """Sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T).
 
     Examples
@@ -102,10 +185,10 @@ def rolling_level_db(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
     array([100.1])
     """
     speed_kmh = np.maximum(3.6 * speed_mps, SLOWEST_KMH)
-    return np.asarray(ROLLING_A_DB[:, None] + ROLLING_B_DB[:, None] * np.log10(speed_kmh / REFERENCE_KMH))
+    return _octaves(kind.rolling_a_db) + _octaves(kind.rolling_b_db) * np.log10(speed_kmh / REFERENCE_KMH)
 
 
-def propulsion_level_db(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+def propulsion_level_db(speed_mps: NDArray[np.float64], kind: VehicleKind = LIGHT) -> NDArray[np.float64]:
     """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T).
 
     Examples
@@ -114,7 +197,30 @@ def propulsion_level_db(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
     array([97.9])
     """
     relative = 3.6 * speed_mps / REFERENCE_KMH - 1.0
-    return PROPULSION_A_DB[:, None] + PROPULSION_B_DB[:, None] * relative
+    return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative
+
+
+def _octaves(levels_db: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(levels_db, dtype=np.float64)[:, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """One of the places of a vehicle that sound.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (n,)
+        Pressure at 1 m, Pa.
+    behind_m : float
+        How far behind the front.
+    height_m : float
+        Above the road.
+    """
+
+    signal: NDArray[np.float32]
+    behind_m: float
+    height_m: float
 
 
 def emit(
@@ -123,11 +229,11 @@ def emit(
     sample_rate_hz: float,
     level_offset_db: float,
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
-    """Draw the pressure that each axle emits, at 1 m, in Pa.
+) -> list[Source]:
+    """Draw what every axle's tyres and the engine emit.
 
-    The tyres of the two axles share the rolling noise and know nothing of each other, which makes a vehicle
-    in view a wide source; engine noise, broadband and harmonics, comes from the front axle.
+    The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
+    view a wide source; engine noise, broadband and harmonics, comes from the first axle and from higher up.
 
     Parameters
     ----------
@@ -138,27 +244,28 @@ def emit(
     sample_rate_hz : float
         Rate in Hz.
     level_offset_db : float
-        This vehicle against the fleet's mean.
+        This vehicle against its kind's mean.
     rng : numpy.random.Generator
         Source of randomness.
 
     Returns
     -------
-    ndarray, shape (2, n)
-        Front and rear axle.
+    list of Source
+        Tyres per axle, and the engine where the kind has one.
     """
+    kind = trajectory.kind
     time = trajectory.time_s[0] + np.arange(samples) / sample_rate_hz
-    rolling = _pressure(rolling_level_db(trajectory.speed_mps) + level_offset_db)
-    engine = _pressure(propulsion_level_db(trajectory.speed_mps) + level_offset_db)
-    front = np.sqrt(0.5 * rolling**2 + (1.0 - HARMONIC_SHARE) * engine**2)
-    axles = np.stack(
-        [
-            _noise(trajectory, time, pressure, sample_rate_hz, rng)
-            for pressure in (front, np.sqrt(0.5) * rolling)
-        ]
-    )
-    axles[0] += _harmonics(trajectory, time, np.sqrt(HARMONIC_SHARE) * engine, rng)
-    return axles
+    rolling = _pressure(rolling_level_db(trajectory.speed_mps, kind) + level_offset_db)
+    tyres = rolling / np.sqrt(len(kind.axles_m))
+    sources = [
+        Source(_noise(trajectory, time, tyres, sample_rate_hz, rng), behind, TYRE_M)
+        for behind in kind.axles_m
+    ]
+    if max(kind.propulsion_a_db) > SILENCE_DB:
+        engine = _pressure(propulsion_level_db(trajectory.speed_mps, kind) + level_offset_db)
+        signal = _engine(trajectory, time, engine, sample_rate_hz, rng)
+        sources.append(Source(signal, kind.axles_m[0], kind.engine_m))
+    return sources
 
 
 def _noise(
@@ -188,33 +295,61 @@ def _band_shares(sample_rate_hz: float) -> NDArray[np.float64]:
     return np.asarray(np.maximum((masks**2).mean(axis=1), 1e-6))
 
 
-def _harmonics(
+def _engine(
     trajectory: Trajectory,
     time: NDArray[np.float64],
     octave_pressure: NDArray[np.float64],
+    sample_rate_hz: float,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """Multiples of a wandering firing frequency, sharing each octave's pressure."""
-    firing = _firing_frequency(trajectory, time, rng)
-    cycles = np.cumsum(firing) / (len(time) / (time[-1] - time[0]))
+    """Noise and lines; an octave that no line falls into is noise alone."""
+    share = trajectory.kind.harmonic_share
+    firing = firing_frequency_hz(trajectory, time, rng)
     orders = np.arange(1, HARMONICS + 1)
     octave = np.clip(np.round(np.log2(orders * firing.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
     crowd = np.bincount(octave, minlength=8)
-    signal = np.zeros(len(time), np.float32)
-    for order, band in zip(orders, octave, strict=True):
-        amplitude = octave_pressure[band].mean() * np.sqrt(2.0 / crowd[band])
-        phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
-        signal += np.float32(amplitude) * np.cos(phase.astype(np.float32))
+    lines = np.where(crowd > 0, share, 0.0)[:, None]
+    signal = _noise(trajectory, time, np.sqrt(1.0 - lines) * octave_pressure, sample_rate_hz, rng)
+    if share > 0.0:
+        shared = octave_pressure * np.sqrt(2.0 * lines / np.maximum(crowd, 1)[:, None])
+        signal += _harmonics(trajectory, time, shared, firing, octave, rng)
     return signal
 
 
-def _firing_frequency(
+def _harmonics(
+    trajectory: Trajectory,
+    time: NDArray[np.float64],
+    octave_amplitude: NDArray[np.float64],
+    firing_hz: NDArray[np.float64],
+    octave: NDArray[np.int_],
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Multiples 1, 2, ... of the firing frequency, each with the amplitude of the octave it falls into."""
+    cycles = np.cumsum(firing_hz) / (len(time) / (time[-1] - time[0]))
+    levels = [np.interp(time, trajectory.time_s, row).astype(np.float32) for row in octave_amplitude]
+    signal = np.zeros(len(time), np.float32)
+    for order, band in enumerate(octave.tolist(), start=1):
+        phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
+        signal += levels[band] * np.cos(phase.astype(np.float32))
+    return signal
+
+
+def firing_frequency_hz(
     trajectory: Trajectory, time: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw the firing frequency of four cylinders in Hz: follows the speed in one gear, wanders by 5 %."""
-    mean_speed = trajectory.speed_mps.mean()
-    idle_to_cruise = rng.uniform(45.0, 75.0)
-    geared = idle_to_cruise * np.interp(time, trajectory.time_s, trajectory.speed_mps) / mean_speed
-    knots = np.arange(time[0], time[-1] + 0.5, 0.5)
-    wander = 1.0 + 0.05 * np.clip(rng.standard_normal(len(knots)) / 2.0, -1.0, 1.0)
-    return np.asarray(np.clip(geared, 25.0, 200.0) * np.interp(time, knots, wander))
+    """Draw the firing frequency in Hz: follows the speed through the gears, never idles, wanders by 5 %."""
+    shift_up = SHIFT_UP_HZ * rng.uniform(0.8, 1.2)
+    speed = np.interp(time, trajectory.time_s, trajectory.speed_mps)
+    choices = np.array(GEARS_HZ_PER_MPS)[:, None] * trajectory.speed_mps
+    gear = np.minimum((choices > shift_up).sum(axis=0), len(GEARS_HZ_PER_MPS) - 1)
+    ratio = np.interp(time, trajectory.time_s, _smooth(np.array(GEARS_HZ_PER_MPS)[gear], trajectory.time_s))
+    knots = np.arange(time[0], time[-1] + WANDER_STEP_S, WANDER_STEP_S)
+    wander = 1.0 + WANDER * np.clip(rng.standard_normal(len(knots)) / 2.0, -1.0, 1.0)
+    return np.asarray(np.maximum(ratio * speed, IDLE_HZ) * np.interp(time, knots, wander))
+
+
+def _smooth(values: NDArray[np.float64], time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the running mean over the time that a change of gear takes."""
+    length = max(int(SHIFT_S / (time_s[1] - time_s[0])), 1)
+    padded = np.pad(values, (length, length), mode="edge")
+    return np.convolve(padded, np.full(length, 1.0 / length), mode="same")[length:-length]

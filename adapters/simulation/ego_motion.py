@@ -1,0 +1,58 @@
+"""Where the ego is: it stands, or it drives up to the corner and stops there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+
+Array = NDArray[np.float64]
+
+BRAKING_MPS2 = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class EgoMotion:
+    """An ego that drives along its street at a constant speed, brakes and stops at the origin.
+
+    Parameters
+    ----------
+    speed_mps : float
+        Before braking; 0 for an ego that stands all the time.
+    stop_s : float
+        When it comes to stand.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> ego = EgoMotion(5.0, 8.0)
+    >>> ego.x_m(np.array([5.0, 7.0, 9.0])), ego.at_mps(np.array([5.0, 7.0, 9.0]))
+    (array([-10.  ,  -1.25,   0.  ]), array([5. , 2.5, 0. ]))
+    """
+
+    speed_mps: float = 0.0
+    stop_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        in_range("speed_mps", self.speed_mps, 0.0, 20.0)
+        in_range("stop_s", self.stop_s, 0.0, 120.0)
+
+    @property
+    def stands(self) -> bool:
+        """Whether it never moves."""
+        return self.speed_mps == 0.0
+
+    def at_mps(self, time_s: Array) -> Array:
+        """Speed at any time, same shape as `time_s`."""
+        return np.clip(BRAKING_MPS2 * (self.stop_s - time_s), 0.0, self.speed_mps)
+
+    def x_m(self, time_s: Array) -> Array:
+        """Position along the street, 0 where it stops, same shape as `time_s`."""
+        left = np.maximum(self.stop_s - time_s, 0.0)
+        braking = np.minimum(left, self.speed_mps / BRAKING_MPS2)
+        return np.asarray(0.0 - 0.5 * BRAKING_MPS2 * braking**2 - self.speed_mps * (left - braking))

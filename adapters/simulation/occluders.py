@@ -1,0 +1,121 @@
+"""Bodies in the open that hide a vehicle: a lead vehicle, a bridge pier, a barrier at a merge.
+
+A body is a convex outline, taken as infinitely high. Sound goes round it on the shorter side, by the one
+corner of that side that costs most, and pays the screen attenuation of that detour.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import finite_array
+from worldstate.errors import InvalidArgumentError
+
+Array = NDArray[np.float64]
+
+MAX_CORNERS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Occluder:
+    """A convex outline on the ground.
+
+    Parameters
+    ----------
+    corners_m : tuple of (float, float)
+        x ahead and y left of every corner, 2 (a thin screen) to 16.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are too few or too many, or a number is not finite.
+
+    Examples
+    --------
+    >>> box(6.0, 12.0, -1.25, 1.25).corners_m[0]
+    (6.0, -1.25)
+    """
+
+    corners_m: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        corners = finite_array("corners_m", self.corners_m, (None, 2))
+        if not 2 <= len(corners) <= MAX_CORNERS:
+            raise InvalidArgumentError(f"corners_m: expected 2 to {MAX_CORNERS} corners, got {len(corners)}")
+
+
+def box(near_m: float, far_m: float, right_m: float, left_m: float) -> Occluder:
+    """Return an upright rectangular outline."""
+    return Occluder(((near_m, right_m), (far_m, right_m), (far_m, left_m), (near_m, left_m)))
+
+
+def hidden_by(
+    occluders: Sequence[Occluder], x_m: Array, y_m: Array, eye_m: tuple[float | Array, float]
+) -> NDArray[np.bool_]:
+    """Tell when a body stands between an eye and a point that moves, shape (T,).
+
+    Examples
+    --------
+    >>> x, y = np.array([20.0, 20.0]), np.array([0.0, 6.0])
+    >>> hidden_by([box(6, 12, -1, 1)], x, y, (0.0, 0.0))
+    array([ True, False])
+    """
+    hidden = np.zeros(np.shape(y_m), np.bool_)
+    for occluder in occluders:
+        hidden |= _crosses(*_offsets(occluder, x_m, y_m, eye_m))
+    return hidden
+
+
+def detours(
+    occluder: Occluder, x_m: Array, y_m: Array, end_m: tuple[float | Array, float]
+) -> tuple[Array, NDArray[np.int_]]:
+    """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each.
+
+    The detour is negative where the line is clear; it passes through 0 where the line touches the body.
+
+    Examples
+    --------
+    >>> x, y = np.full(3, 20.0), np.array([0.0, 1.7, 6.0])
+    >>> detours(box(6, 12, -1, 1), x, y, (0.0, 0.0))[0].round(2)
+    array([ 0.12,  0.03, -0.07])
+    """
+    offset, along = _offsets(occluder, x_m, y_m, end_m)
+    via = np.array([_via(x, y, x_m, y_m, end_m) for x, y in occluder.corners_m])
+    extra = np.maximum(via - np.hypot(x_m - end_m[0], y_m - end_m[1]), 0.0)
+    # Round a body on one side means past all of its corners there; the costliest stands for them.
+    sides = np.stack([np.where(side * offset > 0.0, extra, -1.0) for side in (1.0, -1.0)])
+    cost, corner = sides.max(axis=1), sides.argmax(axis=1)
+    blocked, shorter = _crosses(offset, along), cost[0] <= cost[1]
+    # In the light the body is as far away as the corner that the line passes most closely.
+    beside = np.where((along > 0.0) & (along < 1.0), extra, np.inf).min(axis=0)
+    clear = np.where(np.isfinite(beside), beside, extra.min(axis=0))
+    return (
+        np.where(blocked, cost.min(axis=0), -clear),
+        np.where(blocked, np.where(shorter, *corner), extra.argmin(axis=0)),
+    )
+
+
+def _via(x: float, y: float, x_m: Array, y_m: Array, end_m: tuple[float | Array, float]) -> Array:
+    return np.asarray(np.hypot(x_m - x, y_m - y) + np.hypot(end_m[0] - x, end_m[1] - y))
+
+
+def _offsets(
+    occluder: Occluder, x_m: Array, y_m: Array, end_m: tuple[float | Array, float]
+) -> tuple[Array, Array]:
+    """Lateral offset of every corner from the line, and how far along it is, 0..1, shape (corners, T)."""
+    corners = np.array(occluder.corners_m)[:, :, None]
+    dx, dy = x_m - end_m[0], y_m - end_m[1]
+    length = np.maximum(np.hypot(dx, dy), 1e-6)
+    to_x, to_y = corners[:, 0] - end_m[0], corners[:, 1] - end_m[1]
+    return (to_y * dx - to_x * dy) / length, (to_x * dx + to_y * dy) / length**2
+
+
+def _crosses(offset: Array, along: Array) -> NDArray[np.bool_]:
+    """Tell when a side of the outline crosses the line between its ends, shape (T,)."""
+    onward, further = np.roll(offset, -1, axis=0), np.roll(along, -1, axis=0)
+    apart = offset * onward < 0.0
+    share = offset / np.where(apart, offset - onward, 1.0)
+    met = along + (further - along) * share
+    return np.asarray((apart & (met > 0.0) & (met < 1.0)).any(axis=0))

@@ -1,0 +1,103 @@
+"""Microphones that stand or move, and what reaches them from places that stand still."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bands import resample_whole
+from .delay import KNOT_SAMPLES, OVERSAMPLING, Table, add_delayed
+from .diffraction import SPEED_OF_SOUND_MPS
+from .ego_motion import EgoMotion
+
+Array = NDArray[np.float64]
+Signal = NDArray[np.float32]
+
+NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
+ARRIVAL_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """Microphones, how they move, and the times at which they listen.
+
+    Parameters
+    ----------
+    positions_m : ndarray, shape (M, 3)
+        In `base_link`, z above the road.
+    skew_s : ndarray, shape (M,)
+        Phase mismatch of every channel as a delay.
+    knots_s : ndarray, shape (K + 1,)
+        Receive times of the knots; K * KNOT_SAMPLES samples are heard.
+    ego : EgoMotion
+        How `base_link` moves along x.
+    """
+
+    positions_m: Array
+    skew_s: Array
+    knots_s: Array
+    ego: EgoMotion = field(default_factory=EgoMotion)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples between the first and the last knot."""
+        return (len(self.knots_s) - 1) * KNOT_SAMPLES
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Rate at which is heard."""
+        return float(KNOT_SAMPLES / (self.knots_s[1] - self.knots_s[0]))
+
+    @property
+    def centre_m(self) -> Array:
+        """Array's centre in `base_link`, shape (3,)."""
+        return np.asarray(self.positions_m.mean(axis=0))
+
+    def above(self, height_m: float) -> float:
+        """Height of the array's centre above a source."""
+        return float(self.centre_m[2]) - height_m
+
+    def arrivals(self, emit_s: Array, length_m: Callable[[Array], Array]) -> tuple[Array, Array]:
+        r"""Solve a = t + r(x(a)) / c for what is emitted at t and heard at a by an ego at x.
+
+        Parameters
+        ----------
+        emit_s : ndarray, shape (T,)
+            Emission times.
+        length_m : callable
+            Length of the path to an ego at x (T,), shape (T,).
+
+        Returns
+        -------
+        (ndarray, ndarray), shape (T,) each
+            Length of the path, and where the ego is when it hears.
+        """
+        x = self.ego.x_m(emit_s)
+        length = length_m(x)
+        # The ego is far slower than sound: every round is wrong by v / c < 6 % of what the last one was.
+        for _ in range(0 if self.ego.stands else ARRIVAL_ROUNDS):
+            x = self.ego.x_m(emit_s + length / SPEED_OF_SOUND_MPS)
+            length = length_m(x)
+        return length, x
+
+
+def distance_m(place_m: Array, x_m: Array, offset_m: Array) -> Array:
+    """Distance from a place to a point fixed at `offset_m` on an ego at `x_m` (T,)."""
+    across = np.hypot(place_m[1] - offset_m[1], place_m[2] - offset_m[2])
+    return np.asarray(np.hypot(place_m[0] - offset_m[0] - x_m, across))
+
+
+def add_turning(out: Signal, signal: Signal, place_m: Array, gain: Array, receiver: Receiver) -> None:
+    """Spread over the microphones of a moving ego what its centre hears from a place that stands still."""
+    if not np.abs(signal).any():
+        return
+    rate_hz = receiver.sample_rate_hz
+    values = resample_whole(signal, OVERSAMPLING)
+    table = Table(values, float(receiver.knots_s[0]), rate_hz * OVERSAMPLING)
+    x, knots = receiver.ego.x_m(receiver.knots_s), receiver.knots_s
+    centre = distance_m(place_m, x, receiver.centre_m)
+    last = knots[-1] - 1.0 / rate_hz  # what the centre hears afterwards is not known
+    for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
+        later = (distance_m(place_m, x, position) - centre) / SPEED_OF_SOUND_MPS + skew
+        add_delayed(microphone, table, np.clip(knots - later, knots[0], last), gain)

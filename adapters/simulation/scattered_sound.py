@@ -1,0 +1,78 @@
+"""What rough walls send on of a moving source, rendered at every microphone."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .delay import add_delayed, emission_times
+from .diffraction import SPEED_OF_SOUND_MPS
+from .emission import Emission, MovingSource
+from .presets import Preset
+from .receiver import NEAREST_M, Receiver, add_turning, distance_m
+from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, scattering, seen_through_mouth
+from .scene import Site
+from .static_field import add_static
+
+Array = NDArray[np.float64]
+Signal = NDArray[np.float32]
+
+
+def add_scattered(
+    out: Signal,
+    source: MovingSource,
+    site: Site,
+    receiver: Receiver,
+    preset: Preset,
+) -> None:
+    """Add what rough walls send on of one moving source, from where they stand, to all microphones.
+
+    Parameters
+    ----------
+    out, site, receiver
+        As for `add_sources`.
+    source : MovingSource
+        The whole vehicle as one.
+    preset : Preset
+        Scattering coefficient and largest screen attenuation.
+    """
+    amplitude = np.sqrt(scattering(preset))
+    if not amplitude.any() or site.occluders:
+        return
+    for group in patches(site):
+        arrived = np.zeros((len(group.strengths_m), receiver.samples), np.float32)
+        for index, signal in enumerate(arrived):
+            for leg in first_legs(
+                site, group, index, source.x_m, source.y_m, source.height_m, preset.screen_cap_db
+            ):
+                _add_leg(signal, source.emission, leg, amplitude, receiver, group.positions_m[index])
+        _add_patches(out, arrived, group, site, receiver)
+
+
+def _add_leg(
+    out: Signal, emission: Emission, leg: FirstLeg, amplitude: Array, receiver: Receiver, patch_m: Array
+) -> None:
+    """Add what one patch sends on, as late as the array's centre hears it."""
+    made = emission.table(leg.gain * amplitude)
+    if made is None:
+        return
+    table, span = made
+    knots, first = emission.knots_s[span], leg.length_m[span]
+    total, _ = receiver.arrivals(knots, lambda x: first + distance_m(patch_m, x, receiver.centre_m))
+    emit = emission_times(receiver.knots_s, knots, total, SPEED_OF_SOUND_MPS)
+    length = np.interp(np.nan_to_num(emit), knots, first)
+    add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
+
+
+def _add_patches(out: Signal, arrived: Signal, group: Patches, site: Site, receiver: Receiver) -> None:
+    """Let every patch sound to all microphones."""
+    if receiver.ego.stands:
+        distance, gain = last_leg(group, receiver.positions_m)
+        centre = np.linalg.norm(group.positions_m - receiver.centre_m, axis=1)
+        delays = (distance - centre[:, None]) / SPEED_OF_SOUND_MPS + receiver.skew_s
+        add_static(out, arrived, delays, receiver.sample_rate_hz, gain)
+        return
+    x = receiver.ego.x_m(receiver.knots_s)
+    for place, normal, signal in zip(group.positions_m, group.normals, arrived, strict=True):
+        distance = np.maximum(distance_m(place, x, receiver.centre_m), NEAREST_M)
+        cosine = np.abs((x - place[0]) * normal[0] - place[1] * normal[1]) / distance
+        seen = seen_through_mouth(site, place, x) if group.beyond_mouth else 1.0
+        add_turning(out, signal, place, np.sqrt(np.minimum(cosine, 1.0)) / distance * seen, receiver)

@@ -1,0 +1,59 @@
+"""The ways past bodies in the open, cut into pieces that each go by one corner."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bands import OCTAVES_HZ, smooth_step
+from .diffraction import screen_attenuation_db
+from .occluders import Occluder, detours
+
+Array = NDArray[np.float64]
+
+BLEND_M = 0.02  # detour over which a line that touches a body turns into the way round it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScreenedLeg:
+    """Sound that goes by one point, or straight, at a series of emission times.
+
+    Parameters
+    ----------
+    before_m : ndarray, shape (T,)
+        Way from the source to that point, seen from above; 0 for the straight line.
+    via_x_m, via_y_m : ndarray, shape (T,)
+        That point, or the source itself.
+    gain : ndarray, shape (T, 8)
+        Amplitude per octave; 0 where this is not the way.
+    """
+
+    before_m: Array
+    via_x_m: Array
+    via_y_m: Array
+    gain: Array
+
+
+def screened_legs(
+    occluders: Sequence[Occluder], x_m: Array, y_m: Array, ego_x_m: Array, cap_db: float
+) -> list[ScreenedLeg]:
+    """Return the straight way and the way round every corner of the body that is most in the way.
+
+    Only that body counts at any time; behind it the others change little.
+    """
+    found = [detours(one, x_m, y_m, (ego_x_m, 0.0)) for one in occluders]
+    worst = np.argmax([detour for detour, _ in found], axis=0)
+    detour = np.max([one for one, _ in found], axis=0)
+    gain = 10.0 ** (-screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db) / 20.0)
+    blocked = smooth_step(detour / BLEND_M)
+    legs = [ScreenedLeg(np.zeros_like(y_m), x_m, y_m, gain * (1.0 - blocked)[:, None])]
+    for body, (occluder, (_, chosen)) in enumerate(zip(occluders, found, strict=True)):
+        for index, (x, y) in enumerate(occluder.corners_m):
+            here = blocked * ((worst == body) & (chosen == index))
+            if here.any():
+                before = np.hypot(x_m - x, y_m - y)
+                legs.append(
+                    ScreenedLeg(before, np.full_like(y_m, x), np.full_like(y_m, y), gain * here[:, None])
+                )
+    return legs
