@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import log_softmax
 
 from worldstate.checks import finite_array
 from worldstate.errors import InvalidArgumentError
 
 from .evidence import SignatureEvidence
-from .expert import Expert, expert_view, split_reference
+from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
 from .mirror import SEGMENTS, mirror_features
 from .pairwise import SMALLEST_PROBABILITY
 from .schema import read_numbers
@@ -82,8 +81,9 @@ class EnsembleModel:
         object.__setattr__(self, "empty", empty)
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
+        views = expert_views(VIEWS, self.home.mean[None], self.home.row[None])
         for expert in self.experts:
-            inputs = expert_view(expert.view, self.home.mean[None], self.home.row[None]).shape[1]
+            inputs = views[expert.view].shape[1]
             if expert.mean.size != inputs:
                 raise InvalidArgumentError(f"expert: expected {inputs} inputs, got {expert.mean.size}")
 
@@ -132,7 +132,7 @@ class EnsembleModel:
         """
         levels, reference = self._split(X)
         posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
-        return np.asarray(posteriors / posteriors.sum(axis=1, keepdims=True))
+        return np.asarray(posteriors / total(posteriors))
 
     def log_likelihoods(self, X: ArrayLike) -> Numbers:
         r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
@@ -196,10 +196,16 @@ class EnsembleModel:
         return log_levels(inputs), np.broadcast_to(self.home.row, (len(inputs), self.home.row.size))
 
     def _log_posteriors(self, levels: Numbers, reference: Numbers) -> Numbers:
-        mirrored = mirror_features(levels, SEGMENTS), mirror_features(reference, SEGMENTS * len(KINDS))
-        sums = np.zeros((len(levels), len(CLASSES)))
+        n, wanted = len(levels), {expert.view for expert in self.experts}
+        views = expert_views(
+            wanted,
+            np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
+            np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
+        )
+        sums = np.zeros((n, len(CLASSES)))
         for expert in self.experts:
+            seen = views[expert.view]
             # Added to each other first: the sum of two does not depend on which is the mirror image.
-            there, back = expert.log_posteriors(levels, reference), expert.log_posteriors(*mirrored)
+            there, back = expert.log_posteriors(seen[:n]), expert.log_posteriors(seen[n:])
             sums += there + back[:, MIRRORED_CLASSES]
-        return np.asarray(log_softmax(sums / (2 * len(self.experts)), axis=1))
+        return log_softmax(sums / (2 * len(self.experts)))

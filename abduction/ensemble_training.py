@@ -12,7 +12,7 @@ from worldstate.checks import finite_array
 from worldstate.errors import InvalidArgumentError
 
 from .ensemble import MIRRORED_CLASSES, EnsembleModel
-from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_view, split_reference
+from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
 from .mirror import SEGMENTS, mirror_features
 from .signature import CLASSES, NONE
 from .signature_training import checked_labels
@@ -103,8 +103,9 @@ class SiteEnsembleClassifier:
             raise InvalidArgumentError(f"X: expected windows with a reference, got shape {inputs.shape}")
         codes = np.searchsorted(CLASSES, checked_labels(y, len(inputs)))
         levels, reference, codes = _with_mirror_images(*split_reference(inputs), codes)
+        views = expert_views({recipe.view for recipe in self.recipes}, levels, reference)
         self.model_ = EnsembleModel(
-            tuple(_fit_expert(recipe, levels, reference, codes) for recipe in self.recipes),
+            tuple(_fit_expert(recipe, views[recipe.view], codes) for recipe in self.recipes),
             np.bincount(codes) / codes.size,
             SiteReference.from_row(reference.mean(axis=0)),
             levels[codes == NONE].mean(axis=0),
@@ -128,8 +129,7 @@ def _with_mirror_images(
     )
 
 
-def _fit_expert(recipe: Recipe, levels: Numbers, reference: Numbers, codes: NDArray[np.intp]) -> Expert:
-    seen = expert_view(recipe.view, levels, reference)
+def _fit_expert(recipe: Recipe, seen: Numbers, codes: NDArray[np.intp]) -> Expert:
     mean, scale = standardisation(seen)
     machine = LogisticRegression(C=1.0 / (recipe.ridge * len(seen)), max_iter=_ITERATIONS)
     machine.fit((seen - mean) / scale, codes)

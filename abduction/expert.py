@@ -1,12 +1,11 @@
 """One linear expert of an ensemble, and the views of a window that an expert may have."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_softmax
 
 from worldstate.checks import finite_array
 from worldstate.errors import InvalidArgumentError
@@ -67,11 +66,9 @@ class Expert:
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
 
-    def log_posteriors(self, levels: Numbers, reference: Numbers) -> Numbers:
-        """Return log-softmax of the weighted sums, shape (n, 4)."""
-        seen = expert_view(self.view, levels, reference)
-        sums = (seen - self.mean) / self.scale @ self.weights.T + self.intercepts
-        return np.asarray(log_softmax(sums, axis=1))
+    def log_posteriors(self, seen: Numbers) -> Numbers:
+        """Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4)."""
+        return log_softmax((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
@@ -96,13 +93,13 @@ class Expert:
         return cls(view=str(data.get("view")), weights=np.array(rows), **vectors)
 
 
-def expert_view(view: str, levels: Numbers, reference: Numbers) -> Numbers:
-    """Return what an expert looks at, shape (n, inputs).
+def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -> dict[str, Numbers]:
+    """Return what experts look at, each of shape (n, inputs); what several share is computed once.
 
     Parameters
     ----------
-    view : str
-        One of `VIEWS`.
+    wanted : collection of str
+        Some of `VIEWS`.
     levels : ndarray, shape (n, features)
         Natural logarithms.
     reference : ndarray, shape (n, 3 * features)
@@ -110,16 +107,33 @@ def expert_view(view: str, levels: Numbers, reference: Numbers) -> Numbers:
 
     Examples
     --------
-    >>> expert_view("median", np.full((1, 2), 3.0), np.array([[0.0, 0.0, 1.0, 2.0, 0.0, 0.0]]))
-    array([[2., 1.]])
+    >>> expert_views(["median"], np.full((1, 2), 3.0), np.array([[0.0, 0.0, 1.0, 2.0, 0.0, 0.0]]))
+    {'median': array([[2., 1.]])}
     """
-    if view == SHAPE:
-        return shape_features(levels, SEGMENTS)
-    kind = KINDS.index("median" if view == SHAPE_CHANGE else view)
-    summary = reference[:, kind * levels.shape[1] : (kind + 1) * levels.shape[1]]
-    if view == SHAPE_CHANGE:
-        return shape_features(levels, SEGMENTS) - shape_features(summary, SEGMENTS)
-    return levels - summary
+    summaries = dict(zip(KINDS, np.split(reference, len(KINDS), axis=1), strict=True))
+    views = {kind: levels - summary for kind, summary in summaries.items() if kind in wanted}
+    if SHAPE in wanted or SHAPE_CHANGE in wanted:
+        views[SHAPE] = shape_features(levels, SEGMENTS)
+    if SHAPE_CHANGE in wanted:
+        views[SHAPE_CHANGE] = views[SHAPE] - shape_features(summaries["median"], SEGMENTS)
+    return views
+
+
+def log_softmax(sums: Numbers) -> Numbers:
+    """Return the rows less the log of their summed exponentials.
+
+    Examples
+    --------
+    >>> log_softmax(np.zeros((1, 4))).round(3)
+    array([[-1.386, -1.386, -1.386, -1.386]])
+    """
+    below = sums - sums.max(axis=1, keepdims=True)
+    return np.asarray(below - np.log(total(np.exp(below))))
+
+
+def total(values: Numbers) -> Numbers:
+    """Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand."""
+    return np.asarray(np.sort(values, axis=1).sum(axis=1, keepdims=True))
 
 
 def split_reference(X: Numbers) -> tuple[Numbers, Numbers]:

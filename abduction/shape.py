@@ -29,30 +29,33 @@ def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
     array([0.69])
     """
     stretches = levels.reshape(len(levels), segments, -1)
-    columns = [column for i in range(segments) for column in _segment(stretches[:, i])]
-    return np.stack(columns + _change(stretches[:, 0], stretches[:, -1]), axis=1)
+    by_segment = np.stack(_columns(stretches), axis=2).reshape(len(levels), -1)
+    change = np.stack(_change(stretches[:, 0], stretches[:, -1]), axis=1)
+    return np.concatenate([by_segment, change], axis=1)
 
 
-def _segment(levels: Numbers) -> list[Numbers]:
-    n_directions = levels.shape[1]
-    peak, middle = levels.max(axis=1), np.median(levels, axis=1)
+def _columns(levels: Numbers) -> list[Numbers]:
+    """Numbers of each stretch, every one of shape (n, segments)."""
+    n_directions = levels.shape[2]
+    peak, middle = levels.max(axis=2), np.median(levels, axis=2)
     third = n_directions // 3
-    first = levels[:, :third].max(axis=1)
-    centre = levels[:, third : n_directions - third].max(axis=1)
-    last = levels[:, n_directions - third :].max(axis=1)
+    first = levels[:, :, :third].max(axis=2)
+    centre = levels[:, :, third : n_directions - third].max(axis=2)
+    last = levels[:, :, n_directions - third :].max(axis=2)
     position, width = _centroid(levels)
-    heights = [peak, middle, levels.min(axis=1), peak - middle]
+    heights = [peak, middle, levels.min(axis=2), peak - middle]
     sides = [first, centre, last, first - last, position, np.abs(position)]
-    return [*heights, *sides, levels.std(axis=1), width, np.diff(levels, axis=1).std(axis=1)]
+    return [*heights, *sides, levels.std(axis=2), width, np.diff(levels, axis=2).std(axis=2)]
 
 
 def _centroid(levels: Numbers) -> tuple[Numbers, Numbers]:
     """Mean and spread of the direction, on [-1, 1], weighted by the levels above their peak's foot."""
-    direction = np.linspace(-1.0, 1.0, levels.shape[1])
-    weights = np.exp(_SHARPNESS * (levels - levels.max(axis=1, keepdims=True)))
-    weights /= weights.sum(axis=1, keepdims=True)
-    position = weights @ direction
-    return position, np.sqrt(np.maximum(weights @ direction**2 - position**2, 0.0))
+    direction = np.linspace(-1.0, 1.0, levels.shape[2])
+    weights = np.exp(_SHARPNESS * (levels - levels.max(axis=2, keepdims=True)))
+    weights /= weights.sum(axis=2, keepdims=True)
+    # Sums, not products of matrices: a row then comes out to the bit the same among whatever others.
+    position, square = (weights * direction).sum(axis=2), (weights * direction**2).sum(axis=2)
+    return position, np.sqrt(np.maximum(square - position**2, 0.0))
 
 
 def _change(first: Numbers, last: Numbers) -> list[Numbers]:

@@ -232,7 +232,7 @@ def test_the_command_replaces_the_policies_and_keeps_the_signature(streams_file,
     assert summary["warnings"]
     assert summary["hazard_free_hours"] == pytest.approx(12 * 291 / 36000)
     before, after = read_model(), read_model(out)
-    assert np.array_equal(after.signature.coefficients, before.signature.coefficients)
+    assert after.signature.to_dict() == before.signature.to_dict()
     assert {(p.alpha, p.miss_rate) for p in after.policies.policies} == {
         (a, b) for a in (0.01, 0.1) for b in (0.0, 1.0)
     }
