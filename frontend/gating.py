@@ -44,6 +44,16 @@ class GatingCurve:
     def threshold_for(self, median_error_rad: float) -> float | NotUsable:
         """Return the lowest threshold from which on the median error stays within the given one.
 
+        Parameters
+        ----------
+        median_error_rad : float
+            Largest median error allowed, radians.
+
+        Returns
+        -------
+        float or NotUsable
+            A prominence.
+
         Examples
         --------
         >>> curve = gating_curve([1.1, 1.2, 2.0, 3.0], [0.4, 0.3, 0.02, 0.01])
@@ -55,6 +65,33 @@ class GatingCurve:
         if first == len(self.threshold):
             return NotUsable(f"no threshold keeps the median error within {median_error_rad:g} rad")
         return float(self.threshold[first])
+
+    def at_coverage(self, share: float) -> tuple[float, float]:
+        """Return the highest threshold that keeps at least a share of the bearings, and the error there.
+
+        Parameters
+        ----------
+        share : float
+            In (0, 1].
+
+        Returns
+        -------
+        threshold, median_error_rad : float
+            Prominence, and radians.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If the share is out of range.
+
+        Examples
+        --------
+        >>> gating_curve([1.1, 1.2, 2.0, 3.0], [0.5, 0.25, 0.125, 0.125]).at_coverage(0.5)
+        (2.0, 0.125)
+        """
+        least = in_range("share", share, 0.0, 1.0, open_low=True)
+        last = int(np.flatnonzero(self.coverage >= least - 1e-12)[-1])
+        return float(self.threshold[last]), float(self.median_error_rad[last])
 
 
 def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int = 200) -> GatingCurve:

@@ -11,7 +11,10 @@ Listen to a recording and keep the world-state.
 
 INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), or the folder of one recording in the OVAD layout
 (out_multi.wav and, where there is one, camera_baseline_results.json). Without detections the camera counts as
-not asked, which is neither presence nor absence."""
+not asked, which is neither presence nor absence.
+
+--gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
+coverage, where only prominent peaks are kept."""
 
 EXAMPLE = """\
 examples:
@@ -52,6 +55,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
+    parser.add_argument(
+        "--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence"
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     parser.set_defaults(run=run)
 
@@ -61,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.audio import SilentChannelsError
     from worldstate.adapters.listen import open_source
     from worldstate.cli.listening import listen_with_progress
+    from worldstate.evaluation.bearing_gating import write_gating_figure
     from worldstate.evaluation.timeline import write_timeline
 
     source = open_source(
@@ -82,5 +89,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.figure is not None:
         write_timeline(report.timeline, arguments.figure)
-    print_summary(report.to_dict(), as_json=arguments.json)
+    summary = report.to_dict()
+    if arguments.gating is not None:
+        write_gating_figure(report.bearings, arguments.gating, title=str(arguments.input))
+        summary |= report.bearings.figures()
+    print_summary(summary, as_json=arguments.json)
     return 0

@@ -10,6 +10,7 @@ import numpy as np
 
 from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.listen import Source, Step, listen_steps
+from worldstate.evaluation.bearing_gating import BearingChecks, check_bearings
 from worldstate.evaluation.health import HealthLog, RecordingHealth
 from worldstate.evaluation.timeline import Timeline
 from worldstate.evaluation.warning import WarningMeter, WarningSummary
@@ -35,6 +36,8 @@ class RecordingReport:
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
+    bearings : BearingChecks
+        Bearings and their prominence, beside the moving boxes of the camera.
     """
 
     warning: WarningSummary
@@ -43,6 +46,7 @@ class RecordingReport:
     peak_risk: float
     realtime_factor: float
     health: RecordingHealth
+    bearings: BearingChecks
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
@@ -91,6 +95,7 @@ def run_recording(
         peak_risk=max(log.risk, default=0.0),
         realtime_factor=(log.time_s[-1] if log.time_s else 0.0) / elapsed_s,
         health=log.health.summary(),
+        bearings=log.bearings(),
     )
 
 
@@ -115,7 +120,8 @@ class _HopLog:
     advisory: list[bool] = field(default_factory=list)
     srp: list[np.ndarray] = field(default_factory=list)
     entity: list[tuple[float, float]] = field(default_factory=list)
-    sightings: list[tuple[float, float]] = field(default_factory=list)
+    heard: list[tuple[float, float, float]] = field(default_factory=list)
+    moving_rad: list[list[float]] = field(default_factory=list)
     azimuths_rad: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def add(self, step: Step) -> None:
@@ -130,12 +136,18 @@ class _HopLog:
         self.azimuths_rad = step.frame.azimuths_rad
         leading = _leading_entity(state)
         self.entity.append((leading.azimuth_rad, leading.azimuth_std_rad) if leading else (np.nan, np.nan))
-        moving = (sighting for sighting in step.measurement.sightings if sighting.moving)
-        self.sightings.extend((now_s, sighting.azimuth_rad) for sighting in moving)
+        frame = step.frame
+        self.heard.append((frame.bearing_age_s, frame.bearing_rad, frame.prominence))
+        self.moving_rad.append([seen.azimuth_rad for seen in step.measurement.sightings if seen.moving])
+
+    def bearings(self) -> BearingChecks:
+        age_s, bearing_rad, prominence = np.array(self.heard, dtype=np.float64).reshape(-1, 3).T.tolist()
+        return check_bearings(self.time_s, age_s, bearing_rad, prominence, self.moving_rad)
 
     def timeline(self, source: Source, title: str) -> Timeline:
         entity = np.array(self.entity, dtype=np.float64).reshape(-1, 2)
-        sightings = np.array(self.sightings, dtype=np.float64).reshape(-1, 2)
+        boxes = [(t, azimuth) for t, row in zip(self.time_s, self.moving_rad, strict=True) for azimuth in row]
+        sightings = np.array(boxes, dtype=np.float64).reshape(-1, 2)
         return Timeline(
             time_s=np.array(self.time_s),
             statistic=np.array(self.statistic),

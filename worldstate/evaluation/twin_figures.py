@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.calibration_error import expected_calibration_error
 from worldstate.evaluation.advisories import SECONDS_PER_HOUR
+from worldstate.evaluation.bearing_gating import BearingChecks, joined
 from worldstate.evaluation.hop_stream import HOP_S
 from worldstate.evaluation.metrics import auroc
 from worldstate.evaluation.twin_recording import TwinRecording
@@ -100,7 +101,30 @@ def _area(positives: Sequence[Numbers], negatives: Sequence[Numbers]) -> float:
 def _bearings(approaches: Sequence[TwinRecording]) -> dict[str, float]:
     errors = {"srp": [r.srp_rad - r.reference_rad for r in approaches]}
     errors["music"] = [r.music_rad - r.reference_rad for r in approaches]
-    return {f"bearing_{name}_deg": _median_deg(parts) for name, parts in errors.items()}
+    medians = {f"bearing_{name}_deg": _median_deg(parts) for name, parts in errors.items()}
+    gated = twin_bearings(approaches).figures()["bearing_gated_deg"]
+    return medians | {"bearing_gated_deg": float("nan") if gated is None else gated}
+
+
+def twin_bearings(recordings: Sequence[TwinRecording]) -> BearingChecks:
+    """Put the bearings of recordings beside the prominence of their windows.
+
+    Parameters
+    ----------
+    recordings : sequence of TwinRecording
+        At least one.
+
+    Returns
+    -------
+    BearingChecks
+        One row a window; the error against the nearest moving box of the camera.
+
+    Examples
+    --------
+    >>> twin_bearings([TwinRecording.blank("a", hops=2)]).prominence
+    array([1., 1.])
+    """
+    return joined(BearingChecks(r.prominence, r.srp_rad - r.reference_rad) for r in recordings)
 
 
 def _median_deg(parts: Sequence[Numbers]) -> float:

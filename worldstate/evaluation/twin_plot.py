@@ -1,4 +1,4 @@
-"""The figure of the twin: ROC at three horizons, reliability, detection against false alarms per hour."""
+"""The figure of the twin: ROC at three horizons, reliability, detection against false alarms, gating."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.calibration_error import reliability_curve
 from worldstate.adapters.atomic import atomic_path
-from worldstate.evaluation.twin_figures import HORIZONS, rule_figures, twin_figures
+from worldstate.evaluation.bearing_gating import draw_gating
+from worldstate.evaluation.twin_figures import HORIZONS, rule_figures, twin_bearings, twin_figures
 from worldstate.evaluation.twin_report import TARGETS
 from worldstate.evaluation.twin_score import ALPHA, TwinScore, labelled_windows
 
@@ -28,11 +29,13 @@ def write_twin_figure(score: TwinScore, path: Path) -> None:
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    _draw_roc(left, score)
-    _draw_reliability(middle, score)
-    _draw_operating(right, score)
+    figure = Figure(figsize=(14.5, 3.6), layout="constrained")
+    roc, reliability, operating, gating = figure.subplots(1, 4)
+    _draw_roc(roc, score)
+    _draw_reliability(reliability, score)
+    _draw_operating(operating, score)
+    draw_gating(gating, twin_bearings([r for r in score.recordings if not r.hazard_free]))
+    gating.set_title("bearings in view")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150, format=path.suffix.lstrip(".") or "png")
 

@@ -61,6 +61,7 @@ TARGETS: Mapping[str, Target] = {
     "sustained_lead_s": Target("sustained rule, lead, s", 1.88, "relative"),
     "sustained_false_alarms_per_hour": Target("sustained rule, FA/h", 185.0, "relative"),
     "bearing_srp_deg": Target("bearing in view, SRP, deg", 3.4, "relative"),
+    "bearing_gated_deg": Target("SRP, most prominent 16 %, deg", 2.4, "relative", counts=False),
     "bearing_music_deg": Target("bearing in view, MUSIC, deg", 7.1, "relative"),
     "prominence_in_view": Target("prominence in view", 1.60, "relative"),
     "prominence_in_silence": Target("prominence in silence", 1.18, "relative"),
