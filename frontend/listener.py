@@ -82,7 +82,7 @@ class Listener:
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft = nfft
         self._n_frames = 0
-        self.music = self._music(array, frequencies, settings)
+        self.music = self._music(array.n_microphones, settings)
         self._unwatched = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array.n_microphones, sample_rate_hz, bins, settings)
@@ -95,11 +95,11 @@ class Listener:
         energies = self._frame_energies(powers)
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
         health = self._watch(samples, energies, matrices)
+        quiet = self._whitened(spectra, health.mask)
         if self.music is not None:
-            self.music.push(spectra[:, self._srp])
-        health.mask.silence(spectra)
+            self._push_music(self.music, spectra, powers, quiet)
         health.mask.silence(whitened)
-        srp, pairs = self._sums(spectra, whitened, matrices, health.mask)
+        srp, pairs = self._sums(quiet, whitened, matrices, health.mask)
         centre = self._centre(len(spectra))
         return HopSums(len(spectra), centre, srp, pairs, energies.mean(axis=0), health)
 
@@ -115,13 +115,34 @@ class Listener:
             return self._unwatched
         return self.monitor.push(samples, energies, matrices)
 
-    def _sums(
-        self, spectra: Spectra, whitened: Spectra, matrices: Spectra, mask: ChannelMask
-    ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-        """Steered power and pair sums of one hop, as of all microphones."""
-        quiet: list[Steered] = [] if self.ego_noise is None else self.ego_noise.process(spectra)
+    def _whitened(self, spectra: Spectra, mask: ChannelMask) -> list[Steered]:
+        """Prewhitened spectra, phase transform included, and their beams; none without ego-noise settings."""
+        if self.ego_noise is None:
+            return []
+        mask.silence(spectra)
+        quiet = self.ego_noise.process(spectra)
         for heard, _ in quiet:
             mask.silence(heard)
+        if self.ego_noise.learned_frames:
+            return quiet
+        plain = (self._beams, self._feature_beams)
+        return [(heard, beams) for (heard, _), beams in zip(quiet, plain, strict=False)]
+
+    def _push_music(
+        self, music: MusicStage, spectra: Spectra, powers: NDArray[np.float32], quiet: list[Steered]
+    ) -> None:
+        """MUSIC hears raw spectra, or whitened ones at the level of the raw ones."""
+        if not quiet or quiet[0][1] is self._beams:
+            music.push(spectra[:, self._srp])
+        else:
+            heard, beams = quiet[0]
+            level = np.sqrt(powers[:, self._srp].mean(axis=2, keepdims=True))
+            music.push(heard * level, beams)
+
+    def _sums(
+        self, quiet: list[Steered], whitened: Spectra, matrices: Spectra, mask: ChannelMask
+    ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+        """Steered power and pair sums of one hop, as of all microphones."""
         srp = quiet[0] if quiet else (whitened[:, self._srp], self._beams)
         if len(quiet) > 1:
             pairs = pair_sum(*quiet[1])
@@ -129,16 +150,11 @@ class Listener:
             pairs = pair_sum_of(mask.cross(matrices), self._feature_beams)
         return steered_power(*srp) * mask.power_scale, pairs * mask.pair_scale
 
-    def _music(
-        self, array: MicrophoneArray, frequencies_hz: NDArray[np.float64], settings: FrontEndSettings
-    ) -> MusicStage | None:
+    def _music(self, n_microphones: int, settings: FrontEndSettings) -> MusicStage | None:
         if not settings.music_sources:
             return None
-        centred = MicrophoneArray(array.centred_m)
-        steering = centred.steering(frequencies_hz, *settings.directions_rad(), settings.speed_of_sound_m_s)
-        azimuths = settings.azimuths_rad()
-        single = steering.astype(np.complex64)
-        return MusicStage(single, azimuths, settings.music_sources, settings.window_hops)
+        azimuths, sources = settings.azimuths_rad(), settings.music_sources
+        return MusicStage(self._beams, azimuths, sources, n_microphones, settings.window_hops)
 
     def _monitor(
         self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings

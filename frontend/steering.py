@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .array import MicrophoneArray
 from .geometry import SPEED_OF_SOUND_M_S
+from .nodes import Nodes
 
 # Largest part of a steering vector, relative to its length, that the factors may miss: single precision's
 # own.
@@ -30,6 +31,9 @@ class Steering:
         Orthonormal columns; None where the factors would not be thinner than the weights.
     weights, conjugate : ndarray of complex64, shape (bins, r or M, directions)
         C and its conjugate.
+    nodes : NodeBeams, optional
+        The same beams at the few directions that say the power at all the others; None where there are no
+        such few.
 
     Examples
     --------
@@ -41,6 +45,7 @@ class Steering:
     basis: NDArray[np.complex64] | None
     weights: NDArray[np.complex64]
     conjugate: NDArray[np.complex64]
+    nodes: "NodeBeams | None" = None
 
     @classmethod
     def towards(
@@ -60,9 +65,8 @@ class Steering:
     @classmethod
     def _of(cls, basis: NDArray[np.complex128] | None, weights: NDArray[np.complex128]) -> "Steering":
         single = weights.astype(np.complex64)
-        return cls(
-            None if basis is None else np.ascontiguousarray(basis, np.complex64), single, single.conj()
-        )
+        thin = None if basis is None else np.ascontiguousarray(basis, np.complex64)
+        return cls(thin, single, single.conj(), NodeBeams.of(weights))
 
     @property
     def n_directions(self) -> int:
@@ -83,9 +87,54 @@ class Steering:
 
     def quadratic_form(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex128]:
         r"""Sum :math:`C_k(\theta)^T Q_k \overline{C_k(\theta)}` over bins, (bins, r, r) -> (directions,)."""
-        products = matrices @ self.conjugate
-        products *= self.weights
-        return np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
+        beams = self if self.nodes is None else self.nodes
+        products = matrices @ beams.conjugate
+        products *= beams.weights
+        total = np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
+        return total if self.nodes is None else total @ self.nodes.spread
+
+    def power_within(self, vectors: NDArray[np.complex64]) -> NDArray[np.float64]:
+        r"""Power :math:`\|E_k^H a_k(\theta)\|^2` within columns (bins, M, k), -> (bins, directions)."""
+        beams = self if self.nodes is None else self.nodes
+        rows = vectors.transpose(0, 2, 1)
+        inner = (rows if self.basis is None else rows @ self.basis) @ beams.weights
+        power = np.square(inner.real).sum(axis=1, dtype=np.float64) + np.square(inner.imag).sum(axis=1)
+        return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
+
+    def squared_lengths(self, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
+        r"""Length :math:`\|a_k(\theta)\|^2` over the microphones kept (M,), (bins, directions)."""
+        if self.basis is None:
+            kept = self.weights[:, keep]
+            return np.asarray(np.square(kept.real).sum(axis=1) + np.square(kept.imag).sum(axis=1), np.float64)
+        kept = self.basis[:, keep]
+        inner = (kept.conj().transpose(0, 2, 1) @ kept) @ self.weights
+        return np.asarray((self.conjugate * inner).real.sum(axis=1), np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NodeBeams:
+    """Beams at a few directions: see `worldstate.frontend.nodes`.
+
+    Parameters
+    ----------
+    weights, conjugate : ndarray of complex64, shape (bins, r or M, N)
+        C at the nodes, and its conjugate.
+    spread : ndarray of float64, shape (N, directions)
+        From power there to power everywhere.
+    """
+
+    weights: NDArray[np.complex64]
+    conjugate: NDArray[np.complex64]
+    spread: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, weights: NDArray[np.complex128]) -> "NodeBeams | None":
+        """Choose them for all directions (bins, r or M, directions)."""
+        nodes = Nodes.of(weights)
+        if nodes is None:
+            return None
+        chosen = np.ascontiguousarray(weights[:, :, nodes.index], np.complex64)
+        return cls(chosen, chosen.conj(), nodes.spread)
 
 
 def _thin_basis(weights: NDArray[np.complex128], max_rank: int) -> NDArray[np.complex128] | None:

@@ -1,12 +1,15 @@
-r"""Signal subspace of a covariance that changes little from hop to hop: warm-started block iteration.
+r"""Signal subspace of a covariance that changes little from hop to hop: a warm-started, filtered basis.
 
-The basis of the last hop is a good guess for this one, so that two block iterations and a Rayleigh-Ritz step
-replace a full eigendecomposition. Two things can go wrong, and both are looked for on every hop:
+The basis of the last hop is a good guess for this one. A Chebyshev polynomial of the covariance amplifies
+what lies above the noise and keeps the rest down, a Rayleigh-Ritz step sorts what comes out. The degree
+follows the eigenvalues of the last hop: one or two where a source stands out, up to eight in noise without
+any. Two things can go wrong, and both are looked for on every hop:
 
-- *The guess has lost the source.* A basis orthogonal to a new source stays so for ever under the iteration.
+- *The guess has lost the source.* A basis orthogonal to a new source stays so for ever under any polynomial.
   One probe is therefore added: the column of the covariance which the last basis explains worst.
-- *The iteration has not converged.* The relative residual :math:`\|R e - \lambda e\| / \lambda` says so, per
-  bin; those bins are decomposed in full.
+- *It has not converged.* The sine of the angle to the true subspace is at most
+  :math:`\|R e - \lambda e\| / (\lambda_k - \lambda_{k+1})` (Davis and Kahan). Bins in which that is too large
+  go round again, and are decomposed in full where even that does not help.
 """
 
 from typing import Any
@@ -22,6 +25,15 @@ from .spectra import ComplexArray
 
 FloatArray = NDArray[np.floating[Any]]
 
+ROUNDS = 2
+_MAX_DEGREE = 8
+# How much more than the noise the weakest signal eigenvector shall be amplified, and at most.
+_GAIN, _MOST_GAIN = 100.0, 3000.0
+# How much more the strongest may be amplified than the weakest: of seven digits some must remain.
+_SPREAD = 1e4
+# Eigenvalues, relative to the largest, that single precision does not tell from each other.
+_LEAST_GAP = 1e-4
+
 
 class SubspaceTracker:
     r"""Follows the k strongest eigenvectors of a running covariance.
@@ -31,11 +43,10 @@ class SubspaceTracker:
     sources : int
         Dimension k of the signal subspace.
     guard : int
-        Extra columns carried along; the convergence rate is (lambda_{k+guard+1} / lambda_k)^iterations.
-    iterations : int
-        Multiplications by the covariance per update.
+        Extra columns carried along: what counts as noise begins below them.
     tolerance : float
-        Largest relative residual of the signal eigenpairs before a bin is decomposed in full.
+        Largest angle, by its bound, between the subspace found and the true one before a bin is decomposed in
+        full.
 
     Raises
     ------
@@ -44,27 +55,25 @@ class SubspaceTracker:
 
     Notes
     -----
-    Source: G. H. Golub and C. F. Van Loan, *Matrix Computations*, section on orthogonal iteration with Ritz
-    acceleration.
+    Sources: Y. Zhou, Y. Saad, M. Tiago and J. Chelikowsky, "Self-consistent-field calculations using
+    Chebyshev-filtered subspace iteration", J. Comput. Phys. 219, 2006; C. Davis and W. Kahan, "The rotation
+    of eigenvectors by a perturbation III", 1970.
 
     Examples
     --------
     >>> tracker = SubspaceTracker(sources=1)
-    >>> R = np.diag([1.0, 2.0, 9.0, 1.0, 1.0, 1.0])[None].astype(complex)
+    >>> R = np.diag([1.0, 2.0, 9.0, 1.0, 1.0, 1.0, 1.0, 1.0])[None].astype(complex)
     >>> [float(tracker.update(R).eigenvalues[0, 0].round(6)) for _ in range(2)]
     [9.0, 9.0]
     >>> tracker.full_decompositions
     1
     """
 
-    def __init__(self, sources: int, *, guard: int = 2, iterations: int = 2, tolerance: float = 0.05) -> None:
-        if sources < 1 or guard < 0 or iterations < 1:
-            raise InvalidArgumentError(
-                f"expected sources >= 1, guard >= 0, iterations >= 1, got {sources}, {guard}, {iterations}"
-            )
+    def __init__(self, sources: int, *, guard: int = 4, tolerance: float = 0.05) -> None:
+        if sources < 1 or guard < 0:
+            raise InvalidArgumentError(f"expected sources >= 1, guard >= 0, got {sources}, {guard}")
         self._sources = sources
         self._guard = guard
-        self._iterations = iterations
         self._tolerance = in_range("tolerance", tolerance, 0.0, 1.0, open_low=True)
         self._basis: ComplexArray | None = None
         self._values: FloatArray | None = None
@@ -88,53 +97,96 @@ class SubspaceTracker:
         InvalidArgumentError
             On a wrong shape or non-finite values.
         """
-        R = checked_covariance(covariance, self._sources)
-        width = min(self._sources + self._guard, R.shape[1])
-        if self._basis is None or self._values is None or self._basis.shape != (*R.shape[:2], width):
-            return self._restart(R, width)
-        start = np.concatenate([self._basis, _probe(R, self._basis, self._values)], axis=2)
-        basis, values, residual = _iterate(R, start, self._iterations, self._sources)
-        basis, values = basis[..., -width:], values[..., -width:]
-        lost = ~(residual <= self._tolerance)
-        if lost.any():
-            basis[lost], values[lost] = self._decompose(R[lost], width)
-        return self._remember(basis, values)
+        return self.follow(checked_covariance(covariance, self._sources))
 
-    def _restart(self, R: ComplexArray, width: int) -> Subspace:
-        return self._remember(*self._decompose(R, width))
+    def follow(self, R: ComplexArray) -> Subspace:
+        """Do what `update` does, unchecked."""
+        width = min(self._sources + self._guard, R.shape[1] - 1)
+        if self._basis is None or self._values is None or self._basis.shape != (len(R), width, R.shape[1]):
+            self._basis, self._values = self._decomposed(R, width)
+        else:
+            self._basis, self._values = self._refreshed(R, self._basis, self._values)
+        vectors = self._basis[:, -self._sources :].conj().transpose(0, 2, 1)
+        return Subspace(vectors, self._values[:, -self._sources :])
 
-    def _decompose(self, R: ComplexArray, width: int) -> tuple[ComplexArray, FloatArray]:
+    def _refreshed(
+        self, R: ComplexArray, basis: ComplexArray, values: FloatArray
+    ) -> tuple[ComplexArray, FloatArray]:
+        """Bring all bins up to date, then those again that need more."""
+        basis, values, angle = _improved(R, basis, values, self._sources)
+        for _ in range(ROUNDS - 1):
+            late = np.flatnonzero(~(angle <= self._tolerance))
+            if not len(late):
+                return basis, values
+            better = _improved(R[late], basis[late], values[late], self._sources)
+            basis[late], values[late], angle[late] = better
+        late = np.flatnonzero(~(angle <= self._tolerance))
+        if len(late):
+            basis[late], values[late] = self._decomposed(R[late], basis.shape[1])
+        return basis, values
+
+    def _decomposed(self, R: ComplexArray, width: int) -> tuple[ComplexArray, FloatArray]:
         self.full_decompositions += len(R)
         values, vectors = np.linalg.eigh(R)
-        return vectors[..., -width:], values[..., -width:]
-
-    def _remember(self, basis: ComplexArray, values: FloatArray) -> Subspace:
-        self._basis, self._values = basis, values
-        return Subspace(basis[..., -self._sources :], values[..., -self._sources :])
+        return vectors[..., -width:].conj().transpose(0, 2, 1), values[..., -width:]
 
 
-def _probe(R: ComplexArray, V: ComplexArray, values: FloatArray) -> ComplexArray:
-    """Return the column of each covariance that the basis explains worst, shape (bins, M, 1)."""
-    power = np.einsum("bmm->bm", R).real
-    explained = ((V.real**2 + V.imag**2) * values[:, None, :]).sum(axis=2)
-    worst = np.argmax(power - explained, axis=1)
-    column = R[np.arange(len(R)), :, worst][..., None]
-    return column - V @ (V.conj().transpose(0, 2, 1) @ column)
-
-
-def _iterate(
-    R: ComplexArray, V: ComplexArray, iterations: int, sources: int
+def _improved(
+    R: ComplexArray, basis: ComplexArray, values: FloatArray, sources: int
 ) -> tuple[ComplexArray, FloatArray, FloatArray]:
-    """Block power steps, then Rayleigh-Ritz: basis, ascending Ritz values, worst relative residual."""
-    for _ in range(iterations):
-        V = R @ V
-        V = V / np.maximum(np.linalg.norm(V, axis=1, keepdims=True), np.finfo(V.real.dtype).tiny)
-    Q = np.linalg.qr(V)[0]
-    RQ = R @ Q
-    values, rotation = np.linalg.eigh(Q.conj().transpose(0, 2, 1) @ RQ)
-    basis, image = Q @ rotation, RQ @ rotation[..., -sources:]
-    miss = np.linalg.norm(image - basis[..., -sources:] * values[:, None, -sources:], axis=1)
-    # Two equally strong sources share a subspace: the strongest value is the scale that matters there.
-    scale = np.maximum(values[:, -sources:], np.finfo(values.dtype).tiny)
-    worst: FloatArray = (miss / scale).max(axis=1)
-    return basis, values, worst
+    """One round: vectors as rows v^H (so that R works from the right), ascending values, angle missed."""
+    guess = np.concatenate([_probe(R, basis, values), basis], axis=1)
+    rows, found, angle = _ritz(R, _filtered(R, guess, values, sources), sources)
+    return rows[:, 1:], found[:, 1:], angle
+
+
+def _probe(R: ComplexArray, rows: ComplexArray, values: FloatArray) -> ComplexArray:
+    """Return the row of each covariance that the basis explains worst, shape (bins, 1, M)."""
+    power = np.einsum("bmm->bm", R).real
+    explained = (values[:, None, :] @ (np.square(rows.real) + np.square(rows.imag)))[:, 0]
+    bins, worst = np.arange(len(R)), np.argmax(power - explained, axis=1)
+    scale = np.maximum(power[bins, worst], np.finfo(power.dtype).tiny)
+    return np.asarray((R[bins, worst] / scale[:, None])[:, None])
+
+
+def _filtered(R: ComplexArray, rows: ComplexArray, values: FloatArray, sources: int) -> ComplexArray:
+    r"""Apply :math:`T_m(2 R / c - 1)` to vectors given as rows; c is where the noise begins."""
+    strongest, weakest = values[:, -1], values[:, -sources]
+    noise = np.maximum(values[:, 0], 1e-3 * weakest) + np.finfo(values.dtype).tiny
+    degree = _degree(strongest, weakest, noise)
+    # No more gain than is needed: the noise may as well begin higher.
+    edge = 2.0 * weakest / (1.0 + np.cosh(np.arccosh(_MOST_GAIN) / degree))
+    scale = (2.0 / np.maximum(noise, edge)).astype(values.dtype)[:, None, None]
+    before, now = rows, (rows * scale) @ R - rows
+    scale *= 2.0
+    for _ in range(degree - 1):
+        after = (now * scale) @ R
+        after -= before
+        after -= now
+        after -= now
+        before, now = now, after
+    return np.asarray(now)
+
+
+def _degree(strongest: FloatArray, weakest: FloatArray, noise: FloatArray) -> int:
+    """Lowest degree that reaches the gain in every bin, as far as precision allows."""
+    contrast = np.maximum(2.0 * weakest / noise - 1.0, 1.0 + 1e-3)
+    needed = int(np.ceil((np.arccosh(_GAIN) / np.arccosh(contrast)).max()))
+    spread = float((strongest / np.maximum(weakest, noise)).max())
+    allowed = int(np.log(_SPREAD) / np.log(spread)) if spread > 1.0 else _MAX_DEGREE
+    return max(min(needed, allowed, _MAX_DEGREE), 1)
+
+
+def _ritz(R: ComplexArray, rows: ComplexArray, sources: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    """Rayleigh-Ritz: orthonormal rows, ascending values, and a bound of the sine of the angle missed."""
+    Q = np.ascontiguousarray(np.linalg.qr(rows.transpose(0, 2, 1))[0].transpose(0, 2, 1))
+    QR = Q @ R
+    values, rotation = np.linalg.eigh(QR @ Q.conj().transpose(0, 2, 1))
+    turn = rotation.conj().transpose(0, 2, 1)
+    basis, image = turn @ Q, turn[:, -sources:] @ QR
+    image -= basis[:, -sources:] * values[:, -sources:, None]
+    miss = np.sqrt((np.square(image.real) + np.square(image.imag)).sum(axis=2).max(axis=1))
+    gap = values[:, -sources] - values[:, -sources - 1]
+    # What single precision cannot tell apart, no decomposition would.
+    least = np.maximum(_LEAST_GAP * values[:, -1], np.finfo(values.dtype).tiny)
+    return basis, values, miss / np.maximum(gap, least)

@@ -132,6 +132,7 @@ def climb(
     omega: float,
     bounds: tuple[float, float] = (-np.inf, np.inf),
     tolerance: float = 1e-7,
+    steps: int = STEPS,
 ) -> tuple[float, complex]:
     """Fit one tone by Gauss-Newton from a coarse peak, unchecked; steps are held within the main lobe.
 
@@ -146,6 +147,8 @@ def climb(
     tolerance : float
         A step below this share of the resolution is the last; where the fit is good, the next would be its
         square.
+    steps : int
+        At most so many.
 
     Returns
     -------
@@ -160,7 +163,7 @@ def climb(
     """
     n: NDArray[np.float64] = np.arange(len(y), dtype=np.float64) - 0.5 * (len(y) - 1)
     reach = np.pi / len(y)
-    for _ in range(STEPS):
+    for _ in range(steps):
         step, fit = _step(y, omega, n)
         target = min(max(omega + min(max(step, -reach), reach), bounds[0]), bounds[1])
         moved, omega = abs(target - omega), target

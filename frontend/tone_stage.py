@@ -35,7 +35,8 @@ _RING = (5, 40)
 # Peak over floor, A^2 N / 4 sigma^2; 15.6 dB for eta N. White noise exceeds it in one window of a thousand.
 _EVIDENT = 18.0
 # Share of a resolution that the climb may be wrong by: a tone whose eta N is 80 dB is known to as much.
-_TOLERANCE = 1e-4
+# From a parabola's vertex two steps do; where nothing converges, nothing stands out.
+_TOLERANCE, _STEPS = 1e-4, 3
 # Lowest frequency, periods in the window: below, a tone cannot be told from an offset.
 _FEWEST_PERIODS = 4.0
 
@@ -142,7 +143,7 @@ class ToneStage:
         sound = self._heard - self._spectrum.offset(self._heard)
         power = self._spectrum.power(sound)
         begin, band = self._spectrum.peak(power), self._spectrum.omega_range
-        omega, amplitude = climb(sound, begin, band, tolerance=_TOLERANCE)
+        omega, amplitude = climb(sound, begin, band, _TOLERANCE, _STEPS)
         snr = 0.5 * abs(amplitude) ** 2 / self._spectrum.floor_near(power, omega)
         if not 0.5 * snr * len(sound) > _EVIDENT:
             return NotUsable("no tone stands out of the noise")

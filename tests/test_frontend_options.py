@@ -6,6 +6,7 @@ import pytest
 from worldstate.errors import InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.ego_noise import EgoNoiseSettings
 from worldstate.frontend.music import covariance, covariance_subspace, music_spectrum
 from worldstate.frontend.music_stage import MusicReading
 from worldstate.frontend.settings import FrontEndSettings
@@ -152,3 +153,47 @@ def test_the_frame_tells_the_twin_and_the_grid_shows_it() -> None:
     assert solid.ambiguity == "none"
     assert isinstance(solid.twin_bearing_rad, NotUsable)
     assert np.degrees(solid.bearing_rad) == pytest.approx(30.0, abs=1.0)
+
+
+EGO = FrontEndSettings(music_sources=1, ego_noise=EgoNoiseSettings(guard_hops=0))
+
+
+def test_prewhitened_music_hears_past_the_own_noise() -> None:
+    """A directed own noise, learned while alone, no longer owns the MUSIC peak when a weaker source joins."""
+    own, source = waves(ARRAY, [(-40.0, 0.0)], 6.0, 1), waves(ARRAY, [(25.0, 0.0)], 2.0, 2)
+    sound = 2.0 * own
+    sound[-len(source) :] += source
+    learning, plain = FrontEnd(ARRAY, RATE, EGO), FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1))
+    learning.learn_ego_noise(1.0)
+    learning.process(sound[: -len(source)])
+    learning.learn_ego_noise(0.0)
+    heard = learning.process(sound[-len(source) :])[-1].music
+    deaf = plain.process(sound)[-1].music
+    assert isinstance(heard, MusicReading)
+    assert isinstance(deaf, MusicReading)
+    assert np.degrees(deaf.azimuth_rad) == pytest.approx(-40.0, abs=1.0)
+    assert np.degrees(heard.azimuth_rad) == pytest.approx(25.0, abs=1.0)
+
+
+def test_music_is_what_it_was_until_ego_noise_is_learned() -> None:
+    sound = waves(ARRAY, [(25.0, 0.0)])
+    shut = FrontEnd(ARRAY, RATE, EGO).process(sound)
+    plain = FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1)).process(sound)
+    for ours, theirs in zip(shut, plain, strict=True):
+        assert isinstance(ours.music, MusicReading)
+        assert isinstance(theirs.music, MusicReading)
+        np.testing.assert_array_equal(ours.music.spectrum, theirs.music.spectrum)
+
+
+@pytest.mark.parametrize("dead", [(), (3, 7, 11)])
+def test_prewhitened_music_does_no_harm_in_white_noise(dead: tuple[int, ...]) -> None:
+    noise = np.random.default_rng(3).standard_normal((4 * RATE, 19)).astype(np.float32)
+    sound = np.concatenate([noise, waves(ARRAY, [(25.0, 0.0)])])
+    sound[:, list(dead)] = 0.0
+    front_end = FrontEnd(ARRAY, RATE, EGO)
+    front_end.learn_ego_noise(1.0)
+    front_end.process(sound[: len(noise)])
+    front_end.learn_ego_noise(0.0)
+    frame = front_end.process(sound[len(noise) :])[-1]
+    assert isinstance(frame.music, MusicReading)
+    assert np.degrees(frame.music.azimuth_rad) == pytest.approx(25.0, abs=1.0)
