@@ -94,7 +94,23 @@ class MicrophoneArray:
         return float(nearest_spacings_m(self.positions_m).mean())
 
     def alias_hz(self, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S) -> float:
-        """Frequency c / (2 d) up to which the mean spacing d samples every direction without aliasing, Hz."""
+        """Frequency c / (2 d) up to which the mean spacing d samples every direction without aliasing, Hz.
+
+        Parameters
+        ----------
+        speed_of_sound_m_s : float
+            c.
+
+        Returns
+        -------
+        float
+            Hz.
+
+        Examples
+        --------
+        >>> MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]).alias_hz()
+        857.5
+        """
         return speed_of_sound_m_s / (2.0 * self.mean_spacing_m)
 
     @property
@@ -108,7 +124,25 @@ class MicrophoneArray:
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> NDArray[np.float64]:
-        """Far-field arrival time at every microphone relative to the origin, seconds, shape (..., M)."""
+        """Far-field arrival time at every microphone relative to the origin, seconds, shape (..., M).
+
+        Parameters
+        ----------
+        azimuths_rad, elevations_rad : array_like, broadcast together
+            Azimuth, left positive, and elevation, up positive.
+        speed_of_sound_m_s : float
+            c.
+
+        Returns
+        -------
+        ndarray, shape (..., M)
+            Seconds; negative at microphones nearer to the source than the origin.
+
+        Examples
+        --------
+        >>> (1e6 * MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]).delays_s(np.pi / 6)).round(1)
+        array([-145.8,  145.8])
+        """
         directions = direction_vectors(azimuths_rad, elevations_rad)
         return np.asarray(-(directions @ self.positions_m.T) / speed_of_sound_m_s)
 
@@ -120,6 +154,20 @@ class MicrophoneArray:
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> NDArray[np.complex128]:
         r"""Steering vectors :math:`a_m = e^{-j 2 \pi f \tau_m}`, shape (frequencies, M, directions).
+
+        Parameters
+        ----------
+        frequencies_hz : array_like, shape (F,)
+            Hz.
+        azimuths_rad, elevations_rad : array_like, broadcast to shape (D,)
+            Azimuth, left positive, and elevation, up positive.
+        speed_of_sound_m_s : float
+            c.
+
+        Returns
+        -------
+        ndarray of complex128, shape (F, M, D)
+            Of modulus one.
 
         Examples
         --------
@@ -136,6 +184,11 @@ def roof_array_56() -> MicrophoneArray:
 
     It has the dimensions of the array in the paper (section IV): aperture 0.78 m x 0.65 m, S_xx = 3.03 m^2,
     mean nearest spacing 8.8 cm, hence alias-free to about 1.9 kHz. The places themselves are ours.
+
+    Returns
+    -------
+    MicrophoneArray
+        The same each time.
 
     Examples
     --------

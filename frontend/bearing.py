@@ -59,6 +59,11 @@ def bearing_std_rad(
     broadside_std_rad, span_rad : float
         sigma_0 and Delta.
 
+    Returns
+    -------
+    float
+        Radians, at most the span over sqrt(12).
+
     Examples
     --------
     >>> cases = ((0, 3.0), (60, 3.0), (0, 1.05))
@@ -86,6 +91,11 @@ def strongest_bearing(
     broadside_std_rad : float
         sigma_0 of `bearing_std_rad`.
 
+    Returns
+    -------
+    AcousticBearing
+        Interpolated between the points of the grid.
+
     Examples
     --------
     >>> grid = np.radians(np.arange(-90.0, 91.0))
@@ -101,6 +111,20 @@ def bearing_of(
     peaks: Sequence[Peak], azimuths_rad: NDArray[np.float64], broadside_std_rad: float
 ) -> AcousticBearing:
     """Take the first of the peaks that were found on a grid, highest first, for a bearing.
+
+    Parameters
+    ----------
+    peaks : sequence of Peak
+        Highest first; none in silence.
+    azimuths_rad : ndarray, shape (A,)
+        The grid, ascending.
+    broadside_std_rad : float
+        sigma_0 of `bearing_std_rad`.
+
+    Returns
+    -------
+    AcousticBearing
+        In silence the middle of the grid, with its span's uncertainty.
 
     Examples
     --------

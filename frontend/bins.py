@@ -17,6 +17,11 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
     nfft : int
         Frame length, samples.
 
+    Returns
+    -------
+    range
+        Indices into the one-sided spectrum.
+
     Raises
     ------
     InvalidArgumentError
@@ -41,6 +46,20 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
 
 def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
     """Centre frequencies of the bins, Hz, shape (bins,).
+
+    Parameters
+    ----------
+    bins : range
+        Indices into the one-sided spectrum.
+    sample_rate_hz : float
+        Samples per second.
+    nfft : int
+        Frame length, samples.
+
+    Returns
+    -------
+    ndarray, shape (bins,)
+        Hz.
 
     Examples
     --------

@@ -14,7 +14,13 @@ from .sample_clock import RateEstimate
 
 
 class Fault(StrEnum):
-    """Kinds of faults of one channel."""
+    """Kinds of faults of one channel.
+
+    Examples
+    --------
+    >>> Fault("dead").name, len(Fault)
+    ('DEAD', 8)
+    """
 
     DEAD = "dead"
     """Constant, or 30 dB below the median channel."""
@@ -104,7 +110,20 @@ class ArrayHealth:
 
     @classmethod
     def unknown(cls, n_channels: int, reason: str = "nothing heard yet") -> "ArrayHealth":
-        """Nothing is known against any microphone."""
+        """Nothing is known against any microphone.
+
+        Parameters
+        ----------
+        n_channels : int
+            M.
+        reason : str
+            Why there is no estimate of the sample rate.
+
+        Returns
+        -------
+        ArrayHealth
+            All channels kept.
+        """
         nothing = NotUsable(reason)
         return cls(ChannelMask.all_of(n_channels), (), (), 0, nothing, nothing)
 
@@ -117,6 +136,16 @@ class ArrayHealth:
     def with_fault(self, *kinds: Fault) -> NDArray[np.intp]:
         """Channels that have one of these faults, ascending.
 
+        Parameters
+        ----------
+        *kinds : Fault
+            Any of these.
+
+        Returns
+        -------
+        ndarray of int
+            Channel indices from 0.
+
         Examples
         --------
         >>> ArrayHealth.unknown(2).with_fault(Fault.DEAD)
@@ -127,6 +156,20 @@ class ArrayHealth:
 
 def faults_where(fault: Fault, found: NDArray[np.bool_], values: NDArray[np.float64]) -> list[ChannelFault]:
     """List one fault of several channels, (M,) each.
+
+    Parameters
+    ----------
+    fault : Fault
+        What was found.
+    found : ndarray of bool, shape (M,)
+        In which channels.
+    values : ndarray, shape (M,)
+        The number that shows it, of every channel.
+
+    Returns
+    -------
+    list of ChannelFault
+        One a channel that was found, ascending.
 
     Examples
     --------

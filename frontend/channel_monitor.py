@@ -88,6 +88,11 @@ class ChannelMonitor:
             Mean square of each channel in some band within the frames of the hop.
         matrices : ndarray of complex64, shape (K, M, M)
             Sums of Z_i conj(Z_j) over these frames, Z being whitened spectra.
+
+        Returns
+        -------
+        ArrayHealth
+            As of the end of this hop.
         """
         lowest, highest = _extremes(samples)
         span = highest - lowest

@@ -94,6 +94,11 @@ def spectrum_and_floor(
     settings : HarmonicSettings
         Band and width of the running median.
 
+    Returns
+    -------
+    powers, floor : ndarray, shape (K, bins)
+        Squared magnitudes, in the units of the windows squared.
+
     Examples
     --------
     >>> noise = np.random.default_rng(0).normal(size=(2, 1000)) * np.hanning(1000)
@@ -124,6 +129,11 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
         Spacing of the bins.
     settings : HarmonicSettings
         Range, teeth and rate of change.
+
+    Returns
+    -------
+    ndarray, shape (K,)
+        Hz.
 
     Examples
     --------

@@ -62,7 +62,18 @@ class Decimator:
         self._waiting: NDArray[np.float64] = np.empty(0)
 
     def push(self, samples: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Take the next samples (n,), give the outputs that they complete."""
+        """Take the next samples (n,), give the outputs that they complete.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n,)
+            Any number of them.
+
+        Returns
+        -------
+        ndarray of float64
+            At the lower rate; empty where none is complete.
+        """
         waiting = np.concatenate([self._waiting, samples])
         n_out = max((len(waiting) - self.n_taps) // self.factor + 1, 0)
         self._waiting = waiting[n_out * self.factor :]

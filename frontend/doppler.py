@@ -114,6 +114,12 @@ class RadialSpeed:
         v and d of the straight pass-by, and when its closest point is heard (receiver's clock).
     misfit : float
         Reduced chi-squared of the S-curve.
+
+    Examples
+    --------
+    >>> at_rest = RadialSpeed(*np.zeros((3, 1)), 100.0, 12.0, 5.0, 2.0, misfit=1.1)
+    >>> at_rest.rest_frequency_hz, at_rest.speed_m_s
+    (100.0, 12.0)
     """
 
     time_s: FloatArray

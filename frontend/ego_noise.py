@@ -111,7 +111,17 @@ class NoiseCovariance:
         self._forgetting = forgetting_frames
 
     def learn(self, total: NDArray[np.complex64], n_frames: int, weight: float) -> None:
-        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed."""
+        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
+
+        Parameters
+        ----------
+        total : ndarray of complex64, shape (bins, M, M)
+            Sum of cross-spectra; consumed.
+        n_frames : int
+            How many frames it sums.
+        weight : float
+            In (0, 1].
+        """
         kept = math.exp(-weight * n_frames / self._forgetting)
         total *= np.float32(weight)
         self._sum *= np.float32(kept)
@@ -119,7 +129,18 @@ class NoiseCovariance:
         self.n_frames = kept * self.n_frames + weight * n_frames
 
     def mean(self, bin_index: int) -> NDArray[np.complex64]:
-        """Covariance of one bin; the mean of its diagonal is one."""
+        """Covariance of one bin; the mean of its diagonal is one.
+
+        Parameters
+        ----------
+        bin_index : int
+            From 0.
+
+        Returns
+        -------
+        ndarray of complex64, shape (M, M)
+            Hermitian.
+        """
         return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
 
 
@@ -151,7 +172,15 @@ class WhitenedBeams:
         self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
 
     def update(self, bin_index: int, root: NDArray[np.complex64]) -> None:
-        """Use another inverse root (M, M) in one bin."""
+        """Use another inverse root (M, M) in one bin.
+
+        Parameters
+        ----------
+        bin_index : int
+            From 0.
+        root : ndarray of complex64, shape (M, M)
+            Inverse root of the noise covariance.
+        """
         plain, ours = self._plain, self.steering
         weights = plain.weights[bin_index]
         if plain.basis is None or ours.basis is None:
@@ -231,6 +260,11 @@ class EgoNoise:
 
     def process(self, spectra: NDArray[np.complex64]) -> list[tuple[NDArray[np.complex64], Steering]]:
         """Cancel, learn and whiten the frames of a hop (frames, bins, M), phase transform included.
+
+        Parameters
+        ----------
+        spectra : ndarray of complex64, shape (frames, bins, M)
+            One hop.
 
         Returns
         -------

@@ -53,6 +53,24 @@ def feature_steering(
 ) -> Steering:
     """Beams at the thirty published azimuths.
 
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Microphones.
+    bins : range
+        Of the one-sided spectrum: see `band_bins`.
+    sample_rate_hz : float
+        Samples per second.
+    nfft : int
+        Frame length, samples.
+    speed_of_sound_m_s : float
+        c.
+
+    Returns
+    -------
+    Steering
+        Thirty directions, from left to right.
+
     Examples
     --------
     >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).n_directions
@@ -74,12 +92,39 @@ def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.
     Returns
     -------
     ndarray of complex128, shape (directions,)
+
+    Examples
+    --------
+    >>> from worldstate.frontend.steering import Steering
+    >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0])
+    >>> pair_sum(np.array([[[1.0, 1j]]], np.complex64), steering).round(3)
+    array([0.-1.j])
     """
     return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
 
 
 def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
-    """Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already."""
+    """Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already.
+
+    Parameters
+    ----------
+    matrices : ndarray of complex64, shape (bins, M, M)
+        Sums of x_i conj(x_j) over frames, whitened.
+    steering : Steering
+        For the same bins.
+
+    Returns
+    -------
+    ndarray of complex128, shape (directions,)
+        As `pair_sum`.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.steering import Steering
+    >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0])
+    >>> pair_sum_of(np.ones((1, 2, 2), np.complex64), steering).round(3)
+    array([1.+0.j])
+    """
     pairs = matrices * _pairs_mask(matrices.shape[2])
     return steering.quadratic_form(steering.compress(pairs))
 
@@ -88,6 +133,18 @@ def segment_feature(
     sums: Sequence[NDArray[np.complex128]], n_frames: int, n_bins: int, n_microphones: int
 ) -> NDArray[np.float64]:
     """Modulus of summed pair sums, per frame, bin and pair.
+
+    Parameters
+    ----------
+    sums : sequence of ndarray of complex128, shape (directions,)
+        Pair sums that make up the segment.
+    n_frames, n_bins, n_microphones : int
+        What they were summed over, all sums together.
+
+    Returns
+    -------
+    ndarray of float64, shape (directions,)
+        0..1.
 
     Examples
     --------

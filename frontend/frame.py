@@ -62,6 +62,16 @@ class AcousticFrame:
         What is wrong with the microphones, and which were left out; not usable in frames made by hand.
     tone : ToneReading or NotUsable
         Engine line over the last `tone_hops` hops; not usable when it is off, or none stands out.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.stream import FrontEnd
+    >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
+    >>> sound = np.random.default_rng(0).standard_normal((8000, 3))
+    >>> frame = FrontEnd(array, 8000).process(sound)[0]
+    >>> frame.stamp_ns, frame.srp.shape, frame.feature.shape
+    (1000000000, (181,), (60,))
     """
 
     stamp_ns: int

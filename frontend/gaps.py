@@ -82,6 +82,13 @@ class GapFinder:
     def push(self, samples: NDArray[np.float32], alive: NDArray[np.bool_]) -> list[Gap]:
         """Take the samples (n, M) of a hop and the channels that are not constant in it.
 
+        Parameters
+        ----------
+        samples : ndarray of float32, shape (n, M)
+            One hop.
+        alive : ndarray of bool, shape (M,)
+            Channels that are not constant in it.
+
         Returns
         -------
         list of Gap
@@ -111,7 +118,15 @@ class GapFinder:
 
 
 class StillRuns:
-    """Runs of samples in which nothing changes, across hops; one that opens the stream is no gap."""
+    """Runs of samples in which nothing changes, across hops; one that opens the stream is no gap.
+
+    Examples
+    --------
+    >>> runs, still = StillRuns(), np.zeros(300, bool)
+    >>> still[100:150] = True
+    >>> runs.push(still, end=300)
+    [Gap(kind='still', sample=99, n_samples=51)]
+    """
 
     def __init__(self) -> None:
         self._length = 0
@@ -119,7 +134,20 @@ class StillRuns:
         self._n_still, self._n_moving = 0, 0
 
     def push(self, still: NDArray[np.bool_], end: int) -> list[Gap]:
-        """Take one flag per sample, the last being sample `end` - 1; give the runs that end here."""
+        """Take one flag per sample, the last being sample `end` - 1; give the runs that end here.
+
+        Parameters
+        ----------
+        still : ndarray of bool, shape (n,)
+            Whether no channel changes at a sample.
+        end : int
+            Number of samples so far.
+
+        Returns
+        -------
+        list of Gap
+            In order of time.
+        """
         if not (still.any() or self._length):
             self._heard = True
             self._n_moving += len(still)
@@ -138,7 +166,6 @@ class StillRuns:
         self._heard = True
         self._length = int(len(still) - 1 - moving[-1])
         return gaps
-
 
     def _shortest(self, lengths: NDArray[np.intp]) -> float:
         """Length that single samples which do not change, as often as they come, hardly make."""
@@ -159,6 +186,18 @@ def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool
         Of the stream.
     still : ndarray of bool, shape (n,)
         Where no channel changes; the edges of such runs are no splices.
+
+    Returns
+    -------
+    list of Gap
+        In order of time.
+
+    Examples
+    --------
+    >>> sound = np.cumsum(np.random.default_rng(0).standard_normal((8, 4000)), axis=1).cumsum(axis=1)
+    >>> change = np.diff(np.delete(sound, np.s_[2000:2100], axis=1)).astype(np.float32)
+    >>> find_splices(change, 1, np.zeros(3899, bool))
+    [Gap(kind='splice', sample=2000, n_samples=None)]
     """
     error = _prediction_error(change)
     np.square(error, out=error)
@@ -190,6 +229,13 @@ class RepeatFinder:
     Sound never repeats to the last bit on eight channels. Only samples whose hash has five zeros in one place
     are kept, so that the same samples are kept when they come again. Memory does not grow: two generations of
     a second each.
+
+    Examples
+    --------
+    >>> sound = np.random.default_rng(0).standard_normal((8, 9600)).astype(np.float32)
+    >>> finder = RepeatFinder()
+    >>> finder.push(sound, end=9600), finder.push(sound[:, -4800:], end=14_400)[0].kind
+    ([], 'repeat')
     """
 
     def __init__(self) -> None:
@@ -202,7 +248,20 @@ class RepeatFinder:
         self._end = 0
 
     def push(self, sound: NDArray[np.float32], end: int) -> list[Gap]:
-        """Take a hop of a few channels (channels, n); `end` is the number of samples so far."""
+        """Take a hop of a few channels (channels, n); `end` is the number of samples so far.
+
+        Parameters
+        ----------
+        sound : ndarray of float32, shape (channels, n)
+            One hop of a few channels.
+        end : int
+            Number of samples so far.
+
+        Returns
+        -------
+        list of Gap
+            At most one.
+        """
         if len(sound) < 2:
             return []
         if self._hops % _GENERATION_HOPS == 0:

@@ -46,6 +46,11 @@ class PairDelays:
         Arrival at i minus arrival at j, seconds.
     peak : (P,) float
         Height of the peak over its largest possible value, <= 1: near one for a single coherent source.
+
+    Examples
+    --------
+    >>> PairDelays(all_pairs(2), np.array([1e-4]), np.array([0.9])).pairs.tolist()
+    [[0, 1]]
     """
 
     pairs: NDArray[np.intp]
@@ -55,6 +60,16 @@ class PairDelays:
 
 def all_pairs(microphones: int) -> NDArray[np.intp]:
     """Return every pair i < j, shape (M (M - 1) / 2, 2).
+
+    Parameters
+    ----------
+    microphones : int
+        M >= 2.
+
+    Returns
+    -------
+    ndarray of int, shape (M (M - 1) / 2, 2)
+        In the order of `numpy.triu_indices`.
 
     Raises
     ------

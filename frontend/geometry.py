@@ -75,6 +75,11 @@ def ambiguity(positions_m: NDArray[np.float64]) -> Ambiguity:
     ----------
     positions_m : ndarray, shape (M, 3)
 
+    Returns
+    -------
+    str
+        ``cone``, ``front-back``, ``up-down``, ``mirror`` or ``none``.
+
     Examples
     --------
     >>> ambiguity(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]))

@@ -54,6 +54,12 @@ class EngineState:
         Phase, its derivative over 2 pi, and the derivative of that.
     hops : int
         Number of hops since it was told.
+
+    Examples
+    --------
+    >>> state = EngineState(phase_rad=0.0, frequency_hz=30.0)
+    >>> state.phases(np.array([0.1])).round(2), state.within(10.0, 25.0).frequency_hz
+    (array([18.85]), 25.0)
     """
 
     phase_rad: float
@@ -62,16 +68,51 @@ class EngineState:
     hops: int = 0
 
     def phases(self, time_s: FloatArray) -> FloatArray:
-        """Continue the phase to later times, radians."""
+        """Continue the phase to later times, radians.
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (n,)
+            Seconds after the instant of this state.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Radians.
+        """
         cycles = self.frequency_hz * time_s + 0.5 * self.rate_hz_per_s * time_s**2
         return np.asarray(self.phase_rad + 2.0 * np.pi * cycles)
 
     def frequencies(self, time_s: FloatArray) -> FloatArray:
-        """Continue the frequency to later times, Hz."""
+        """Continue the frequency to later times, Hz.
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (n,)
+            Seconds after the instant of this state.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Hz.
+        """
         return np.asarray(self.frequency_hz + self.rate_hz_per_s * time_s)
 
     def after(self, time_s: float, phase_error_rad: float) -> "EngineState":
-        """Move on by a hop of this length, in whose middle the phase was found ahead by so much."""
+        """Move on by a hop of this length, in whose middle the phase was found ahead by so much.
+
+        Parameters
+        ----------
+        time_s : float
+            Length of the hop, seconds.
+        phase_error_rad : float
+            Measured less predicted phase, radians.
+
+        Returns
+        -------
+        EngineState
+            At the end of the hop.
+        """
         frequency_error = phase_error_rad / (2.0 * np.pi * time_s)
         gain = max(_FREQUENCY_GAIN, 1.0 / max(self.hops, 1))
         rate_gain = _RATE_GAIN if self.hops >= _SETTLING_HOPS else 0.0
@@ -84,7 +125,18 @@ class EngineState:
         )
 
     def within(self, low_hz: float, high_hz: float) -> "EngineState":
-        """Keep the frequency between two limits; one that has to be moved keeps no rate."""
+        """Keep the frequency between two limits; one that has to be moved keeps no rate.
+
+        Parameters
+        ----------
+        low_hz, high_hz : float
+            Limits of the fundamental, Hz.
+
+        Returns
+        -------
+        EngineState
+            The same where it is inside.
+        """
         if low_hz <= self.frequency_hz <= high_hz:
             return self
         return replace(self, frequency_hz=min(max(self.frequency_hz, low_hz), high_hz), rate_hz_per_s=0.0)
@@ -174,6 +226,16 @@ class HarmonicCanceller:
 
     def cancel(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
+
+        Parameters
+        ----------
+        spectra : ndarray of complex64, shape (frames, bins, M)
+            One hop.
+
+        Returns
+        -------
+        ndarray of complex64, same shape
+            A copy.
 
         Raises
         ------

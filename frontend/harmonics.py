@@ -48,6 +48,12 @@ class HarmonicTrack:
         Power of all teeth, 10 log10, relative to samples of unit mean square.
     windows : int
         Number of windows looked at; K of them could be used.
+
+    Examples
+    --------
+    >>> one = np.ones(1)
+    >>> HarmonicTrack(one, 60.0 * one, 0.01 * one, one.astype(int), 0.0 * one, 0.0 * one, windows=3).windows
+    3
     """
 
     time_s: FloatArray

@@ -11,6 +11,18 @@ from numpy.typing import NDArray
 def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
     """Sample at which hop `index` (from 1) ends: floor(index * rate / hops a second + 1/2).
 
+    Parameters
+    ----------
+    index : int
+        From 1; 0 is the start of the stream.
+    sample_rate_hz, hop_rate_hz : float
+        Samples and hops per second.
+
+    Returns
+    -------
+    int
+        Number of samples up to there.
+
     Examples
     --------
     >>> [hop_end(k, 47_998, 10) for k in (0, 1, 2, 10)]
@@ -31,6 +43,11 @@ class Hop:
         Number of samples from the start of the stream to the end of this hop.
     samples : ndarray of float32, shape (n, M)
         Valid until the next hop is asked for.
+
+    Examples
+    --------
+    >>> Hop(index=1, end=4800, samples=np.zeros((4800, 2), np.float32)).end
+    4800
     """
 
     index: int
@@ -64,7 +81,18 @@ class HopCutter:
         self._buffer = np.empty((math.ceil(sample_rate_hz / hop_rate_hz) + 1, n_channels), np.float32)
 
     def cut(self, block: NDArray[np.float32]) -> Iterator[Hop]:
-        """Take a block (n, M), give the hops that it completes; read the iterator to its end."""
+        """Take a block (n, M), give the hops that it completes; read the iterator to its end.
+
+        Parameters
+        ----------
+        block : ndarray of float32, shape (n, M)
+            Any n.
+
+        Returns
+        -------
+        iterator of Hop
+            In order.
+        """
         while len(block):
             taken = min(len(block), self._length - self._filled)
             whole = taken == self._length

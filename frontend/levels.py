@@ -49,6 +49,18 @@ class LevelMeter:
         """Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame.
 
         Of the picked microphones those count that are to be kept (M,), all if none of them is.
+
+        Parameters
+        ----------
+        samples : ndarray of float32, shape (n, M)
+            One hop.
+        keep : ndarray of bool, shape (M,), or None
+            Microphones that count; all where None.
+
+        Returns
+        -------
+        ndarray of float64, shape (bands,)
+            ln mean square per band.
         """
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         kept = None if keep is None else keep[self._channels]

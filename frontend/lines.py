@@ -40,6 +40,12 @@ class Fundamental:
         Reduced chi-squared of the teeth; 0 with fewer than two.
     power : (K,) float
         Sum of the teeth's powers above the floor, in the units of the spectrum.
+
+    Examples
+    --------
+    >>> one = np.ones(1)
+    >>> Fundamental(60.0 * one, 0.01 * one, one.astype(int), 0.0 * one, one).frequency_hz
+    array([60.])
     """
 
     frequency_hz: FloatArray
@@ -63,6 +69,11 @@ class Windows:
         Noise power of the windowed, zero-padded spectra.
     rate_hz : float
         Sample rate.
+
+    Examples
+    --------
+    >>> Windows(np.zeros((1, 3)), np.hanning(3), np.ones((1, 2)), rate_hz=8000.0).n
+    array([-1.,  0.,  1.])
     """
 
     frames: FloatArray
@@ -89,6 +100,11 @@ def measure_fundamental(
         Track so far and its rate of change.
     settings : HarmonicSettings
         Which teeth count.
+
+    Returns
+    -------
+    Fundamental
+        One value a window.
 
     Examples
     --------

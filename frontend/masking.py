@@ -32,7 +32,18 @@ class ChannelMask:
 
     @classmethod
     def all_of(cls, n_channels: int) -> "ChannelMask":
-        """Leave none out."""
+        """Leave none out.
+
+        Parameters
+        ----------
+        n_channels : int
+            M.
+
+        Returns
+        -------
+        ChannelMask
+            A whole one.
+        """
         return cls(np.ones(n_channels, bool))
 
     @property
@@ -57,12 +68,28 @@ class ChannelMask:
         return whole * (whole - 1) / (kept * (kept - 1))
 
     def silence(self, spectra: NDArray[np.complex64]) -> None:
-        """Set the channels left out to zero in place, (..., M)."""
+        """Set the channels left out to zero in place, (..., M).
+
+        Parameters
+        ----------
+        spectra : ndarray of complex64, shape (..., M)
+            Changed in place.
+        """
         if not self.is_whole:
             spectra[..., ~self.keep] = 0.0
 
     def cross(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return cross-spectra (..., M, M) without the channels left out; the same array if there are none.
+
+        Parameters
+        ----------
+        matrices : ndarray of complex64, shape (..., M, M)
+            Left as they are.
+
+        Returns
+        -------
+        ndarray of complex64, shape (..., M, M)
+            Rows and columns of the channels left out are zero.
 
         Examples
         --------

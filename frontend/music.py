@@ -34,6 +34,11 @@ class Subspace:
         Orthonormal columns, strongest last.
     eigenvalues : (bins, k) float
         Power along them, ascending.
+
+    Examples
+    --------
+    >>> Subspace(np.array([[[0.0], [1.0]]]), np.array([[5.0]])).vectors.shape
+    (1, 2, 1)
     """
 
     vectors: ComplexArray
@@ -214,6 +219,18 @@ def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
 
 def checked_covariance(covariance_matrix: ArrayLike, sources: int) -> ComplexArray:
     """Return covariances (bins, M, M) that are finite and large enough for a subspace of this dimension.
+
+    Parameters
+    ----------
+    covariance_matrix : array_like, shape (bins, M, M)
+        Complex.
+    sources : int
+        Dimension of the signal subspace, below M.
+
+    Returns
+    -------
+    ndarray of complex, shape (bins, M, M)
+        Single precision stays single.
 
     Raises
     ------

@@ -51,6 +51,11 @@ def find_peaks(
     min_prominence : float
         Smallest peak-to-median ratio.
 
+    Returns
+    -------
+    tuple of Peak
+        Highest first; empty in silence.
+
     Raises
     ------
     InvalidArgumentError

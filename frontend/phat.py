@@ -11,6 +11,16 @@ _POWER_FLOOR = np.float32(1e-30)
 def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
     """Squared magnitude without the square root, same shape.
 
+    Parameters
+    ----------
+    spectra : ndarray of complex64, any shape
+        X.
+
+    Returns
+    -------
+    ndarray of float32, same shape
+        |X|^2.
+
     Examples
     --------
     >>> power(np.array([3 + 4j], np.complex64))
@@ -31,6 +41,11 @@ def whiten(
     spectra : ndarray of complex64, any shape
     powers : ndarray of float32, same shape, optional
         ``power(spectra)`` if it is at hand already.
+
+    Returns
+    -------
+    ndarray of complex64, same shape
+        Of modulus one or zero.
 
     Examples
     --------

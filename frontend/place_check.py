@@ -71,7 +71,17 @@ class PlaceCheck:
         self._faults: list[ChannelFault] = []
 
     def push(self, matrices: NDArray[np.complex64], n_frames: int, there: NDArray[np.bool_]) -> None:
-        """Take the cross-spectra (K, M, M) of one hop, sums over its frames, and who is there (M,)."""
+        """Take the cross-spectra (K, M, M) of one hop, sums over its frames, and who is there (M,).
+
+        Parameters
+        ----------
+        matrices : ndarray of complex64, shape (K, M, M)
+            Cross-spectra, sums over the frames of one hop.
+        n_frames : int
+            How many frames.
+        there : ndarray of bool, shape (M,)
+            Microphones that are neither dead nor intermittent.
+        """
         self._sum *= np.float32(_FORGET)
         self._sum += matrices.real
         self._n_frames = _FORGET * self._n_frames + n_frames
@@ -136,6 +146,11 @@ def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> lis
         From `place_scores`.
     candidates : ndarray of bool, shape (M,)
         Channels that fit anywhere at all; they share their places among themselves.
+
+    Returns
+    -------
+    list of ChannelFault
+        Ascending; empty where all sit where they fit best.
 
     Examples
     --------

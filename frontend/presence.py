@@ -38,7 +38,18 @@ class Presence:
         self._share = np.zeros(n_channels)
 
     def push(self, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Take one flag per channel (M,); give it back."""
+        """Take one flag per channel (M,); give it back.
+
+        Parameters
+        ----------
+        bad : ndarray of bool, shape (M,)
+            Channels in which the hop is silent or breaks off.
+
+        Returns
+        -------
+        ndarray of bool, shape (M,)
+            The same.
+        """
         self._n_silent = 0
         return self._remember(bad)
 

@@ -56,11 +56,34 @@ class Prewhitener:
 
     @classmethod
     def of(cls, noise_covariance: ArrayLike, shrinkage: float = 0.03) -> "Prewhitener":
-        """Make it from a covariance (bins, M, M); see `inverse_root` for the arguments and errors."""
+        """Make it from a covariance (bins, M, M); see `inverse_root` for the arguments and errors.
+
+        Parameters
+        ----------
+        noise_covariance : array_like, shape (bins, M, M)
+            Complex.
+        shrinkage : float
+            In [0, 1].
+
+        Returns
+        -------
+        Prewhitener
+            One root a bin.
+        """
         return cls(inverse_root(noise_covariance, shrinkage))
 
     def spectra(self, spectra: ArrayLike) -> ComplexArray:
         """Whiten frames, (frames, bins, M) -> the same shape.
+
+        Parameters
+        ----------
+        spectra : array_like, shape (frames, bins, M)
+            Complex.
+
+        Returns
+        -------
+        ndarray of complex, same shape
+            root x.
 
         Raises
         ------
@@ -74,6 +97,16 @@ class Prewhitener:
     def covariance(self, covariance: ArrayLike) -> ComplexArray:
         """Whiten covariances, R -> root R root, (bins, M, M).
 
+        Parameters
+        ----------
+        covariance : array_like, shape (bins, M, M)
+            Complex.
+
+        Returns
+        -------
+        ndarray of complex, same shape
+            root R root.
+
         Raises
         ------
         InvalidArgumentError
@@ -84,6 +117,16 @@ class Prewhitener:
 
     def steering(self, steering: ArrayLike) -> ComplexArray:
         """Whiten steering vectors and give them their length back, (bins, M, directions).
+
+        Parameters
+        ----------
+        steering : array_like, shape (bins, M, directions)
+            Complex.
+
+        Returns
+        -------
+        ndarray of complex, same shape
+            Columns of length sqrt(M).
 
         Raises
         ------
@@ -153,6 +196,11 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
     n_frames : float
         Number of independent frames n >= 0.
 
+    Returns
+    -------
+    float
+        In [0, 1].
+
     Examples
     --------
     >>> white_share(np.eye(4), 100), round(white_share(np.ones((4, 4)), 100), 3)
@@ -168,6 +216,18 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
 
 def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
     """Invert one matrix (M, M) as `inverse_root` does, unchecked.
+
+    Parameters
+    ----------
+    R : ndarray of complex, shape (M, M)
+        Hermitian.
+    s : float
+        Shrinkage, in [0, 1].
+
+    Returns
+    -------
+    ndarray of complex, shape (M, M)
+        Hermitian.
 
     Examples
     --------

@@ -43,7 +43,15 @@ class RailCounter:
     def push(
         self, samples: NDArray[np.float32], lowest: NDArray[np.float32], highest: NDArray[np.float32]
     ) -> None:
-        """Take the samples (n, M) of a hop and their extremes (M,)."""
+        """Take the samples (n, M) of a hop and their extremes (M,).
+
+        Parameters
+        ----------
+        samples : ndarray of float32, shape (n, M)
+            One hop.
+        lowest, highest : ndarray of float32, shape (M,)
+            Their extremes.
+        """
         self._n_samples += len(samples)
         span = highest - lowest
         self._side(0, np.float32(1.0), samples, highest, span)
@@ -73,6 +81,12 @@ class RailCounter:
             below[reached] += n_below * fine
 
     def clipped_share(self) -> NDArray[np.float64]:
-        """Share of all samples that stand at a rail, (M,); 0 for channels without one."""
+        """Share of all samples that stand at a rail, (M,); 0 for channels without one.
+
+        Returns
+        -------
+        ndarray of float64, shape (M,)
+            0..1.
+        """
         clipped = np.where((self._at >= _MIN_COUNT) & (self._at > self._below), self._at, 0)
         return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))

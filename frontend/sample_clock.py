@@ -70,6 +70,11 @@ def rate_from_duration(
     nominal_hz : float
         What the file says.
 
+    Returns
+    -------
+    RateEstimate
+        Hz, with its standard deviation.
+
     Raises
     ------
     InvalidArgumentError
@@ -113,6 +118,13 @@ class SampleClock:
 
     def read(self, n_samples: int, captured_ns: int) -> None:
         """Take the time at which sample number `n_samples` was captured.
+
+        Parameters
+        ----------
+        n_samples : int
+            Samples so far.
+        captured_ns : int
+            When the last of them was captured, nanoseconds of the clock to compare with.
 
         Raises
         ------

@@ -41,6 +41,11 @@ class PassBy:
         Of these, from the information of the fit.
     chi_squared : float
         Sum of squared normalised residuals.
+
+    Examples
+    --------
+    >>> PassBy(np.array([100.0, 12.0, 2.0, 5.0]), np.eye(4), chi_squared=36.0).values[1].item()
+    12.0
     """
 
     values: FloatArray
@@ -61,6 +66,11 @@ def radial_speed_m_s(
         v, tau_0 (emission time) and d.
     sound_m_s : float
         c > v.
+
+    Returns
+    -------
+    ndarray, shape of `time_s`
+        m/s.
 
     Examples
     --------
@@ -90,6 +100,11 @@ def fit_pass_by(
         Upper limit of v.
     sound_m_s : float
         c.
+
+    Returns
+    -------
+    PassBy
+        The best of all starting points.
 
     Examples
     --------
@@ -131,6 +146,11 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: flo
         As in `PassBy`.
     sound_m_s : float
         c.
+
+    Returns
+    -------
+    ndarray, shape (K, 4)
+        m/s per unit of each parameter.
 
     Examples
     --------

@@ -36,7 +36,15 @@ class SlowMean:
         self.count = np.zeros(shape[1], np.int64)
 
     def add(self, values: ArrayLike, good: NDArray[np.bool_]) -> None:
-        """Take the values of a hop, of this shape, and the channels that are good (M,)."""
+        """Take the values of a hop, of this shape, and the channels that are good (M,).
+
+        Parameters
+        ----------
+        values : array_like, shape (M, ...)
+            Of one hop.
+        good : ndarray of bool, shape (M,)
+            Channels whose values count.
+        """
         self.count += good
         weight = good / np.clip(self.count, 1, _HOPS)
         self.mean += weight * (np.asarray(values) - self.mean)

@@ -24,6 +24,11 @@ def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> 
     shape : sequence of int or None
         Expected shape; `None` leaves an axis free.
 
+    Returns
+    -------
+    ndarray of complex64 or complex128
+        complex64 where the input was single precision.
+
     Raises
     ------
     InvalidArgumentError

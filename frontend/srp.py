@@ -33,6 +33,13 @@ def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArra
     Returns
     -------
     ndarray of float64, shape (directions,)
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
+    >>> steered_power(np.ones((3, 1, 2), np.complex64), steering).round(1)
+    array([12. ,  9.8])
     """
     return np.asarray(steering.quadratic_form(steering.covariance(whitened)).real)
 
@@ -41,6 +48,18 @@ def normalised(
     total: NDArray[np.float64], n_frames: int, n_bins: int, n_microphones: int
 ) -> NDArray[np.float64]:
     """Scale a sum of beam powers to 0..1; rounding below zero is cut.
+
+    Parameters
+    ----------
+    total : ndarray, shape (directions,)
+        From `steered_power`.
+    n_frames, n_bins, n_microphones : int
+        What it was summed over.
+
+    Returns
+    -------
+    ndarray of float64, shape (directions,)
+        0..1.
 
     Examples
     --------

@@ -23,6 +23,16 @@ def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
 
     Not usable where there is none in another azimuth, or where every azimuth is one.
 
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Microphones.
+
+    Returns
+    -------
+    ndarray, shape (3, 3), or NotUsable
+        Its own inverse.
+
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -47,6 +57,18 @@ def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
 
 def twin_azimuth_rad(reflection: NDArray[np.float64] | NotUsable, azimuth_rad: float) -> float | NotUsable:
     """Azimuth that sounds the same as this one, in (-pi, pi].
+
+    Parameters
+    ----------
+    reflection : ndarray, shape (3, 3), or NotUsable
+        From `twin_reflection`.
+    azimuth_rad : float
+        Left positive.
+
+    Returns
+    -------
+    float or NotUsable
+        Radians.
 
     Examples
     --------
