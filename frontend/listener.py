@@ -43,6 +43,13 @@ class HopSums:
         Mean square in the looming band of every microphone.
     health : ArrayHealth
         What is wrong with the array, and which microphones counted.
+
+    Examples
+    --------
+    >>> health = ArrayHealth.unknown(n_channels=2)
+    >>> sums = HopSums(19, 2400.0, np.zeros(181), np.zeros(30, complex), np.ones(2), health)
+    >>> sums.n_frames
+    19
     """
 
     n_frames: int
@@ -64,6 +71,14 @@ class Listener:
         Samples per second.
     settings : FrontEndSettings
         Bands, grid and frame length.
+
+    Examples
+    --------
+    >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0.1], [0, -0.1, 0]])
+    >>> listener = Listener(array, 48_000, FrontEndSettings())
+    >>> hop = np.random.default_rng(0).standard_normal((4800, 3)).astype(np.float32)
+    >>> listener.push(hop).power.shape
+    (181,)
     """
 
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings) -> None:
@@ -88,7 +103,18 @@ class Listener:
         self.ego_noise = self._ego_noise(array.n_microphones, sample_rate_hz, bins, settings)
 
     def push(self, samples: NDArray[np.float32]) -> HopSums:
-        """Sum over the frames that these samples (n, M) complete; at least one frame."""
+        """Sum over the frames that these samples (n, M) complete; at least one frame.
+
+        Parameters
+        ----------
+        samples : ndarray of float32, shape (n, M)
+            One hop.
+
+        Returns
+        -------
+        HopSums
+            Sums that running means are made of.
+        """
         spectra = self._stft.push(samples)
         powers = power(spectra)
         whitened = whiten(spectra, powers)

@@ -94,14 +94,33 @@ class MusicStage:
         self._tracker = SubspaceTracker(sources)
 
     def push(self, spectra: NDArray[np.complex64], beams: Steering | None = None) -> None:
-        """Take the frames of a hop (frames, K, M), and their beams if they are whitened."""
+        """Take the frames of a hop (frames, K, M), and their beams if they are whitened.
+
+        Parameters
+        ----------
+        spectra : ndarray of complex64, shape (frames, K, M)
+            One hop.
+        beams : Steering or None
+            Where the spectra are whitened, the beams whitened alike.
+        """
         by_bin = spectra.transpose(1, 0, 2)
         np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.next_slot)
         self._window.close_slot()
         self._whitened = beams
 
     def read(self, mask: ChannelMask) -> MusicReading | NotUsable:
-        """Score the grid by the window so far, with the microphones of a mask."""
+        """Score the grid by the window so far, with the microphones of a mask.
+
+        Parameters
+        ----------
+        mask : ChannelMask
+            Microphones that count.
+
+        Returns
+        -------
+        MusicReading or NotUsable
+            Not usable before the window is full.
+        """
         if mask.n_kept <= self._sources:
             return NotUsable(f"{mask.n_kept} microphones left for {self._sources} sources")
         covariance = mask.cross(self._window.total)

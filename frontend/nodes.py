@@ -51,7 +51,18 @@ class Nodes:
 
     @classmethod
     def of(cls, vectors: NDArray[np.complex128]) -> "Nodes | None":
-        """Choose for steering vectors (bins, M, directions); None where more than half would be needed."""
+        """Choose for steering vectors (bins, M, directions); None where more than half would be needed.
+
+        Parameters
+        ----------
+        vectors : ndarray of complex128, shape (bins, M, directions)
+            Steering vectors.
+
+        Returns
+        -------
+        Nodes or None
+            None where more than half of the directions would be needed.
+        """
         count = vectors.shape[2]
         rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)
         limit = _TOLERANCE**2 * rest.max()

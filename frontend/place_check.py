@@ -90,7 +90,13 @@ class PlaceCheck:
             self._judge(there)
 
     def faults(self) -> list[ChannelFault]:
-        """Say which channels are noisy, inverted or swapped."""
+        """Say which channels are noisy, inverted or swapped.
+
+        Returns
+        -------
+        list of ChannelFault
+            By channel.
+        """
         return self._faults
 
     def _judge(self, there: NDArray[np.bool_]) -> None:

@@ -54,7 +54,13 @@ class Presence:
         return self._remember(bad)
 
     def all_silent(self) -> NDArray[np.bool_]:
-        """Take a hop in which all are silent, which for a second is held against nobody."""
+        """Take a hop in which all are silent, which for a second is held against nobody.
+
+        Returns
+        -------
+        ndarray of bool, shape (M,)
+            Which channels are held to be bad.
+        """
         self._n_silent += 1
         silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
         return self._remember(silent) if silent.any() else silent
@@ -83,7 +89,13 @@ class Presence:
         return np.asarray(self._dead | self._intermittent)
 
     def faults(self) -> list[ChannelFault]:
-        """Say which channels are dead or intermittent."""
+        """Say which channels are dead or intermittent.
+
+        Returns
+        -------
+        list of ChannelFault
+            By channel.
+        """
         if not self._share.any():
             return []
         dead = faults_where(Fault.DEAD, self._dead, self._share)

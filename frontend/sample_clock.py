@@ -153,7 +153,13 @@ class SampleClock:
         self._ee += de * (e - self._mean_e)
 
     def estimate(self) -> RateEstimate | NotUsable:
-        """Return the rate so far; at least ten readings at different times."""
+        """Return the rate so far; at least ten readings at different times.
+
+        Returns
+        -------
+        RateEstimate or NotUsable
+            Hz, with its standard deviation.
+        """
         if self._n < _MIN_READINGS or self._tt <= 0.0:
             return NotUsable(f"needs {_MIN_READINGS} readings of a clock, got {self._n}")
         slope = self._te / self._tt

@@ -136,11 +136,22 @@ class FrontEndSettings:
         _divides("elevation_step_deg", self.elevation_step_deg, highest - lowest)
 
     def azimuths_rad(self) -> NDArray[np.float64]:
-        """Grid of azimuths, ascending from right to left, radians, shape (A,)."""
+        """Grid of azimuths, ascending from right to left, radians, shape (A,).
+
+        Returns
+        -------
+        ndarray, shape (A,)
+            Radians.
+        """
         return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
 
     def elevations_rad(self) -> NDArray[np.float64]:
         """Grid of elevations, ascending, radians, shape (E,).
+
+        Returns
+        -------
+        ndarray, shape (E,)
+            Radians.
 
         Examples
         --------
@@ -150,7 +161,13 @@ class FrontEndSettings:
         return _grid_rad(self.elevation_span_deg, self.elevation_step_deg)
 
     def directions_rad(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Azimuth and elevation of every direction, row by row of elevations, shape (E * A,) each."""
+        """Azimuth and elevation of every direction, row by row of elevations, shape (E * A,) each.
+
+        Returns
+        -------
+        azimuths, elevations : ndarray, shape (E * A,)
+            Radians.
+        """
         azimuths, elevations = np.meshgrid(self.azimuths_rad(), self.elevations_rad())
         return azimuths.ravel(), elevations.ravel()
 

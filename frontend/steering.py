@@ -56,7 +56,24 @@ class Steering:
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> "Steering":
-        """Build the beams of an array at the given frequencies and directions."""
+        """Build the beams of an array at the given frequencies and directions.
+
+        Parameters
+        ----------
+        array : MicrophoneArray
+            Microphones.
+        frequencies_hz : array_like, shape (bins,)
+            Hz.
+        azimuths_rad, elevations_rad : array_like, broadcast to shape (directions,)
+            Azimuth, left positive, and elevation, up positive.
+        speed_of_sound_m_s : float
+            c.
+
+        Returns
+        -------
+        Steering
+            In coordinates centred on the array.
+        """
         centred = MicrophoneArray(array.centred_m)
         weights = centred.steering(frequencies_hz, azimuths_rad, elevations_rad, speed_of_sound_m_s).conj()
         basis = _thin_basis(weights, max_rank=array.n_microphones // 2)
@@ -74,19 +91,52 @@ class Steering:
         return int(self.weights.shape[2])
 
     def covariance(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r)."""
+        """Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
+
+        Parameters
+        ----------
+        spectra : ndarray of complex64, shape (frames, bins, M)
+            Whitened or not.
+
+        Returns
+        -------
+        ndarray of complex64, shape (bins, r, r)
+            Hermitian.
+        """
         by_bin = spectra.transpose(1, 0, 2)
         projected = by_bin if self.basis is None else by_bin @ self.basis
         return cross_spectra(projected)
 
     def compress(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        r"""Write R as :math:`B^T R \overline{B}` in the basis: (bins, M, M) -> (bins, r, r)."""
+        r"""Write R as :math:`B^T R \overline{B}` in the basis: (bins, M, M) -> (bins, r, r).
+
+        Parameters
+        ----------
+        matrices : ndarray of complex64, shape (bins, M, M)
+            Any, not only Hermitian ones.
+
+        Returns
+        -------
+        ndarray of complex64, shape (bins, r, r)
+            The same where there is no basis.
+        """
         if self.basis is None:
             return matrices
         return np.asarray(self.basis.transpose(0, 2, 1) @ (matrices @ self.basis.conj()))
 
     def quadratic_form(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex128]:
-        r"""Sum :math:`C_k(\theta)^T Q_k \overline{C_k(\theta)}` over bins, (bins, r, r) -> (directions,)."""
+        r"""Sum :math:`C_k(\theta)^T Q_k \overline{C_k(\theta)}` over bins, (bins, r, r) -> (directions,).
+
+        Parameters
+        ----------
+        matrices : ndarray of complex64, shape (bins, r, r)
+            In coordinates of the basis.
+
+        Returns
+        -------
+        ndarray of complex128, shape (directions,)
+            Real for Hermitian matrices.
+        """
         beams = self if self.nodes is None else self.nodes
         products = matrices @ beams.conjugate
         products *= beams.weights
@@ -94,7 +144,18 @@ class Steering:
         return total if self.nodes is None else total @ self.nodes.spread
 
     def power_within(self, vectors: NDArray[np.complex64]) -> NDArray[np.float64]:
-        r"""Power :math:`\|E_k^H a_k(\theta)\|^2` within columns (bins, M, k), -> (bins, directions)."""
+        r"""Power :math:`\|E_k^H a_k(\theta)\|^2` within columns (bins, M, k), -> (bins, directions).
+
+        Parameters
+        ----------
+        vectors : ndarray of complex64, shape (bins, M, k)
+            Orthonormal columns E.
+
+        Returns
+        -------
+        ndarray of float64, shape (bins, directions)
+            From 0 to M.
+        """
         beams = self if self.nodes is None else self.nodes
         rows = vectors.transpose(0, 2, 1)
         inner = (rows if self.basis is None else rows @ self.basis) @ beams.weights
@@ -102,7 +163,18 @@ class Steering:
         return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
 
     def squared_lengths(self, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
-        r"""Length :math:`\|a_k(\theta)\|^2` over the microphones kept (M,), (bins, directions)."""
+        r"""Length :math:`\|a_k(\theta)\|^2` over the microphones kept (M,), (bins, directions).
+
+        Parameters
+        ----------
+        keep : ndarray of bool, shape (M,)
+            Microphones that count.
+
+        Returns
+        -------
+        ndarray of float64, shape (bins, directions)
+            Their number, where beams are not whitened.
+        """
         if self.basis is None:
             kept = self.weights[:, keep]
             return np.asarray(np.square(kept.real).sum(axis=1) + np.square(kept.imag).sum(axis=1), np.float64)
@@ -129,7 +201,18 @@ class NodeBeams:
 
     @classmethod
     def of(cls, weights: NDArray[np.complex128]) -> "NodeBeams | None":
-        """Choose them for all directions (bins, r or M, directions)."""
+        """Choose them for all directions (bins, r or M, directions).
+
+        Parameters
+        ----------
+        weights : ndarray of complex128, shape (bins, r or M, directions)
+            Beams in coordinates of the basis.
+
+        Returns
+        -------
+        NodeBeams or None
+            None where too many would be needed.
+        """
         nodes = Nodes.of(weights)
         if nodes is None:
             return None
@@ -162,6 +245,16 @@ def _thin_basis(weights: NDArray[np.complex128], max_rank: int) -> NDArray[np.co
 
 def cross_spectra(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
     r"""Sum over frames of :math:`x_i \overline{x_j}`, (bins, frames, M) -> (bins, M, M).
+
+    Parameters
+    ----------
+    spectra : ndarray of complex64, shape (bins, frames, M)
+        x.
+
+    Returns
+    -------
+    ndarray of complex64, shape (bins, M, M)
+        Hermitian.
 
     Examples
     --------

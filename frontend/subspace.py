@@ -100,7 +100,18 @@ class SubspaceTracker:
         return self.follow(checked_covariance(covariance, self._sources))
 
     def follow(self, R: ComplexArray) -> Subspace:
-        """Do what `update` does, unchecked."""
+        """Do what `update` does, unchecked.
+
+        Parameters
+        ----------
+        R : ndarray of complex, shape (bins, M, M)
+            Hermitian, finite.
+
+        Returns
+        -------
+        Subspace
+            As `update`.
+        """
         width = min(self._sources + self._guard, R.shape[1] - 1)
         if self._basis is None or self._values is None or self._basis.shape != (len(R), width, R.shape[1]):
             self._basis, self._values = self._decomposed(R, width)

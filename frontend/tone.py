@@ -46,6 +46,11 @@ class Tone:
         eta: A^2 / (2 sigma^2) for a real signal; A^2 / sigma^2 for a complex one, sigma^2 per quadrature.
     frequency_std_hz : float
         From the bound at this SNR, Hz.
+
+    Examples
+    --------
+    >>> Tone(frequency_hz=123.4, amplitude=2.0, phase_rad=0.5, snr=40.0, frequency_std_hz=0.01).snr
+    40.0
     """
 
     frequency_hz: float
@@ -174,6 +179,18 @@ def climb(
 
 def tone_wave(omega: float, count: int) -> ComplexArray:
     """Give e^(j omega n), n counted from the centre, as a product of two short ones: few exponentials.
+
+    Parameters
+    ----------
+    omega : float
+        Radians a sample.
+    count : int
+        Number of samples.
+
+    Returns
+    -------
+    ndarray of complex128, shape (count,)
+        Of modulus one.
 
     Examples
     --------

@@ -126,7 +126,15 @@ class ToneStage:
         self._spectrum = _Spectrum(len(self._heard), self._rate, band_hz)
 
     def push(self, samples: NDArray[np.float32], mask: ChannelMask) -> None:
-        """Take the samples of a hop (n, M), of which the microphones of a mask count."""
+        """Take the samples of a hop (n, M), of which the microphones of a mask count.
+
+        Parameters
+        ----------
+        samples : ndarray of float32, shape (n, M)
+            One hop.
+        mask : ChannelMask
+            Microphones that count.
+        """
         if not np.array_equal(mask.keep, self._keep):
             self._weights, self._keep = self._mean_of(mask.keep)
         new = self._decimator.push(samples @ self._weights)
@@ -135,7 +143,13 @@ class ToneStage:
         self._heard = np.concatenate([self._heard, new])[len(new) :]
 
     def read(self) -> ToneReading | NotUsable:
-        """Fit the line of the window that ends with the last hop."""
+        """Fit the line of the window that ends with the last hop.
+
+        Returns
+        -------
+        ToneReading or NotUsable
+            Not usable before the window is full, and where no line stands out.
+        """
         if self._n_out < len(self._heard):
             return NotUsable(f"needs {len(self._heard) / self._rate:.2f} s of sound")
         if not self._heard.any():
