@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from worldstate.adapters.vision_extra import opencv
 from worldstate.checks import in_range
@@ -24,6 +25,9 @@ STRENGTHS: Mapping[str, tuple[float, ...]] = MappingProxyType(
         "noise": (0.0, 10.0, 25.0, 50.0, 100.0),
     }
 )
+
+# Of the staged noise; it ends at 4.3 sigma.
+_QUANTILES = 1 << 16
 
 Frame = NDArray[np.uint8]
 
@@ -123,11 +127,12 @@ def _darkened(frame: Frame, factor: float, rng: np.random.Generator) -> Frame:
 
 
 def _noisy(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
-    values = rng.standard_normal(frame.shape, dtype=np.float32)
-    values *= sigma
+    # Grey levels are whole, so the noise may be too: quantiles looked up, a third of the time of drawing it.
+    quantiles = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    grey = np.rint(sigma * ndtri(quantiles)).astype(np.int16)
+    values: NDArray[np.int16] = grey.take(rng.integers(0, _QUANTILES, frame.shape, dtype=np.uint16))
     values += frame
-    np.rint(values, out=values)
-    return np.clip(values, 0.0, 255.0, out=values).astype(np.uint8)
+    return np.clip(values, 0, 255).astype(np.uint8)
 
 
 _STAGES = {"blur": _blurred, "darkness": _darkened, "noise": _noisy}

@@ -7,9 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.adapters.detections import DetectionFrame
+from worldstate.adapters.outline import difference, outlined_share
 from worldstate.adapters.vision_extra import opencv
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
+
+# No edge of an image is narrower: pixels have a size, and noise is smoothed before it is looked for.
+NARROWEST_EDGE_PX = 3.0
 
 Background = Literal["mog2", "knn"]
 
@@ -32,6 +36,11 @@ class MotionSettings:
         Smallest object as a share of the image, in (0, 1).
     max_area : float
         Larger regions are changes of the light.
+    edge_width : float
+        Widest edge of an object as a share of the image's width, in (0, 1]. A change without one on at least
+        `outlined` of its outline is light: the glow of lamps, a cloud, or what a lens out of focus leaves.
+    outlined : float
+        In [0, 1]; 0 lets everything through. Below one half, as a car has no edge where it meets its shadow.
     label : str
         Motion knows no classes: everything is called this.
 
@@ -52,6 +61,8 @@ class MotionSettings:
     warm_up: int = 5
     min_area: float = 0.0015
     max_area: float = 0.6
+    edge_width: float = 0.01
+    outlined: float = 0.25
     label: str = "car"
 
     def __post_init__(self) -> None:
@@ -62,6 +73,8 @@ class MotionSettings:
         in_range("warm_up", self.warm_up, 0, 100_000)
         in_range("min_area", self.min_area, 0.0, self.max_area, open_low=True)
         in_range("max_area", self.max_area, 0.0, 1.0)
+        in_range("edge_width", self.edge_width, 0.0, 1.0, open_low=True)
+        in_range("outlined", self.outlined, 0.0, 1.0)
 
 
 class MotionDetector:
@@ -110,7 +123,7 @@ class MotionDetector:
         if self._seen <= self.settings.warm_up:
             return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
         scale = np.array([width, height] * 2) / np.array([small.shape[1], small.shape[0]] * 2)
-        return self._objects(mask, scale)
+        return self._objects(small, mask, scale)
 
     def _make_background(self) -> Any:
         chosen = self.settings
@@ -135,11 +148,25 @@ class MotionDetector:
         joined: NDArray[np.uint8] = self._cv2.morphologyEx(mask, self._cv2.MORPH_CLOSE, joint)
         return joined
 
-    def _objects(self, mask: NDArray[np.uint8], scale: NDArray[np.float64]) -> DetectionFrame:
-        _, _, stats, _ = self._cv2.connectedComponentsWithStats(mask, connectivity=8)
-        left, top, width, height, area = stats[1:].T.astype(np.float64)
-        share = area / mask.size
+    def _objects(
+        self, frame: NDArray[np.uint8], mask: NDArray[np.uint8], scale: NDArray[np.float64]
+    ) -> DetectionFrame:
+        _, labels, stats, _ = self._cv2.connectedComponentsWithStats(mask, connectivity=8)
+        share = stats[:, 4] / mask.size
         kept = (share >= self.settings.min_area) & (share <= self.settings.max_area)
-        boxes = np.stack([left, top, left + width, top + height], axis=1)[kept] * scale
-        filled = (area / (width * height))[kept]
-        return DetectionFrame(boxes, filled, (self.settings.label,) * int(kept.sum()))
+        kept[0] = False  # what does not move
+        numbers = np.flatnonzero(kept)
+        if numbers.size and self.settings.outlined > 0.0:
+            numbers = numbers[self._has_outline(frame, labels, numbers)]
+        left, top, width, height, area = stats[numbers].T.astype(np.float64)
+        boxes = np.stack([left, top, left + width, top + height], axis=1) * scale
+        return DetectionFrame(boxes, area / (width * height), (self.settings.label,) * numbers.size)
+
+    def _has_outline(
+        self, frame: NDArray[np.uint8], labels: NDArray[np.int32], numbers: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Tell which regions are objects and not light."""
+        apart = difference(frame, self._background.getBackgroundImage())
+        width_px = max(self.settings.edge_width * frame.shape[1], NARROWEST_EDGE_PX)
+        shares = [outlined_share(apart, labels == number, width_px) for number in numbers]
+        return np.array(shares) >= self.settings.outlined

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
 from worldstate.adapters.detection_formats import read_any_detections, read_coco_results, read_yolo_text
 from worldstate.adapters.detector import overlaps, suppress
 from worldstate.adapters.motion_detector import MotionDetector, MotionSettings
 from worldstate.adapters.onnx_detector import OnnxDetector, OnnxSettings, decode_yolo, open_onnx
+from worldstate.adapters.outline import difference, outlined_share
 from worldstate.errors import InputFileError, InvalidArgumentError
 
 boxes = st.lists(
@@ -67,6 +69,41 @@ def test_motion_finds_the_car_and_little_else(background):
 def test_motion_sees_nothing_in_an_empty_street():
     detector = MotionDetector()
     assert sum(len(detector.detect(frame)) for frame in street(15, car=False)) == 0
+
+
+@pytest.mark.parametrize("background", ["mog2", "knn"])
+def test_light_is_no_object_however_much_of_the_image_it_changes(background):
+    """The glow of lamps wanders over the street: motion without outlines would call it a car."""
+    down, across = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    found = {0.0: 0, 0.25: 0}
+    for outlined in found:
+        detector = MotionDetector(MotionSettings(background=background, outlined=outlined))
+        for number, frame in enumerate(street(25, car=False)):
+            where = np.hypot((across - 40.0 * (number - 9)) / 60.0, (down - 250.0) / 40.0)
+            glow = 90.0 * np.exp(-0.5 * where**2)[:, :, None] * (number >= 10)
+            found[outlined] += len(detector.detect(np.clip(frame + glow, 0, 255).astype(np.uint8)))
+    assert found[0.0] >= 12
+    assert found[0.25] <= 1
+
+
+@pytest.mark.parametrize("sigma_px", [0.5, 2.0, 4.0, 8.0, 16.0])
+def test_an_edge_counts_up_to_the_blur_that_its_formula_says(sigma_px):
+    """A step smeared by sigma rises by C / (sigma sqrt(2 pi)) a pixel."""
+    step, region = np.zeros((300, 400), np.float32), np.zeros((300, 400), dtype=bool)
+    step[80:220, 100:300], region[80:220, 100:300] = 80.0, True
+    smeared = gaussian_filter(step, sigma_px)
+    limit = sigma_px * np.sqrt(2.0 * np.pi)
+    assert outlined_share(smeared, region, 1.15 * limit + 1.0) > 0.9
+    assert outlined_share(smeared, region, 0.8 * limit) < 0.1
+
+
+def test_an_outline_asks_for_a_region_of_the_same_image():
+    image = np.zeros((8, 8), np.float32)
+    for region in (np.ones((8, 9), dtype=bool), np.zeros((8, 8), dtype=bool)):
+        with pytest.raises(InvalidArgumentError, match="region"):
+            outlined_share(image, region, 3.0)
+    with pytest.raises(InvalidArgumentError, match="background"):
+        difference(np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3), np.uint8))
 
 
 def model_file(path, output, size=32):
