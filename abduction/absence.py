@@ -93,6 +93,13 @@ class MissRateTable:
     def from_dict(cls, data: object, source: object = "miss-rate table") -> "MissRateTable":
         """Return the table that `to_dict` wrote; keys it does not know are ignored.
 
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
+        source : object
+            What the message calls it: a path.
+
         Raises
         ------
         InputFileError
@@ -125,6 +132,11 @@ def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
     ----------
     half_view_deg : float
         Half of the horizontal field of view, degrees, in (0, 180].
+
+    Returns
+    -------
+    MissRateTable
+        Over azimuth and degradation.
 
     Examples
     --------

@@ -83,6 +83,13 @@ class AdaptiveBudget:
     def gamma(self, calibrated: float, shift_nats: float) -> float:
         """Return the threshold at a shift; never above `highest` unless it was calibrated there.
 
+        Parameters
+        ----------
+        calibrated : float
+            Threshold of the policy.
+        shift_nats : float
+            How far it has moved, on the log-odds of the statistic.
+
         Examples
         --------
         >>> budget = AdaptiveBudget(20.0)
@@ -102,6 +109,11 @@ class AdaptiveBudget:
     @classmethod
     def from_dict(cls, data: object) -> "AdaptiveBudget":
         """Return the budget that `to_dict` wrote; unknown keys are ignored.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------
@@ -179,6 +191,11 @@ class AdaptiveThreshold:
     @classmethod
     def from_dict(cls, data: object) -> "AdaptiveThreshold":
         """Return the state that `to_dict` wrote.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------

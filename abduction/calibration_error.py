@@ -48,10 +48,21 @@ def reliability_curve(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> 
     bins : int
         How many.
 
+    Returns
+    -------
+    ReliabilityCurve
+        Bins without a window are left out.
+
     Raises
     ------
     InvalidArgumentError
         If the sample is empty, the shapes differ or a risk is no probability.
+
+    Examples
+    --------
+    >>> curve = reliability_curve([0.1, 0.1, 0.9, 0.9], [0, 1, 1, 1], bins=2)
+    >>> curve.predicted, curve.observed
+    (array([0.1, 0.9]), array([0.5, 1. ]))
     """
     predicted, labels = _checked_sample(risk, hazards)
     index = _bin_index(predicted, bins)
@@ -67,7 +78,19 @@ def expected_calibration_error(risk: ArrayLike, hazards: ArrayLike, bins: int = 
 
     .. math:: ECE = \sum_b \frac{n_b}{n} \left| \overline{r}_b - \overline{y}_b \right|
 
-    Parameters and errors are those of `reliability_curve`.
+    Errors are those of `reliability_curve`.
+
+    Parameters
+    ----------
+    risk, hazards : array_like, shape (n,)
+        Predicted risk in [0, 1], and 0 or 1.
+    bins : int
+        Of equal width.
+
+    Returns
+    -------
+    float
+        In [0, 1].
 
     References
     ----------
@@ -96,6 +119,11 @@ def calibration_error_floor(
     bins, draws : int
         Bins of the ECE; how many sets of labels.
 
+    Returns
+    -------
+    float
+        In [0, 1].
+
     Raises
     ------
     InvalidArgumentError
@@ -114,7 +142,21 @@ def calibration_error_sampling(
 ) -> tuple[float, float]:
     """Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
 
-    Parameters and errors are those of `calibration_error_floor`, which is the mean.
+    Errors are those of `calibration_error_floor`, which is the mean.
+
+    Parameters
+    ----------
+    risk : array_like, shape (n,)
+        In [0, 1].
+    rng : numpy.random.Generator
+        Draws labels.
+    bins, draws : int
+        Bins of equal width, and how often labels are drawn.
+
+    Returns
+    -------
+    mean, std : float
+        Of the ECE.
 
     Examples
     --------
@@ -133,7 +175,17 @@ def calibration_error_sampling(
 def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
     """Return the mean squared difference between risk and what came true.
 
-    Parameters and errors are those of `reliability_curve`.
+    Errors are those of `reliability_curve`.
+
+    Parameters
+    ----------
+    risk, hazards : array_like, shape (n,)
+        Predicted risk in [0, 1], and 0 or 1.
+
+    Returns
+    -------
+    float
+        In [0, 1].
 
     Examples
     --------

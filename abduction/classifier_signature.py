@@ -24,7 +24,18 @@ class FittedClassifier(Protocol):
         ...
 
     def predict_proba(self, X: Any) -> Any:
-        """Return posteriors, shape (n, classes)."""
+        """Return posteriors, shape (n, classes).
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+
+        Returns
+        -------
+        ndarray, shape (n, classes)
+            Rows that sum to one.
+        """
         ...
 
 
@@ -72,6 +83,11 @@ class ClassifierSignature:
     def predict_proba(self, X: ArrayLike) -> Numbers:
         """Return the posteriors of front, left, none, right, shape (n, 4).
 
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+
         Raises
         ------
         InvalidArgumentError
@@ -88,6 +104,11 @@ class ClassifierSignature:
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of one window.
+
+        Parameters
+        ----------
+        feature : array_like, shape (features,)
+            One window.
 
         Raises
         ------

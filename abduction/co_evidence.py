@@ -36,7 +36,13 @@ class Absent:
         in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_high=True)
 
     def log_likelihoods(self) -> np.ndarray:
-        """Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible."""
+        """Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Nats.
+        """
         spurious = np.log1p(-self.clutter_rate)
         with np.errstate(divide="ignore"):
             missed = np.log(self.miss_rate)
@@ -69,7 +75,13 @@ class Present:
         in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
 
     def log_likelihoods(self) -> np.ndarray:
-        """Log p(present | hidden, visible, none), shape (3,), nats."""
+        """Log p(present | hidden, visible, none), shape (3,), nats.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Nats.
+        """
         spurious = np.log(self.clutter_rate)
         found = np.log1p(-self.miss_rate * (1.0 - self.clutter_rate))
         return np.array([spurious, found, spurious])
@@ -88,7 +100,13 @@ class Unqueried:
     reason: str
 
     def log_likelihoods(self) -> np.ndarray:
-        """Zero for every explanation, shape (3,): beta = 1, it moves nothing."""
+        """Zero for every explanation, shape (3,): beta = 1, it moves nothing.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Zeros.
+        """
         return np.zeros(3)
 
 

@@ -88,6 +88,18 @@ def conformal_threshold(
 def recordings_needed(alpha: float, confidence: float | None = None) -> int:
     """Return the fewest hazard-free recordings from which a conformal threshold is finite.
 
+    Parameters
+    ----------
+    alpha : float
+        Budget, in (0, 1).
+    confidence : float or None
+        With which it should hold for every later recording; None: on average.
+
+    Returns
+    -------
+    int
+        Number of recordings.
+
     Examples
     --------
     >>> recordings_needed(0.02), recordings_needed(0.02, confidence=0.95)

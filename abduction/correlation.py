@@ -22,6 +22,11 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
     streams : sequence of array_like, each of shape (windows,)
         Recordings in the order of time; lags never reach from one into the next.
 
+    Returns
+    -------
+    float
+        Hops.
+
     Raises
     ------
     InvalidArgumentError

@@ -48,7 +48,13 @@ class SustainedRule:
         return self.run >= self.sustain_hops
 
     def advance(self, held: bool) -> "SustainedRule":
-        """Return the state after one more hop."""
+        """Return the state after one more hop.
+
+        Parameters
+        ----------
+        held : bool
+            Whether the statistic is at or above the threshold.
+        """
         return replace(self, run=min(self.run + 1, self.sustain_hops) if held else 0)
 
 
@@ -106,11 +112,28 @@ class CueingPolicy:
             raise InvalidArgumentError("reference_prior: expected 3 or more positive numbers, sum one")
 
     def exceeded(self, statistic: float) -> bool:
-        """Whether a statistic is at or above the threshold."""
+        """Whether a statistic is at or above the threshold.
+
+        Parameters
+        ----------
+        statistic : float
+            s(t).
+
+        Returns
+        -------
+        bool
+            True at the threshold itself.
+        """
         return statistic >= self.gamma
 
     def gamma_at(self, shift_nats: float) -> float:
-        """Return the threshold once it has moved by so much; gamma itself where nothing moves it."""
+        """Return the threshold once it has moved by so much; gamma itself where nothing moves it.
+
+        Parameters
+        ----------
+        shift_nats : float
+            On the log-odds of the statistic.
+        """
         return self.gamma if self.adaptive is None else self.adaptive.gamma(self.gamma, shift_nats)
 
     def rule(self) -> SustainedRule:
@@ -132,6 +155,11 @@ class CueingPolicy:
     @classmethod
     def from_dict(cls, data: object) -> "CueingPolicy":
         """Return the policy that `to_dict` wrote; unknown keys are ignored.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------
@@ -183,6 +211,13 @@ class CueingPolicies:
     def for_alpha(self, alpha: float, miss_rate: float = 0.0) -> CueingPolicy:
         """Return the policy of a budget, calibrated at the given miss rate (0 or 1 in a trained model).
 
+        Parameters
+        ----------
+        alpha : float
+            Budget.
+        miss_rate : float
+            beta of the co-evidence that the statistic was made with.
+
         Raises
         ------
         InvalidArgumentError
@@ -207,6 +242,11 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.f
     sustain_hops : int
         k >= 1.
 
+    Returns
+    -------
+    ndarray, shape (windows,)
+        Of the statistic's own scale.
+
     Examples
     --------
     >>> sustained_statistic([0.2, 0.9, 0.8, 0.1], sustain_hops=2)
@@ -222,6 +262,18 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.f
 
 def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
     """Return where the last k hops all held, shape (windows,): `SustainedRule` over a whole recording.
+
+    Parameters
+    ----------
+    held : array_like of bool, shape (windows,)
+        Where the statistic is at or above the threshold.
+    sustain_hops : int
+        k >= 1.
+
+    Returns
+    -------
+    ndarray of bool, shape (windows,)
+        False in the first k - 1 windows.
 
     Examples
     --------
@@ -240,6 +292,11 @@ def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1
         Columns front, left, none, right.
     hazard_columns : tuple of int
         Which of them are hazards.
+
+    Returns
+    -------
+    ndarray of bool, shape (windows,)
+        Ties go to the first class.
 
     Examples
     --------

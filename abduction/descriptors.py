@@ -70,7 +70,13 @@ class Coupling:
         in_range("std", self.std, 0.0, np.inf, open_low=True, open_high=True)
 
     def expected(self, radial_speed_m_s: ArrayLike) -> Numbers:
-        """Return the value on every curve, shape (curves, n)."""
+        """Return the value on every curve, shape (curves, n).
+
+        Parameters
+        ----------
+        radial_speed_m_s : array_like, shape (n,)
+            v_r, m/s, positive while receding.
+        """
         speed = np.asarray(radial_speed_m_s, dtype=np.float64)
         return np.stack([np.interp(speed, self.speed_m_s, curve) for curve in self.curves])
 
@@ -78,6 +84,13 @@ class Coupling:
         r"""Return log p(value | c, v_r) at each speed, shape (n,), nats.
 
         .. math:: p = \frac{1}{G} \sum_g N\big(value;\ f_g(v_r),\ \sigma_c^2 + \sigma_{value}^2\big)
+
+        Parameters
+        ----------
+        value, value_std : float
+            Measured value and its standard deviation, in the unit of the curve.
+        radial_speed_m_s : array_like, shape (n,)
+            v_r, m/s.
         """
         expected = self.expected(radial_speed_m_s)
         variance = self.std**2 + value_std**2
@@ -129,7 +142,13 @@ class Descriptor:
             raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
 
     def log_speed_prior(self, radial_speed_m_s: Numbers) -> Numbers:
-        """Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats."""
+        """Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
+
+        Parameters
+        ----------
+        radial_speed_m_s : ndarray, shape (n,)
+            Grid of v_r, m/s.
+        """
         log_weight = -0.5 * ((radial_speed_m_s - self.speed_mean_m_s) / self.speed_std_m_s) ** 2
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
 
@@ -140,6 +159,16 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
     .. math:: f = \max\Big( f_{idle},\ \frac{n_f\, G\, |v|}{2 \pi R} \Big)
 
     with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
+
+    Parameters
+    ----------
+    std_hz : float
+        Scatter about the curves, Hz.
+
+    Returns
+    -------
+    Coupling
+        Hz over m/s.
 
     Examples
     --------
@@ -158,6 +187,16 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 10 km/h it is held constant.
 
+    Parameters
+    ----------
+    std_db : float
+        Scatter about the curve, dB.
+
+    Returns
+    -------
+    Coupling
+        dB over m/s.
+
     Examples
     --------
     >>> tyre_noise_shape().expected([5.0, 10.0, 20.0]).round(0)
@@ -173,6 +212,16 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
 def doppler_trajectory(std: float = 0.01) -> Coupling:
     """Ratio of the frequencies heard before and after a pass-by: (c + v) / (c - v).
 
+    Parameters
+    ----------
+    std : float
+        Scatter about the curve, a ratio.
+
+    Returns
+    -------
+    Coupling
+        A ratio over m/s.
+
     Examples
     --------
     >>> doppler_trajectory().expected([10.0]).round(3)
@@ -184,13 +233,35 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
 
 
 def car() -> Descriptor:
-    """Return a motor vehicle that approaches at town speed, all three couplings in place."""
+    """Return a motor vehicle that approaches at town speed, all three couplings in place.
+
+    Returns
+    -------
+    Descriptor
+        With three couplings.
+
+    Examples
+    --------
+    >>> car().name
+    'motor_vehicle'
+    """
     couplings = (engine_line(), tyre_noise_shape(), doppler_trajectory())
     return Descriptor("motor_vehicle", ("car", "truck", "bus"), 0.9, 8.0, 4.0, couplings)
 
 
 def motorcycle() -> Descriptor:
-    """Return a motorcycle: faster, with an engine line of its own gearing left open."""
+    """Return a motorcycle: faster, with an engine line of its own gearing left open.
+
+    Returns
+    -------
+    Descriptor
+        With the Doppler coupling only.
+
+    Examples
+    --------
+    >>> motorcycle().name
+    'motorcycle'
+    """
     return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
 
 

@@ -110,6 +110,11 @@ class EnsembleModel:
     def at_site(self, reference: SiteReference) -> "EnsembleModel":
         """Return the model with another reference in place of the training sites' mean.
 
+        Parameters
+        ----------
+        reference : SiteReference
+            What the site is like.
+
         Raises
         ------
         InvalidArgumentError
@@ -137,12 +142,22 @@ class EnsembleModel:
     def log_likelihoods(self, X: ArrayLike) -> Numbers:
         r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
 
-        Parameters and errors are those of `predict_proba`.
+        Errors are those of `predict_proba`.
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features) or (n, 4 * features)
+            As for `predict_proba`.
         """
         return explanation_ratios(self.predict_proba(X), self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of one window, shape (features,) or (4 * features,).
+
+        Parameters
+        ----------
+        feature : array_like, shape (features,) or (4 * features,)
+            One window, with its reference or without.
 
         Raises
         ------
@@ -165,6 +180,11 @@ class EnsembleModel:
     @classmethod
     def from_dict(cls, data: object) -> "EnsembleModel":
         """Return the model that `to_dict` wrote; unknown keys are ignored.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------

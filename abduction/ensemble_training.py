@@ -93,6 +93,11 @@ class SiteEnsembleClassifier:
         y : array_like of str, shape (n,)
             front, left, none or right.
 
+        Returns
+        -------
+        SiteEnsembleClassifier
+            Itself.
+
         Raises
         ------
         InvalidArgumentError
@@ -113,7 +118,13 @@ class SiteEnsembleClassifier:
         return self
 
     def predict_proba(self, X: ArrayLike) -> Numbers:
-        """Return posteriors of front, left, none, right, shape (n, 4)."""
+        """Return posteriors of front, left, none, right, shape (n, 4).
+
+        Parameters
+        ----------
+        X : array_like, shape (n, 4 * features)
+            Windows with the references of their sites behind them.
+        """
         return self.model_.predict_proba(X)
 
 

@@ -67,7 +67,13 @@ class Expert:
             raise InvalidArgumentError("scale: expected positive numbers")
 
     def log_posteriors(self, seen: Numbers) -> Numbers:
-        """Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4)."""
+        """Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4).
+
+        Parameters
+        ----------
+        seen : ndarray, shape (n, inputs)
+            Its view of the windows.
+        """
         return log_softmax((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
     def to_dict(self) -> dict[str, Any]:
@@ -78,6 +84,11 @@ class Expert:
     @classmethod
     def from_dict(cls, data: object) -> "Expert":
         """Return the expert that `to_dict` wrote; unknown keys are ignored.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------
@@ -105,6 +116,11 @@ def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -
     reference : ndarray, shape (n, 3 * features)
         Mean, median and quiet reference behind one another.
 
+    Returns
+    -------
+    dict of str to ndarray, shape (n, inputs)
+        By name.
+
     Examples
     --------
     >>> expert_views(["median"], np.full((1, 2), 3.0), np.array([[0.0, 0.0, 1.0, 2.0, 0.0, 0.0]]))
@@ -122,6 +138,16 @@ def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -
 def log_softmax(sums: Numbers) -> Numbers:
     """Return the rows less the log of their summed exponentials.
 
+    Parameters
+    ----------
+    sums : ndarray, shape (n, classes)
+        Any numbers.
+
+    Returns
+    -------
+    ndarray, shape (n, classes)
+        Logarithms of rows that sum to one.
+
     Examples
     --------
     >>> log_softmax(np.zeros((1, 4))).round(3)
@@ -132,11 +158,43 @@ def log_softmax(sums: Numbers) -> Numbers:
 
 
 def total(values: Numbers) -> Numbers:
-    """Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand."""
+    """Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, columns)
+        Any numbers.
+
+    Returns
+    -------
+    ndarray, shape (n, 1)
+        Sums of rows.
+
+    Examples
+    --------
+    >>> total(np.array([[1.0, 2.0, 3.0]]))
+    array([[6.]])
+    """
     return np.asarray(np.sort(values, axis=1).sum(axis=1, keepdims=True))
 
 
 def split_reference(X: Numbers) -> tuple[Numbers, Numbers]:
-    """Part windows with a reference behind them into log-levels and references."""
+    """Part windows with a reference behind them into log-levels and references.
+
+    Parameters
+    ----------
+    X : ndarray, shape (n, 4 * features)
+        A level and its site's three statistics, side by side.
+
+    Returns
+    -------
+    levels, reference : ndarray, shape (n, features) and (n, 3 * features)
+        Natural logarithms.
+
+    Examples
+    --------
+    >>> split_reference(np.array([[1.0, 0.1, 0.2, 0.3]]))
+    (array([[0.]]), array([[0.1, 0.2, 0.3]]))
+    """
     n_features = X.shape[1] // (1 + len(KINDS))
     return log_levels(X[:, :n_features]), X[:, n_features:]

@@ -20,6 +20,11 @@ def combined_information(parts: Sequence[ArrayLike]) -> Matrix:
     parts : sequence of array_like, each of shape (p, p)
         Symmetric, positive semi-definite.
 
+    Returns
+    -------
+    ndarray, shape (p, p)
+        J.
+
     Raises
     ------
     InvalidArgumentError
@@ -48,6 +53,11 @@ def gaussian_information(slope: ArrayLike, covariance: ArrayLike) -> Matrix:
         H, derivative of the mean observation by the state.
     covariance : array_like, shape (n, n)
         R, positive definite.
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+        J.
 
     Raises
     ------
@@ -92,6 +102,11 @@ def common_cause_information(
     effects : sequence of array_like, each of shape (n_m,)
         g_m.
 
+    Returns
+    -------
+    ndarray, shape (p, p)
+        J.
+
     Raises
     ------
     InvalidArgumentError
@@ -120,7 +135,22 @@ def claimed_covariance(
 
     with :math:`S_m = R_m + g_m g_m^T` and :math:`J_s = \sum_m H_m^T S_m^{-1} H_m`.
 
-    Parameters and errors are those of `common_cause_information`; also if the sum is singular.
+    Errors are those of `common_cause_information`; also if the sum is singular.
+
+    Parameters
+    ----------
+    slopes, covariances, effects : sequence of array_like
+        As for `common_cause_information`.
+
+    Returns
+    -------
+    claimed, true : ndarray, shape (p, p)
+        Covariances of the estimate.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As `common_cause_information`, and if the state cannot be told even if (A1) held.
 
     Examples
     --------
@@ -145,6 +175,16 @@ def claimed_covariance(
 
 def at_least(larger: ArrayLike, smaller: ArrayLike) -> bool:
     """Tell whether one information matrix is at least the other in the Loewner order.
+
+    Parameters
+    ----------
+    larger, smaller : array_like, shape (p, p)
+        Symmetric.
+
+    Returns
+    -------
+    bool
+        Whether the difference has no negative eigenvalue beyond rounding.
 
     Examples
     --------

@@ -51,7 +51,13 @@ class Background:
     std: float
 
     def log_density(self, value: float) -> float:
-        """Return the log density at a value, nats."""
+        """Return the log density at a value, nats.
+
+        Parameters
+        ----------
+        value : float
+            In the unit of the background.
+        """
         return float(-0.5 * ((value - self.mean) / self.std) ** 2 - np.log(self.std * np.sqrt(2 * pi)))
 
 
@@ -83,7 +89,13 @@ class Sector:
     std_rad: float
 
     def log_prior(self, azimuths_rad: Numbers) -> Numbers:
-        """Return log P(theta) on a grid, normalised over it, shape (n,), nats."""
+        """Return log P(theta) on a grid, normalised over it, shape (n,), nats.
+
+        Parameters
+        ----------
+        azimuths_rad : ndarray, shape (n,)
+            Grid, radians.
+        """
         log_weight = -0.5 * ((azimuths_rad - self.azimuth_rad) / self.std_rad) ** 2
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
 
@@ -159,6 +171,13 @@ class GroundedAnswer:
         arg max over z.
     class_posterior : dict of str to float
         P(c | y, hidden).
+
+    Examples
+    --------
+    >>> hidden = HiddenState("left", "motor_vehicle", ("car",), 0.5, 8.0, -3.0)
+    >>> evidence = SignatureEvidence(("left", "right"), (1.2, -0.3), -0.5, 0.1)
+    >>> GroundedAnswer(evidence, hidden, {"motor_vehicle": 1.0}).best.direction
+    'left'
     """
 
     evidence: SignatureEvidence
@@ -184,6 +203,11 @@ def ground(
         Classes of road users, at least one, names all different.
     settings : GroundedSettings, optional
         Sectors and switched-off couplings.
+
+    Returns
+    -------
+    GroundedAnswer
+        Class, speed and evidence after physics.
 
     Raises
     ------

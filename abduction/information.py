@@ -19,6 +19,18 @@ class Information(NamedTuple):
 
     `lower` holds for any classifier on windows that it was not trained on, in expectation; `plug_in` for a
     calibrated one, and is too high for one that is too sure of itself.
+
+    Parameters
+    ----------
+    lower : float
+        Variational lower bound.
+    plug_in : float
+        Entropy of the labels less the mean entropy of the posteriors.
+
+    Examples
+    --------
+    >>> Information(lower=0.41, plug_in=0.45).lower
+    0.41
     """
 
     lower: float
@@ -27,6 +39,16 @@ class Information(NamedTuple):
 
 def entropy_bits(probabilities: ArrayLike) -> float:
     r"""Return :math:`H = -\sum_k p_k \log_2 p_k`.
+
+    Parameters
+    ----------
+    probabilities : array_like, shape (K,)
+        Sum to one.
+
+    Returns
+    -------
+    float
+        Bits.
 
     Raises
     ------
@@ -50,6 +72,11 @@ def mutual_information_bits(joint: ArrayLike) -> float:
     ----------
     joint : array_like, shape (states, observations)
         Probabilities that sum to one.
+
+    Returns
+    -------
+    float
+        Bits.
 
     Raises
     ------
@@ -85,6 +112,11 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
     states : array_like of int, shape (n,)
         True states, 0 to K - 1.
 
+    Returns
+    -------
+    Information
+        Bits.
+
     Raises
     ------
     InvalidArgumentError
@@ -105,6 +137,18 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
 
 def state_entropy_bits(states: ArrayLike, count: int) -> float:
     """Return the entropy of labels, its small-sample bias added back, at most log2 of their number.
+
+    Parameters
+    ----------
+    states : array_like of int, shape (n,)
+        Labels, from 0.
+    count : int
+        K.
+
+    Returns
+    -------
+    float
+        Bits, at most log2 K.
 
     Examples
     --------
@@ -134,6 +178,11 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike, n
         True states; those with no more than `neighbours` windows are left out.
     neighbours : int
         k >= 1.
+
+    Returns
+    -------
+    float
+        Bits; may be below zero by chance.
 
     Raises
     ------
@@ -189,6 +238,11 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
     states : int
         K >= 2.
 
+    Returns
+    -------
+    float
+        In [0, 1].
+
     Raises
     ------
     InvalidArgumentError
@@ -211,7 +265,19 @@ def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
     with the binary entropy h, solved for the smallest P_e. Never below `fano_bound`, and attained by the
     symmetric channel.
 
-    Parameters and errors are those of `fano_bound`.
+    Errors are those of `fano_bound`.
+
+    Parameters
+    ----------
+    entropy, information : float
+        H(z) and I(z; x), bits.
+    states : int
+        K >= 2.
+
+    Returns
+    -------
+    float
+        In [0, 1 - 1/K].
 
     Examples
     --------
@@ -244,6 +310,11 @@ def conditional_information(acoustic: ArrayLike, both: ArrayLike, states: ArrayL
     states : array_like of int, shape (n,)
         True states.
 
+    Returns
+    -------
+    float
+        Bits.
+
     Raises
     ------
     InvalidArgumentError
@@ -273,6 +344,11 @@ def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> Numbers:
         Posteriors of each at the same prior.
     prior : array_like, shape (K,)
         p(z), positive.
+
+    Returns
+    -------
+    ndarray, shape (n, K)
+        Rows that sum to one.
 
     Raises
     ------

@@ -18,6 +18,11 @@ def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
     segments : int
         Stretches of time that a feature vector covers.
 
+    Returns
+    -------
+    ndarray, shape of `X`
+        A copy.
+
     Examples
     --------
     >>> mirror_features(np.array([[1, 2, 3, 4, 5, 6]]))

@@ -32,6 +32,11 @@ def neyman_pearson_threshold(
     sustain_hops : int
         k, consecutive hops that the statistic has to hold.
 
+    Returns
+    -------
+    float
+        Of the statistic's own scale.
+
     Raises
     ------
     InvalidArgumentError

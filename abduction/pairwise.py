@@ -22,6 +22,16 @@ SMALLEST_PROBABILITY = 1e-7
 def class_pairs(n_classes: int) -> list[tuple[int, int]]:
     """Return all pairs i < j in the order of a one-against-one machine.
 
+    Parameters
+    ----------
+    n_classes : int
+        K.
+
+    Returns
+    -------
+    list of (int, int)
+        K (K - 1) / 2 pairs.
+
     Examples
     --------
     >>> class_pairs(3)
@@ -39,6 +49,11 @@ def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]
         P(i | i or j) for each of `class_pairs`.
     n_classes : int
         At least 2.
+
+    Returns
+    -------
+    ndarray, shape (n, classes)
+        Rows that sum to one.
 
     Examples
     --------

@@ -20,6 +20,18 @@ _RIDGE = 1e-12
 def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> NDArray[np.float64]:
     """Return 1 / (1 + exp(slope * value + offset)) without overflow, broadcast.
 
+    Parameters
+    ----------
+    value : ndarray
+        Any shape.
+    slope, offset : array_like
+        Broadcast against it.
+
+    Returns
+    -------
+    ndarray
+        In (0, 1).
+
     Examples
     --------
     >>> sigmoid(np.array([0.0, 1e6]), -1.0, 0.0)
@@ -38,6 +50,11 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
         Decision values of samples that the machine was not trained on.
     positive : array_like of bool, shape (n,)
         Labels.
+
+    Returns
+    -------
+    slope, offset : float
+        A and B.
 
     Raises
     ------

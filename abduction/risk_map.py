@@ -132,6 +132,11 @@ def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
     hazards : array_like of bool, shape (n,)
         Whether a hidden hazard was there.
 
+    Returns
+    -------
+    IsotonicMap
+        Never falling.
+
     Raises
     ------
     InvalidArgumentError
@@ -156,7 +161,17 @@ def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
 def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
     """Fit the sigmoid of hazard labels on the log-odds of statistics; a falling fit is held flat.
 
-    Parameters and errors are those of `fit_isotonic`.
+    Errors are those of `fit_isotonic`.
+
+    Parameters
+    ----------
+    statistics, hazards : array_like, shape (n,)
+        Scores in [0, 1], and 0 or 1.
+
+    Returns
+    -------
+    PlattMap
+        Never falling.
 
     References
     ----------
@@ -189,6 +204,11 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
         How many independent samples they are worth; n where not given. Windows of one recording repeat each
         other: see `abduction.correlation`.
 
+    Returns
+    -------
+    RiskMap
+        A `PlattMap` or an `IsotonicMap`.
+
     Raises
     ------
     InvalidArgumentError
@@ -205,6 +225,16 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
 
 def risk_map_from_dict(data: object) -> RiskMap:
     """Return the map that `to_dict` wrote.
+
+    Parameters
+    ----------
+    data : object
+        Decoded JSON.
+
+    Returns
+    -------
+    RiskMap
+        A `PlattMap` or an `IsotonicMap`.
 
     Raises
     ------

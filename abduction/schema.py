@@ -12,6 +12,16 @@ MOST_ITEMS = 100_000
 def schema_stamp(name: str, version: str) -> dict[str, Any]:
     """Return the entry that names schema and version.
 
+    Parameters
+    ----------
+    name, version : str
+        Of the schema.
+
+    Returns
+    -------
+    dict
+        To be merged into the values.
+
     Examples
     --------
     >>> schema_stamp("worldstate.MissRateTable", "1.0.0")
@@ -31,6 +41,11 @@ def check_schema(data: object, name: str, version: str, source: object) -> Mappi
         What the caller writes itself.
     source : object
         Where `data` comes from; errors begin with it.
+
+    Returns
+    -------
+    mapping
+        The same data.
 
     Raises
     ------
@@ -58,6 +73,18 @@ def check_schema(data: object, name: str, version: str, source: object) -> Mappi
 def read_number(value: object, name: str) -> float:
     """Return a finite number; text and booleans are none.
 
+    Parameters
+    ----------
+    value : object
+        Decoded JSON.
+    name : str
+        What the message calls it.
+
+    Returns
+    -------
+    float
+        Finite.
+
     Raises
     ------
     InvalidArgumentError
@@ -77,6 +104,18 @@ def read_number(value: object, name: str) -> float:
 def read_numbers(value: object, name: str) -> tuple[float, ...]:
     """Return a list of finite numbers.
 
+    Parameters
+    ----------
+    value : object
+        Decoded JSON.
+    name : str
+        What the message calls it.
+
+    Returns
+    -------
+    tuple of float
+        All finite.
+
     Raises
     ------
     InvalidArgumentError
@@ -92,6 +131,18 @@ def read_numbers(value: object, name: str) -> tuple[float, ...]:
 
 def read_rows(value: object, name: str) -> tuple[tuple[float, ...], ...]:
     """Return a list of lists of finite numbers.
+
+    Parameters
+    ----------
+    value : object
+        Decoded JSON.
+    name : str
+        What the message calls it.
+
+    Returns
+    -------
+    tuple of tuple of float
+        All finite.
 
     Raises
     ------

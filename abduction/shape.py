@@ -20,6 +20,11 @@ def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
     segments : int
         Stretches of time, at least two; the change is that from the first to the last.
 
+    Returns
+    -------
+    ndarray, shape (n, 13 * segments + 5)
+        In the unit of the log-levels, directions in steps.
+
     Examples
     --------
     >>> rising = np.log([[1.0, 2.0, 1.0, 1.0, 4.0, 1.0]])

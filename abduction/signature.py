@@ -135,19 +135,34 @@ class SignatureModel:
     def predict_proba(self, X: ArrayLike) -> Numbers:
         """Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
 
-        Parameters and errors are those of `decision_values`.
+        Errors are those of `decision_values`.
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
         """
         return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
 
     def log_likelihoods(self, X: ArrayLike) -> Numbers:
         r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
 
-        Parameters and errors are those of `decision_values`.
+        Errors are those of `decision_values`.
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
         """
         return explanation_ratios(self.predict_proba(X), self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of one feature vector, shape (features,).
+
+        Parameters
+        ----------
+        feature : array_like, shape (features,)
+            One window.
 
         Raises
         ------
@@ -164,6 +179,11 @@ class SignatureModel:
     @classmethod
     def from_dict(cls, data: object) -> "SignatureModel":
         """Return the model that `to_dict` wrote; unknown keys are ignored.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------
@@ -191,6 +211,11 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Number
     miss_rate : float
         beta: 1 gives the published statistic, 0 removes the visible explanation.
 
+    Returns
+    -------
+    ndarray, shape (n,)
+        In [0, 1].
+
     Examples
     --------
     >>> [hazard_statistic([[0.5, 0.3, 0.1, 0.1]], beta).round(3).item() for beta in (1.0, 0.0)]
@@ -203,12 +228,46 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Number
 
 
 def explanation_ratios(posteriors: Numbers, class_prior: ArrayLike) -> Numbers:
-    """Return log P_c - log pi_c of left, right, visible, none by window, shape (n, 4), nats."""
+    """Return log P_c - log pi_c of left, right, visible, none by window, shape (n, 4), nats.
+
+    Parameters
+    ----------
+    posteriors : ndarray, shape (n, 4)
+        Of front, left, none, right.
+    class_prior : array_like, shape (4,)
+        In the same order.
+
+    Returns
+    -------
+    ndarray, shape (n, 4)
+        Nats.
+
+    Examples
+    --------
+    >>> explanation_ratios(np.array([[0.1, 0.4, 0.4, 0.1]]), [0.25, 0.25, 0.25, 0.25]).round(2)
+    array([[ 0.47, -0.92, -0.92,  0.47]])
+    """
     ratios = np.log(posteriors) - np.log(class_prior)
     return np.asarray(ratios[:, EXPLANATION_COLUMNS])
 
 
 def evidence_of(log_likelihoods: Numbers) -> SignatureEvidence:
-    """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence."""
+    """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
+
+    Parameters
+    ----------
+    log_likelihoods : ndarray, shape (4,)
+        Of left, right, visible, none; nats.
+
+    Returns
+    -------
+    SignatureEvidence
+        Directions left and right.
+
+    Examples
+    --------
+    >>> evidence_of(np.array([0.5, -1.0, -0.9, 0.4])).hidden
+    (0.5, -1.0)
+    """
     left, right, visible, none = log_likelihoods.tolist()
     return SignatureEvidence(DIRECTIONS, (left, right), visible, none)

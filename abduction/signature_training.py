@@ -29,11 +29,30 @@ class Classifier(Protocol):
     """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Learn from features (n, features) and class names (n,)."""
+        """Learn from features (n, features) and class names (n,).
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+        y : array_like of str, shape (n,)
+            Class names.
+
+        Returns
+        -------
+        Classifier
+            Itself.
+        """
         ...
 
     def predict_proba(self, X: ArrayLike) -> Numbers:
-        """Return posteriors of front, left, none, right, shape (n, 4)."""
+        """Return posteriors of front, left, none, right, shape (n, 4).
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+        """
         ...
 
 
@@ -70,6 +89,18 @@ class PublishedClassifier:
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit on features, shape (n, features), and class names, shape (n,).
 
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+        y : array_like of str, shape (n,)
+            Class names.
+
+        Returns
+        -------
+        PublishedClassifier
+            Itself.
+
         Raises
         ------
         InvalidArgumentError
@@ -94,7 +125,13 @@ class PublishedClassifier:
         return self
 
     def predict_proba(self, X: ArrayLike) -> Numbers:
-        """Return posteriors of front, left, none, right, shape (n, 4)."""
+        """Return posteriors of front, left, none, right, shape (n, 4).
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features)
+            One row a window.
+        """
         return self.model_.predict_proba(X)
 
     def _fit_sigmoids(self, standard: Numbers, codes: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
@@ -130,6 +167,11 @@ def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
     X : ndarray, shape (n, 2 * azimuths)
     y : ndarray of str, shape (n,)
 
+    Returns
+    -------
+    X, y : ndarray
+        Longer by the number of hazard windows.
+
     Examples
     --------
     >>> mirror_hazards(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array(["left", "none"]))[1]
@@ -142,6 +184,18 @@ def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
 
 def checked_labels(y: ArrayLike, n: int) -> Labels:
     """Return class names as an array; the sides stand in for each other, the other classes must be there.
+
+    Parameters
+    ----------
+    y : array_like of str, shape (n,)
+        Class names.
+    n : int
+        How many there should be.
+
+    Returns
+    -------
+    ndarray of str, shape (n,)
+        As they came.
 
     Raises
     ------

@@ -61,6 +61,11 @@ class SiteReference:
     def from_row(cls, row: ArrayLike) -> "SiteReference":
         """Return the reference whose `row` this is.
 
+        Parameters
+        ----------
+        row : array_like, shape (3 * features,)
+            The statistics, one after the other.
+
         Raises
         ------
         InvalidArgumentError
@@ -72,12 +77,28 @@ class SiteReference:
         return cls(*values.reshape(len(KINDS), -1))
 
     def shifted(self, offset: ArrayLike) -> "SiteReference":
-        """Return the reference of a site whose log-levels are higher by `offset`, shape (features,)."""
+        """Return the reference of a site whose log-levels are higher by `offset`, shape (features,).
+
+        Parameters
+        ----------
+        offset : array_like, shape (features,)
+            Natural logarithms.
+        """
         return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
 
 
 def log_levels(X: ArrayLike) -> Numbers:
     """Return the natural logarithm of levels, silence held at 1e-4.
+
+    Parameters
+    ----------
+    X : array_like, any shape
+        Levels >= 0.
+
+    Returns
+    -------
+    ndarray, same shape
+        Natural logarithms.
 
     Examples
     --------
@@ -90,10 +111,25 @@ def log_levels(X: ArrayLike) -> Numbers:
 def site_reference(levels: ArrayLike) -> SiteReference:
     """Return the reference of a site from its windows, shape (windows, features), natural logarithms.
 
+    Parameters
+    ----------
+    levels : array_like, shape (windows, features)
+        Natural logarithms of levels.
+
+    Returns
+    -------
+    SiteReference
+        Statistics over the windows.
+
     Raises
     ------
     InvalidArgumentError
         If there is no window or a number is not finite.
+
+    Examples
+    --------
+    >>> site_reference(np.array([[0.0, 1.0], [2.0, 3.0]])).row
+    array([1., 2., 1., 2., 0., 1.])
     """
     windows = finite_array("levels", levels, (None, None))
     if not len(windows):

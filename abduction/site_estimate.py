@@ -96,7 +96,13 @@ class SiteEstimate:
 
     @classmethod
     def start(cls, n_features: int) -> "SiteEstimate":
-        """Return the estimate of one who has heard nothing."""
+        """Return the estimate of one who has heard nothing.
+
+        Parameters
+        ----------
+        n_features : int
+            Of a window.
+        """
         return cls(np.zeros(n_features))
 
     def updated(self, feature: ArrayLike, dt_s: float, settings: SiteEstimateSettings) -> "SiteEstimate":
@@ -124,6 +130,13 @@ class SiteEstimate:
     def reference(self, model: EnsembleModel, settings: SiteEstimateSettings) -> SiteReference:
         """Return what windows are to be compared with; that of the training sites before anything was heard.
 
+        Parameters
+        ----------
+        model : EnsembleModel
+            Whose training sites stand in before anything was heard.
+        settings : SiteEstimateSettings
+            How fast what was heard counts.
+
         Raises
         ------
         InvalidArgumentError
@@ -145,6 +158,11 @@ class SiteEstimate:
     @classmethod
     def from_dict(cls, data: object) -> "SiteEstimate":
         """Return the estimate that `to_dict` wrote; unknown keys are ignored.
+
+        Parameters
+        ----------
+        data : object
+            Decoded JSON.
 
         Raises
         ------

@@ -9,6 +9,16 @@ Numbers = NDArray[np.float64]
 def standardisation(inputs: Numbers) -> tuple[Numbers, Numbers]:
     """Return mean and standard deviation of each column; 1 where a column never changes.
 
+    Parameters
+    ----------
+    inputs : ndarray, shape (n, columns)
+        Any numbers.
+
+    Returns
+    -------
+    mean, std : ndarray, shape (columns,)
+        In the units of the columns.
+
     Examples
     --------
     >>> standardisation(np.array([[1.0, 5.0], [3.0, 5.0]]))
