@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import check_shape, finite_array, in_range
+from worldstate.checks import check_shape, finite_array
 from worldstate.errors import InvalidArgumentError
 
 from .co_evidence import CoEvidence
@@ -70,13 +70,11 @@ class Posterior:
         return float(np.exp(self.log_probabilities[-1]))
 
 
-def abduce(
-    log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence, evidence_weight: float = 1.0
-) -> Posterior:
+def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> Posterior:
     r"""Weigh the explanations of one observation.
 
     .. math::
-        p(h \mid y, V) = \pi_h\, \ell_h(y)^\kappa\, p(V \mid h) \,/\, Z,
+        p(h \mid y, V) = \pi_h\, \ell_h(y)\, p(V \mid h) \,/\, Z,
 
     eq. (post) with V absent: :math:`p(V \mid h)` is :math:`\beta_c(\theta, d)` for the visible explanation
     and 1 for the others.
@@ -89,9 +87,6 @@ def abduce(
         Log-likelihoods of the observation.
     co_evidence : CoEvidence
         What the channel that was asked answered.
-    evidence_weight : float
-        kappa in (0, 1]. Windows that overlap repeat most of their samples: at a 0.1-s hop a 1-s window would
-        be counted ten times by a recursion that took each for independent.
 
     Raises
     ------
@@ -111,8 +106,7 @@ def abduce(
     (0.742, 0.128)
     """
     prior = _checked_log_prior(log_prior, len(evidence.directions))
-    weight = in_range("evidence_weight", evidence_weight, 0.0, 1.0, open_low=True)
-    log_likelihood = _log_likelihood(evidence, co_evidence, weight)
+    log_likelihood = _log_likelihood(evidence, co_evidence)
     joint = prior + log_likelihood
     log_evidence = _log_sum(joint)
     if log_evidence == -np.inf:
@@ -125,9 +119,7 @@ def abduce(
     )
 
 
-def log_lambda(
-    log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence, evidence_weight: float = 1.0
-) -> float:
+def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> float:
     r"""Return the log of the mixture likelihood ratio that the Neyman-Pearson test thresholds, nats.
 
     .. math::
@@ -138,7 +130,21 @@ def log_lambda(
     source is beforehand; where that prior is zero, all directions weigh alike. +inf where neither other
     explanation is possible.
 
-    Parameters and errors are those of `abduce`.
+    Errors are those of `abduce`.
+
+    Parameters
+    ----------
+    log_prior : array_like, shape (K + 2,)
+        Log prior of the explanations, nats.
+    evidence : SignatureEvidence
+        Log-likelihoods of the signature.
+    co_evidence : Absent, Present or Unqueried
+        Answer of the co-evidence channel.
+
+    Returns
+    -------
+    float
+        Nats.
 
     Examples
     --------
@@ -150,8 +156,7 @@ def log_lambda(
     2.434
     """
     prior = _checked_log_prior(log_prior, len(evidence.directions))
-    weight = in_range("evidence_weight", evidence_weight, 0.0, 1.0, open_low=True)
-    return _log_ratio(prior, _log_likelihood(evidence, co_evidence, weight))
+    return _log_ratio(prior, _log_likelihood(evidence, co_evidence))
 
 
 def statistic(
@@ -174,6 +179,11 @@ def statistic(
         What the channel that was asked answered.
     reference_prior : sequence of float, shape (K + 2,)
         Probabilities, not logs, of (hidden_1 .. hidden_K, visible, none).
+
+    Returns
+    -------
+    float
+        In [0, 1].
 
     Raises
     ------
@@ -204,12 +214,9 @@ def _checked_log_prior(log_prior: ArrayLike, directions: int) -> NDArray[np.floa
     return prior
 
 
-def _log_likelihood(
-    evidence: SignatureEvidence, co_evidence: CoEvidence, weight: float
-) -> NDArray[np.float64]:
+def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> NDArray[np.float64]:
     hidden, visible, none = co_evidence.log_likelihoods()
-    log_likelihood = np.empty(len(evidence.directions) + 2)
-    log_likelihood[:] = weight * evidence.log_likelihoods
+    log_likelihood = evidence.log_likelihoods
     log_likelihood[:-2] += hidden
     log_likelihood[-2:] += visible, none
     return log_likelihood

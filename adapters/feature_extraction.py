@@ -12,7 +12,7 @@ from worldstate.abduction.signature import CLASSES
 from worldstate.adapters.audio import AudioSource, open_audio
 from worldstate.adapters.csv_rows import read_rows
 from worldstate.adapters.feature_table import FeatureTable
-from worldstate.adapters.ovad import AUDIO_NAME
+from worldstate.adapters.ovad_layout import AUDIO_NAME
 from worldstate.errors import InputFileError
 from worldstate.frontend.array import MicrophoneArray
 from worldstate.frontend.feature import published_feature

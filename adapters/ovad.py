@@ -16,17 +16,12 @@ from numpy.typing import NDArray
 from worldstate.adapters.audio import AudioSource, open_audio
 from worldstate.adapters.csv_rows import read_rows
 from worldstate.adapters.detections import DetectionLog, read_detections
+from worldstate.adapters.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
 from worldstate.errors import InputFileError
 from worldstate.values import wrap_angle
 
 Label = Literal["left", "none", "right"]
 
-FRAME_RATE_HZ = 10.0
-LOG_NAME = "DataLog.csv"
-AUDIO_NAME = "out_multi.wav"
-# The data set's description names the first, its authors' code opens the second.
-DETECTION_NAMES = ("camera_baseline_results.json", "camera_baseline_detections.json")
-COLUMNS = ("ID", "Environment", "Class", "T0")
 MAX_T0_FRAME = 1_000_000
 # S or D for a standing or moving ego, then the junction: its type and number.
 ENVIRONMENT = re.compile(r"(?P<ego>[SD])(?P<junction>[A-Z][0-9]{1,3})", re.ASCII)

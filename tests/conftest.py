@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from worldstate.adapters.array_xml import write_array_xml
-from worldstate.adapters.ovad import DETECTION_NAMES, Recording
+from worldstate.adapters.ovad import Recording
+from worldstate.adapters.ovad_layout import DETECTION_NAMES
 from worldstate.cli.demo import simulate_approach
 from worldstate.frontend.array import roof_array_56
 

@@ -10,7 +10,8 @@ import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.adapters.ovad import DETECTION_NAMES, OvadDataset, Recording, read_id_list, to_base_link
+from worldstate.adapters.ovad import OvadDataset, Recording, read_id_list, to_base_link
+from worldstate.adapters.ovad_layout import DETECTION_NAMES
 from worldstate.errors import InputFileError
 
 HEADER = "ID,Environment,Class,T0"

@@ -82,6 +82,15 @@ def test_from_a_standing_to_a_moving_ego():
     assert figures["fpr_p_value"] >= 0.05
 
 
+def test_from_a_standing_to_a_moving_ego_by_the_pattern_above_the_quiet_windows():
+    passes = ("worldstate", "distant_site")
+    figures = compared("dynamic", "transfer", passes)["rows"]["distant_site"]
+    assert figures["auroc_macro"] >= 0.83
+    assert figures["auroc_pooled"] >= 0.82
+    assert figures["fpr_p_value"] >= 0.05
+    assert figures["ece"] <= figures["ece_floor"] + 2 * figures["ece_floor_std"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["lojo", "cv", "transfer"])
 @pytest.mark.parametrize("row", ["baseline", "baseline_absent", "loudest_direction"])
@@ -105,7 +114,7 @@ def test_the_command_prints_every_row_and_writes_what_it_scored(tmp_path, capsys
     assert command(*words, "--json", "--predictions", out) == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures["rows"]) == {
-        "baseline", "baseline_absent", "loudest_direction", "commissioning_drive",
+        "baseline", "baseline_absent", "loudest_direction", "commissioning_drive", "distant_site",
     }  # fmt: skip
     for row in (figures, *figures["rows"].values()):
         for key, (low, high) in row["intervals"].items():

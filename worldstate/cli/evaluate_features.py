@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from worldstate.cli.feature_options import add_table_options
 from worldstate.cli.output import print_summary
 from worldstate.cli.progress import progress_bar
 
@@ -26,7 +27,9 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --method worldstate  windows compared with the unlabelled reference of their site, taken from its other
                        recordings; mirror-symmetric ensemble; eq. (post) with the visible explanation removed.
                        "rows" and "gains" compare it with the baseline, with the untrained loudest direction,
-                       and with itself given hazard-free windows of the site (a commissioning drive)
+                       and with itself given hazard-free windows of the site (a commissioning drive);
+                       under transfer also with "distant_site": one expert of the pattern above the site's
+                       quiet windows, its risks shifted until hazards are as frequent as in training
 
 Thresholds and risk maps are set on inner out-of-fold scores. Figures are means over the seeds; intervals are
 the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
@@ -48,21 +51,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("table", type=Path, metavar="CSV", help="windows: feat0..feat59, Class, ID, ...")
-    parser.add_argument(
-        "--group",
-        choices=("static", "dynamic", "all"),
-        default="static",
-        help="standing ego, moving ego or both (default: %(default)s)",
-    )
+    add_table_options(parser)
     parser.add_argument(
         "--protocol",
         choices=("cv", "lojo", "transfer"),
         default="cv",
         help="who is held out (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--method", choices=("baseline", "worldstate"), default="baseline", help="(default: %(default)s)"
     )
     parser.add_argument("--model", type=Path, help="evaluate this model file; no cross-validation")
     parser.add_argument(
@@ -97,7 +91,13 @@ def _evaluate_method(
     arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
 ) -> tuple[Figures, "list[Predictions]"]:
     from worldstate.errors import InvalidArgumentError
-    from worldstate.evaluation.comparison import COMPARED, comparison, row_predictions, run_passes
+    from worldstate.evaluation.comparison import (
+        COMPARED,
+        COMPARED_AFAR,
+        comparison,
+        row_predictions,
+        run_passes,
+    )
     from worldstate.evaluation.feature_report import report
     from worldstate.evaluation.methods import ROWS
 
@@ -105,7 +105,8 @@ def _evaluate_method(
         if getattr(arguments, option) < 1:
             raise InvalidArgumentError(f"--{option}: expected at least 1, got {getattr(arguments, option)}")
     row = arguments.method
-    names = (row,) if row == "baseline" else (row, *COMPARED)
+    afar = arguments.protocol == "transfer"
+    names = (row,) if row == "baseline" else (row, *(COMPARED_AFAR if afar else COMPARED))
     methods = list(dict.fromkeys(ROWS[name].method for name in names))
     with progress_bar("evaluating", arguments.seeds * len(methods)) as bar:
         passes = run_passes(
@@ -114,7 +115,7 @@ def _evaluate_method(
             arguments.protocol,
             seeds=arguments.seeds,
             alpha=arguments.alpha,
-            train=_standing(whole, arguments) if arguments.protocol == "transfer" else None,
+            train=_standing(whole, arguments) if afar else None,
             jobs=arguments.jobs,
             on_pass=bar.advance,
         )

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from worldstate.cli.feature_options import add_table_options
 from worldstate.cli.output import print_summary
 from worldstate.cli.progress import progress_bar
 
@@ -28,16 +29,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("table", type=Path, metavar="CSV", help="windows: feat0..feat59, Class, ID, ...")
-    parser.add_argument(
-        "--group",
-        choices=("static", "dynamic", "all"),
-        default="static",
-        help="standing ego, moving ego or both (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--method", choices=("baseline", "worldstate"), default="baseline", help="(default: %(default)s)"
-    )
+    add_table_options(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     parser.add_argument(
         "--exclude",

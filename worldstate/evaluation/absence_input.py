@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from worldstate.adapters.ovad import LOG_NAME, OvadDataset, Recording
+from worldstate.adapters.ovad import OvadDataset, Recording
+from worldstate.adapters.ovad_layout import LOG_NAME
 from worldstate.adapters.video import VIDEO_NAME
 from worldstate.errors import InputFileError
 

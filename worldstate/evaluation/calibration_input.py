@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from worldstate.adapters.listen import measure_steps, open_source
-from worldstate.adapters.ovad import LOG_NAME, OvadDataset, Recording
+from worldstate.adapters.ovad import OvadDataset, Recording
+from worldstate.adapters.ovad_layout import LOG_NAME
 from worldstate.errors import InputFileError
 from worldstate.evaluation.hop_stream import HopStream, hop_stream, load_streams
 

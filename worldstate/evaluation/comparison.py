@@ -19,6 +19,8 @@ from .splits import Protocol
 
 BOOTSTRAP_SEED = 0
 COMPARED = ("baseline", "baseline_absent", "loudest_direction", "commissioning_drive")
+# Beside the method where it is used on another kind of driving than it was trained on.
+COMPARED_AFAR = (*COMPARED, "distant_site")
 
 
 def run_passes(

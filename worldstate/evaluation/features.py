@@ -6,18 +6,19 @@ from inner out-of-fold scores of the training windows.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.risk_map import fit_isotonic
-from worldstate.abduction.signature import CLASSES
+from worldstate.abduction.signature import CLASSES, hazard_statistic
 from worldstate.abduction.signature_training import Classifier
 from worldstate.adapters.feature_table import FeatureTable
 from worldstate.errors import InvalidArgumentError
 
 from .calibration import MISS_RATES, FitMap, WindowCalibration, between, calibrate_windows
+from .prevalence import matched_risk
 from .splits import Folds, Split
 
 Numbers = NDArray[np.float64]
@@ -124,6 +125,7 @@ def transfer(
     *,
     alpha: float,
     fit_map: FitMap = fit_isotonic,
+    match_prevalence: bool = False,
 ) -> dict[float, Predictions]:
     """Predict every window of one table by what was learned on another.
 
@@ -133,6 +135,8 @@ def transfer(
         Windows to learn from, threshold and map included, and windows to predict.
     inner_splits, make, rng, alpha, fit_map
         As for `cross_validate`.
+    match_prevalence : bool
+        Shift the risks at each junction until hazards are as frequent as in training; see `matched_risk`.
 
     Returns
     -------
@@ -149,15 +153,18 @@ def transfer(
         raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")
     inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits]
     probabilities = _trained(make, train, rng).predict_proba(test.features)
-    return {
-        beta: predict_with(test, probabilities, _calibration(train, inner, alpha, beta, fit_map), "transfer")
-        for beta in MISS_RATES
-    }
+    predictions = {}
+    for beta in MISS_RATES:
+        calibration = _calibration(train, inner, alpha, beta, fit_map)
+        one = predict_with(test, probabilities, calibration, "transfer")
+        if match_prevalence:
+            mean_risk = float(calibration.risk_map(hazard_statistic(inner[-1], beta)).mean())
+            one = replace(one, risk=matched_risk(one.risk, test, mean_risk))
+        predictions[beta] = one
+    return predictions
 
 
-def out_of_fold(
-    table: FeatureTable, folds: Folds, make: MakeClassifier, rng: np.random.Generator
-) -> Numbers:
+def out_of_fold(table: FeatureTable, folds: Folds, make: MakeClassifier, rng: np.random.Generator) -> Numbers:
     """Return posteriors of each window from a classifier trained on the other folds, shape (n, 4)."""
     probabilities = np.empty((len(table), len(CLASSES)))
     for fold in np.unique(folds):

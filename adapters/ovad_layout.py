@@ -1,0 +1,8 @@
+"""Names of files and columns in the layout of OVAD, for those who read it and those who write it."""
+
+LOG_NAME = "DataLog.csv"
+AUDIO_NAME = "out_multi.wav"
+# The data set's description names the first, its authors' code opens the second.
+DETECTION_NAMES = ("camera_baseline_results.json", "camera_baseline_detections.json")
+COLUMNS = ("ID", "Environment", "Class", "T0")
+FRAME_RATE_HZ = 10.0
