@@ -12,8 +12,12 @@ from hypothesis import strategies as st
 
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import read_detections
+from worldstate.adapters.ovad import OvadDataset
 from worldstate.adapters.simulation import (
+    KINDS,
+    OCCLUSIONS,
     SITES,
+    DatasetSettings,
     SimulationSettings,
     Site,
     draw_settings,
@@ -30,6 +34,7 @@ from worldstate.adapters.simulation.paths import trace_paths
 from worldstate.adapters.simulation.propagation import add_sources
 from worldstate.adapters.simulation.receiver import Receiver
 from worldstate.adapters.simulation.vehicle import drive, propulsion_level_db, rolling_level_db
+from worldstate.cli import simulate as cli
 from worldstate.cli.main import main
 from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
@@ -191,12 +196,14 @@ def test_line_of_sight_is_the_straight_line_past_the_corner():
 
 
 def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp_path):
-    rows = write_dataset(tmp_path / "one", 3, seed=5, duration_s=0.5)
+    """Two of a standing ego, one of a moving one; OVAD has no camera results of the latter."""
+    wanted = DatasetSettings(n_static=2, n_dynamic=1, seed=5, duration_s=0.5, kind="bicycle")
+    rows = write_dataset(tmp_path / "one", wanted)
     seen = []
-    write_dataset(tmp_path / "two", 3, seed=5, duration_s=0.5, jobs=2, progress=seen.append)
+    write_dataset(tmp_path / "two", wanted, jobs=2, progress=seen.append)
     assert seen == rows
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
-    assert len(files) == 3 * 3 + 1
+    assert len(files) == 2 * 3 + 2 + 1
     for name in files:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
@@ -204,7 +211,7 @@ def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp
         table = list(csv.DictReader(log))
     assert [list(row) for row in table] == [["ID", "Environment", "Class", "T0"]] * 3
     assert [(row["ID"], row["Environment"], row["Class"]) for row in table] == [
-        ("1_00_0000", "SA1", "left"), ("2_00_0001", "SA1", "none"), ("3_01_0002", "SA2", "right"),
+        ("1_00_0000", "SA1", "left"), ("2_00_0001", "SA1", "none"), ("1_05_0002", "DA1", "left"),
     ]  # fmt: skip
     folder = tmp_path / "one" / "SA1" / "left" / "1_00_0000"
     about = soundfile.info(folder / "out_multi.wav")
@@ -212,8 +219,27 @@ def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp
     assert about.frames == round(0.5 * 47_998)
     assert len(read_detections(folder / "camera_baseline_results.json")) == 5
     truth = json.loads((folder / "truth.json").read_text())
-    assert truth["settings"]["approach"] == "left"
+    assert (truth["settings"]["approach"], truth["settings"]["kind"]) == ("left", "bicycle")
     assert len(truth["frames"]) == 5
+    assert [recording.moving_ego for recording in OvadDataset(tmp_path / "one").recordings] == [False] * 3 + [
+        True
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"n_static": 0}, "n_static"),
+        ({"n_dynamic": -1}, "n_dynamic"),
+        ({"scene": "tunnel"}, "scene"),
+        ({"kind": "horse"}, "kind"),
+        ({"scene": "merge", "n_dynamic": 1}, "n_dynamic"),
+        ({"n_dynamic": 1, "video": True}, "video"),
+    ],
+)
+def test_data_sets_that_cannot_be_are_named(wrong, named):
+    with pytest.raises(InvalidArgumentError, match=named):
+        DatasetSettings(**wrong)
 
 
 def test_other_seeds_give_other_sound():
@@ -252,12 +278,18 @@ def test_settings_out_of_range_are_named(change, named):
 
 def test_the_command_writes_and_reports(tmp_path, capsys):
     arguments = ["simulate", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
-    assert main(arguments) == 0
+    assert main([*arguments, "--scene", "merge", "--kind", "electric"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["approaches"] == 1
-    assert (tmp_path / "d" / summary["folders"][0] / "out_multi.wav").is_file()
+    assert (summary["approaches"], summary["folders"]) == (1, ["SM1/left/1_12_0000"])
+    truth = json.loads((tmp_path / "d" / summary["folders"][0] / "truth.json").read_text())
+    assert (truth["settings"]["kind"], truth["settings"]["site"]["name"]) == ("electric", "SM1")
     assert main(["simulate", "--out", str(tmp_path / "e"), "--static", "0"]) == 2
     assert "n_static" in capsys.readouterr().err
+
+
+def test_the_command_offers_what_the_simulation_has():
+    assert sorted(cli.KINDS) == sorted(KINDS)
+    assert sorted(cli.SCENES) == sorted(["junction", *OCCLUSIONS])
 
 
 def test_hidden_approaches_are_louder_and_sharper_than_empty_streets():

@@ -10,7 +10,7 @@ from sklearn.metrics import roc_curve as sklearn_roc
 
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.simulation import SimulationSettings, preset, simulate_recording, site
-from worldstate.adapters.simulation.dataset import plan_static
+from worldstate.adapters.simulation.plan import plan_static
 from worldstate.cli.main import main
 from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.evaluation.hop_stream import ABSENT

@@ -21,8 +21,10 @@ from worldstate.checks import in_range
 from worldstate.errors import InputFileError
 
 from .detector import to_json
+from .occlusions import OCCLUSIONS, occluded_scene
+from .plan import DatasetSettings, Plan
 from .recording import SimulatedRecording, simulate_recording
-from .scene import SITES
+from .scene import MOVING_SITES, SITES
 from .settings import APPROACHES, draw_settings
 from .video import Picture, camera_frames, write_video
 
@@ -31,7 +33,9 @@ DETECTIONS_NAME = "camera_baseline_results.json"
 TRUTH_NAME = "truth.json"
 LOG_NAME = "DataLog.csv"
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
-MAX_RECORDINGS = 10_000
+# OVAD's location numbers 00 to 09, then the scenes in the open.
+PLACES = (*SITES, *MOVING_SITES, *(occluded_scene(name).site.name for name in OCCLUSIONS))
+UNKNOWN_PLACE = 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,64 +71,25 @@ class LogRow:
         return Path(self.environment, self.approach, self.recording_id)
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What the recording number `number` of a data set is, before anything is drawn."""
-
-    number: int
-    environment: str
-    approach: str
-    seed: np.random.SeedSequence
-
-
-def plan_static(n_static: int, seed: int) -> list[Plan]:
-    """Plan a data set: every other recording an approach, left and right in turn, site after site.
-
-    Examples
-    --------
-    >>> [(p.environment, p.approach) for p in plan_static(4, 1)]
-    [('SA1', 'left'), ('SA1', 'none'), ('SA2', 'right'), ('SA2', 'none')]
-    """
-    in_range("n_static", n_static, 1, MAX_RECORDINGS)
-    in_range("seed", seed, 0, 2**63)
-    children = np.random.SeedSequence(seed).spawn(n_static)
-    return [Plan(i, SITES[(i // 2) % len(SITES)], _approach(i), child) for i, child in enumerate(children)]
-
-
-def _approach(number: int) -> str:
-    if number % 2:
-        return "none"
-    return "left" if number % 4 == 0 else "right"
-
-
 def write_dataset(
     root: str | Path,
-    n_static: int,
-    seed: int = 1,
+    settings: DatasetSettings | None = None,
     *,
     jobs: int = 1,
-    duration_s: float = 10.0,
-    video: bool = False,
     progress: Callable[[LogRow], None] | None = None,
 ) -> list[LogRow]:
-    """Simulate a data set of recordings with a standing ego.
+    """Simulate a data set.
 
-    The same seed gives the same bytes, whatever the number of jobs: every recording has a seed of its own.
+    The same settings give the same bytes, whatever the number of jobs: every recording has a seed of its own.
 
     Parameters
     ----------
     root : str or Path
         Folder to write to; made if it is not there. Simulated recordings of the same name are replaced.
-    n_static : int
-        Number of recordings; every other one is hazard-free.
-    seed : int
-        Of the whole data set.
+    settings : DatasetSettings, optional
+        What to write; four recordings of junctions if not given.
     jobs : int
-        Processes.
-    duration_s : float
-        Length of every recording.
-    video : bool
-        Write what the camera sees, too; sound, detections and truth are the same with and without.
+        Processes, 1 to 256.
     progress : callable, optional
         Called with every finished recording, in order.
 
@@ -143,12 +108,11 @@ def write_dataset(
         If video is wanted and OpenCV is not installed.
     """
     in_range("jobs", jobs, 1, 256)
-    in_range("duration_s", duration_s, 0.5, 60.0)
-    plans = plan_static(n_static, seed)
+    wanted = settings or DatasetSettings()
     folder = Path(root)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in _each(partial(_simulate_one, folder, duration_s, video), plans, jobs):
+    for row in _each(partial(_simulate_one, folder, wanted), wanted.plans(), jobs):
         rows.append(row)
         if progress is not None:
             progress(row)
@@ -193,7 +157,8 @@ def write_recording(
     with atomic_path(target) as temporary:
         temporary.mkdir()
         _write_audio(temporary / AUDIO_NAME, recording)
-        _write_json(temporary / DETECTIONS_NAME, to_json(list(recording.detections)))
+        if recording.detections:
+            _write_json(temporary / DETECTIONS_NAME, to_json(list(recording.detections)))
         _write_json(temporary / TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
@@ -231,12 +196,12 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     write_text(Path(root) / LOG_NAME, text.getvalue())
 
 
-def _simulate_one(root: Path, duration_s: float, video: bool, plan: Plan) -> LogRow:
+def _simulate_one(root: Path, wanted: DatasetSettings, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
-    settings = draw_settings(plan.environment, plan.approach, rng, duration_s)
+    settings = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
     recording = simulate_recording(settings, rng)
     # A generator of its own: what is drawn for the picture changes nothing else.
-    frames = camera_frames(settings, recording, rng.spawn(1)[0]) if video else None
+    frames = camera_frames(settings, recording, rng.spawn(1)[0]) if wanted.video else None
     return write_recording(root, recording, plan.number, frames)
 
 
@@ -252,7 +217,7 @@ def _each(work: Callable[[Plan], LogRow], plans: list[Plan], jobs: int) -> Itera
 def _log_row(recording: SimulatedRecording, number: int) -> LogRow:
     settings = recording.truth["settings"]
     environment, approach = settings["site"]["name"], settings["approach"]
-    location = SITES.index(environment) if environment in SITES else 99
+    location = PLACES.index(environment) if environment in PLACES else UNKNOWN_PLACE
     identity = f"{APPROACHES.index(approach) + 1}_{location:02d}_{number:04d}"
     return LogRow(identity, environment, approach, recording.t0_frame)
 

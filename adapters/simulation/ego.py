@@ -53,6 +53,7 @@ IDLE_HZ, SHIFT_UP_HZ = 26.7, 45.0
 ENGINE_WANDER, WANDER_STEP_S = 0.01, 0.5
 HARMONICS = 24
 
+HEAD_START_S = 0.05  # no way on the vehicle is as long
 KNOT = 1024  # levels are evaluated so often, samples
 FASTEST_MPS = 70.0
 
@@ -152,12 +153,15 @@ def ego_sound(
         )
     in_range("speed_mps: lowest", speed.min(), 0.0, FASTEST_MPS)
     in_range("speed_mps: highest", speed.max(), 0.0, FASTEST_MPS)
+    # Everything ran before the recording began; what is on its way then is heard at its beginning.
+    lead = round(HEAD_START_S * rate)
+    driven = np.pad(speed, (lead, 0), mode="edge")
     to_engine, to_noise, to_wind = rng.spawn(3)
-    firing = _firing_hz(speed, rate, to_engine)
-    out = np.zeros((len(positions), len(speed)), np.float32)
-    _add_sources(out, positions, speed, firing, rate, to_noise)
-    _add_wind(out, speed, rate, to_wind)
-    return EgoSound(np.ascontiguousarray(out.T), firing)
+    firing = _firing_hz(driven, rate, to_engine)
+    out = np.zeros((len(positions), len(driven)), np.float32)
+    _add_sources(out, positions, driven, firing, rate, to_noise)
+    _add_wind(out, driven, rate, to_wind)
+    return EgoSound(np.ascontiguousarray(out[:, lead:].T), firing[lead:])
 
 
 def _add_sources(

@@ -55,7 +55,7 @@ def merge() -> OccludedScene:
     return OccludedScene(_open("SM1", barrier), ((-60.0, 5.6), (60.0, 5.6)), "left")
 
 
-OCCLUSIONS = {"lead_vehicle": lead_vehicle, "bridge_pier": bridge_pier, "merge": merge}
+OCCLUSIONS = {"lead-vehicle": lead_vehicle, "bridge-pier": bridge_pier, "merge": merge}
 
 
 def occluded_scene(name: str) -> OccludedScene:
@@ -69,7 +69,7 @@ def occluded_scene(name: str) -> OccludedScene:
     Examples
     --------
     >>> from worldstate.adapters.simulation import SimulationSettings
-    >>> scene = occluded_scene("bridge_pier")
+    >>> scene = occluded_scene("bridge-pier")
     >>> settings = SimulationSettings(scene.site, scene.approach, entry_s=6.0, route_m=scene.route_m)
     >>> settings.site.occluders[0].corners_m[0]
     (7.0, 1.6)
@@ -77,6 +77,17 @@ def occluded_scene(name: str) -> OccludedScene:
     if name not in OCCLUSIONS:
         raise InvalidArgumentError(f"scene: expected one of {', '.join(OCCLUSIONS)}, got {name!r}")
     return OCCLUSIONS[name]()
+
+
+def scene_of(site_name: str) -> OccludedScene | None:
+    """Return the scene in the open whose site has this name; None if it is none of them.
+
+    Examples
+    --------
+    >>> scene_of("SM1").approach, scene_of("SA1")
+    ('left', None)
+    """
+    return next((scene for scene in map(occluded_scene, OCCLUSIONS) if scene.site.name == site_name), None)
 
 
 def _open(name: str, occluder: Occluder) -> Site:

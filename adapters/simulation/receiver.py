@@ -96,8 +96,9 @@ def add_turning(out: Signal, signal: Signal, place_m: Array, gain: Array, receiv
     values = resample_whole(signal, OVERSAMPLING)
     table = Table(values, float(receiver.knots_s[0]), rate_hz * OVERSAMPLING)
     x, knots = receiver.ego.x_m(receiver.knots_s), receiver.knots_s
-    centre = distance_m(place_m, x, receiver.centre_m)
-    last = knots[-1] - 1.0 / rate_hz  # what the centre hears afterwards is not known
+    left = knots - distance_m(place_m, x, receiver.centre_m) / SPEED_OF_SOUND_MPS
     for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
-        later = (distance_m(place_m, x, position) - centre) / SPEED_OF_SOUND_MPS + skew
-        add_delayed(microphone, table, np.clip(knots - later, knots[0], last), gain)
+        wanted = knots - skew - distance_m(place_m, x, position) / SPEED_OF_SOUND_MPS
+        # What the centre hears before the beginning and after the end is not known.
+        heard = np.clip(np.interp(wanted, left, knots), knots[0], knots[-1] - 1.0 / rate_hz)
+        add_delayed(microphone, table, heard, gain)

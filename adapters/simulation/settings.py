@@ -9,6 +9,7 @@ from worldstate.errors import InvalidArgumentError
 
 from .ego_motion import EgoMotion
 from .kinds import vehicle_kind
+from .occlusions import scene_of
 from .presets import Preset, preset
 from .scene import MOVING_SITES, Site, site
 
@@ -165,20 +166,32 @@ class SimulationSettings:
 
 
 def draw_settings(
-    site_name: str, approach: str, rng: np.random.Generator, duration_s: float = 10.0
+    site_name: str,
+    approach: str,
+    rng: np.random.Generator,
+    duration_s: float = 10.0,
+    kind: str = "light",
 ) -> SimulationSettings:
     """Draw how a vehicle drives: 18 to 43 km/h, three in four braking, in sight at 65 to 75 % of the time.
 
     Parameters
     ----------
     site_name : str
-        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h.
+        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h, or of a
+        scene in the open, where the vehicle takes the scene's route.
     approach : str
         "left", "right" or "none".
     rng : numpy.random.Generator
         Source of randomness.
     duration_s : float
         Length of the recording.
+    kind : str
+        One of `KINDS`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        For an unknown name, or a scene that has no such approach.
 
     Examples
     --------
@@ -186,15 +199,20 @@ def draw_settings(
     'SB1'
     """
     in_range("duration_s", duration_s, 0.5, 60.0)
+    scene = scene_of(site_name)
+    if scene is not None:
+        _one_of("approach", approach, (scene.approach, "none"))
     brakes = rng.random() < BRAKING_SHARE
     return SimulationSettings(
-        site=site(site_name),
+        site=site(site_name) if scene is None else scene.site,
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
         speed_mps=rng.uniform(*SPEEDS_MPS),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
-        parked_car=bool(rng.random() < 0.3),
+        parked_car=bool(rng.random() < 0.3) and scene is None,
+        kind=kind,
+        route_m=() if scene is None else scene.route_m,
         ego=_draw_ego(rng, duration_s) if site_name in MOVING_SITES else EgoMotion(),
     )
 

@@ -6,16 +6,25 @@ from pathlib import Path
 from worldstate.cli.output import print_summary
 from worldstate.cli.progress import progress_bar
 
+SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
+KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
+
 DESCRIPTION = """\
-Simulate recordings of a vehicle with a roof array that stands at blind junctions, in the OVAD layout:
-D/DataLog.csv and D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json, truth.json.
-Every other recording is an approach, from the left and from the right in turn; the others are hazard-free.
+Simulate recordings of a vehicle with a roof array at blind junctions, in the OVAD layout: D/DataLog.csv and
+D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json and truth.json: ways, line of
+sight and time to visible of every vehicle. The ego stands (--static, SA1 to SB3) or drives up to the corner
+and is heard on its own roof (--dynamic, DA1 to DB3; no camera results there, as in OVAD). Every other
+recording is an approach, from the left and from the right in turn; the others are hazard-free.
 The same seed gives the same bytes, whatever the number of jobs. --video adds what the camera sees,
-ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same."""
+ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same.
+
+--scene hides the vehicle in the open instead, behind a van ahead, a bridge pier at a ramp, or a barrier that
+ends at a merge; there the ego stands and every approach is from the left."""
 
 EXAMPLE = """\
 examples:
   worldstate simulate --out sim --static 4 --seed 1
+  worldstate simulate --out sim --dynamic 10 --kind electric --jobs 2
   worldstate run sim/SA1/left/1_00_0000"""
 
 
@@ -30,8 +39,13 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     parser.add_argument(
-        "--static", type=int, default=4, metavar="N", help="recordings (default: %(default)s)"
+        "--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)"
     )
+    parser.add_argument("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
+    parser.add_argument(
+        "--scene", choices=SCENES, default=SCENES[0], help="what hides the vehicle (default: %(default)s)"
+    )
+    parser.add_argument("--kind", choices=KINDS, default=KINDS[0], help="vehicle (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
@@ -42,22 +56,26 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.simulation import write_dataset
+    from worldstate.adapters.simulation import DatasetSettings, write_dataset
 
-    with progress_bar("simulating", arguments.static) as bar:
-        rows = write_dataset(
-            arguments.out,
-            arguments.static,
-            arguments.seed,
-            jobs=arguments.jobs,
-            duration_s=arguments.duration,
-            video=arguments.video,
-            progress=lambda row: bar.advance(),
-        )
+    static = arguments.static
+    settings = DatasetSettings(
+        n_static=(0 if arguments.dynamic else 4) if static is None else static,
+        n_dynamic=arguments.dynamic,
+        seed=arguments.seed,
+        scene=arguments.scene,
+        kind=arguments.kind,
+        duration_s=arguments.duration,
+        video=arguments.video,
+    )
+    with progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
+        rows = write_dataset(arguments.out, settings, jobs=arguments.jobs, progress=lambda row: bar.advance())
     summary = {
         "out": str(arguments.out),
         "recordings": len(rows),
         "approaches": sum(row.approach != "none" for row in rows),
+        "scene": arguments.scene,
+        "kind": arguments.kind,
         "seed": arguments.seed,
         "folders": [row.folder.as_posix() for row in rows],
     }

@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _listen(arguments: argparse.Namespace) -> "list[TwinRecording]":
-    from worldstate.adapters.simulation.dataset import plan_static
+    from worldstate.adapters.simulation.plan import plan_static
     from worldstate.checks import in_range
     from worldstate.evaluation.twin_simulation import TwinSettings, listen_twins
 

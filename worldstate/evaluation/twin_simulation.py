@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
-from worldstate.adapters.simulation.dataset import Plan
+from worldstate.adapters.simulation.plan import Plan
 from worldstate.adapters.simulation.presets import Preset
 from worldstate.evaluation.twin_hearing import hear
 from worldstate.evaluation.twin_recording import TwinRecording, load_twin, save_twin

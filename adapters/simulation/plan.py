@@ -1,0 +1,111 @@
+"""What a data set is made of, before anything is drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+
+from .kinds import vehicle_kind
+from .occlusions import occluded_scene
+from .scene import MOVING_SITES, SITES
+
+MAX_RECORDINGS = 10_000
+JUNCTION = "junction"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What the recording number `number` of a data set is, before anything is drawn."""
+
+    number: int
+    environment: str
+    approach: str
+    seed: np.random.SeedSequence
+    kind: str = "light"
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetSettings:
+    """How a data set is made up.
+
+    Parameters
+    ----------
+    n_static, n_dynamic : int
+        Recordings with a standing ego and with one that drives up to the corner; in either group every other
+        one is hazard-free.
+    seed : int
+        Of the whole data set.
+    scene : str
+        "junction", or one of `OCCLUSIONS`: there the ego only stands and the vehicle comes from the left.
+    kind : str
+        What drives there, one of `KINDS`.
+    duration_s : float
+        Length of every recording, 0.5 to 60 s.
+    video : bool
+        Write what the camera sees, too; sound, detections and truth are the same with and without. Only for
+        a standing ego at a junction.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range, a word unknown or a combination not to be had.
+    """
+
+    n_static: int = 4
+    n_dynamic: int = 0
+    seed: int = 1
+    scene: str = JUNCTION
+    kind: str = "light"
+    duration_s: float = 10.0
+    video: bool = False
+
+    def __post_init__(self) -> None:
+        in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
+        in_range("n_dynamic", self.n_dynamic, 0, MAX_RECORDINGS)
+        in_range("n_static + n_dynamic", self.n_static + self.n_dynamic, 1, MAX_RECORDINGS)
+        in_range("seed", self.seed, 0, 2**63)
+        in_range("duration_s", self.duration_s, 0.5, 60.0)
+        vehicle_kind(self.kind)
+        if self.scene != JUNCTION:
+            occluded_scene(self.scene)
+        if self.n_dynamic and self.scene != JUNCTION:
+            raise InvalidArgumentError(
+                f"n_dynamic: expected 0 with scene {self.scene!r}, got {self.n_dynamic}"
+            )
+        if self.video and (self.n_dynamic or self.scene != JUNCTION):
+            raise InvalidArgumentError("video: expected only static recordings of the scene 'junction'")
+
+    def plans(self) -> list[Plan]:
+        """Return what every recording is: site after site, the standing ego first.
+
+        Examples
+        --------
+        >>> [(p.environment, p.approach) for p in DatasetSettings(n_static=1, n_dynamic=2).plans()]
+        [('SA1', 'left'), ('DA1', 'left'), ('DA1', 'none')]
+        """
+        children = np.random.SeedSequence(self.seed).spawn(self.n_static + self.n_dynamic)
+        sites = SITES if self.scene == JUNCTION else (occluded_scene(self.scene).site.name,)
+        groups = (range(self.n_static), sites), (range(self.n_dynamic), MOVING_SITES)
+        wanted = [(names[(i // 2) % len(names)], self._approach(i)) for group, names in groups for i in group]
+        return [
+            Plan(number, *what, child, self.kind)
+            for number, (what, child) in enumerate(zip(wanted, children, strict=True))
+        ]
+
+    def _approach(self, number: int) -> str:
+        if number % 2:
+            return "none"
+        return "left" if number % 4 == 0 or self.scene != JUNCTION else "right"
+
+
+def plan_static(n_static: int, seed: int) -> list[Plan]:
+    """Plan recordings at junctions: every other one an approach, left and right in turn, site after site.
+
+    Examples
+    --------
+    >>> [(p.environment, p.approach) for p in plan_static(4, 1)]
+    [('SA1', 'left'), ('SA1', 'none'), ('SA2', 'right'), ('SA2', 'none')]
+    """
+    return DatasetSettings(n_static=n_static, seed=seed).plans()
