@@ -91,6 +91,11 @@ class Present:
 class Unqueried:
     """The channel was not asked: no frame, outside its field of view, or no such sensor.
 
+    Parameters
+    ----------
+    reason : str
+        For people and logs.
+
     Examples
     --------
     >>> Unqueried("no detections file").log_likelihoods()

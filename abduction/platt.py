@@ -24,7 +24,7 @@ def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> 
     ----------
     value : ndarray
         Any shape.
-    slope, offset : array_like
+    slope, offset : array_like, broadcast
         Broadcast against it.
 
     Returns

@@ -88,6 +88,11 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
     co_evidence : CoEvidence
         What the channel that was asked answered.
 
+    Returns
+    -------
+    Posterior
+        Over hidden_1 .. hidden_K, visible, none.
+
     Raises
     ------
     InvalidArgumentError

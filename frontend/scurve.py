@@ -60,7 +60,7 @@ def radial_speed_m_s(
 
     Parameters
     ----------
-    time_s : float array
+    time_s : ndarray, any shape
         Receiver's clock, seconds.
     speed_m_s, closest_s, range_m : float
         v, tau_0 (emission time) and d.

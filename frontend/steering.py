@@ -193,6 +193,13 @@ class NodeBeams:
         C at the nodes, and its conjugate.
     spread : ndarray of float64, shape (N, directions)
         From power there to power everywhere.
+
+    Examples
+    --------
+    >>> array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
+    >>> beams = Steering.towards(array, [500.0], np.linspace(-1.0, 1.0, 61))
+    >>> beams.nodes.weights.shape[2] < 30, beams.nodes.spread.shape[1]
+    (True, 61)
     """
 
     weights: NDArray[np.complex64]

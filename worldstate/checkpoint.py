@@ -87,7 +87,23 @@ def settings_from_record(record: Record) -> FilterSettings:
 
 
 def policy_from_record(record: Record) -> CueingPolicy:
-    """Return the policy that its `to_dict` wrote; errors are those of `memory_from_record`."""
+    """Return the policy that its `to_dict` wrote.
+
+    Parameters
+    ----------
+    record : Record
+        Of the checkpoint.
+
+    Returns
+    -------
+    CueingPolicy
+        Ready to use.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a value is missing or out of range.
+    """
     try:
         return CueingPolicy.from_dict(record.raw)
     except (KeyError, TypeError, ValueError, OverflowError) as error:

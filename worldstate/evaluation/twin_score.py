@@ -117,6 +117,25 @@ def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -
 def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: int = FOLDS) -> Indices:
     """Deal recordings to folds so that each holds its share of every approach at every site, shape (R,).
 
+    Parameters
+    ----------
+    recordings : sequence of TwinRecording
+        At least two with and two without a vehicle.
+    rng : numpy.random.Generator
+        Draws the order within a stratum.
+    folds : int
+        At most so many.
+
+    Returns
+    -------
+    ndarray of int, shape (R,)
+        Fold of each recording.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are fewer than two of a kind.
+
     Examples
     --------
     >>> from dataclasses import replace
