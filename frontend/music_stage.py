@@ -90,7 +90,7 @@ class MusicStage:
         self._whitened: Steering | None = None
         self._azimuths = azimuths_rad
         self._sources = sources
-        self._window = WindowSum(window_hops, (len(beams.weights), n_microphones, n_microphones))
+        self._window = WindowSum(window_hops, len(beams.weights), n_microphones)
         self._tracker = SubspaceTracker(sources)
 
     def push(self, spectra: NDArray[np.complex64], beams: Steering | None = None) -> None:
@@ -104,7 +104,7 @@ class MusicStage:
             Where the spectra are whitened, the beams whitened alike.
         """
         by_bin = spectra.transpose(1, 0, 2)
-        np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.next_slot)
+        np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.open_slot())
         self._window.close_slot()
         self._whitened = beams
 

@@ -110,6 +110,11 @@ class FrontEnd:
             When the last of these samples was captured by the caller's clock, nanoseconds; measures the
             sample rate (`AcousticFrame.health`) and changes nothing else.
 
+        Returns
+        -------
+        list of AcousticFrame
+            In order of time; empty where no hop is complete.
+
         Raises
         ------
         InvalidArgumentError
@@ -177,14 +182,23 @@ class FrontEnd:
         except (TypeError, ValueError) as error:
             raise InvalidArgumentError(f"block: expected numbers, got {type(block).__name__}") from error
         check_shape("block", samples.shape, (None, self.array.n_microphones))
-        # NaN compares false: one pass finds it, infinity and numbers whose power single precision cannot
-        # hold.
-        if len(samples) and not np.abs(samples).max() <= _LOUDEST:
-            channels = np.flatnonzero(~(np.abs(samples).max(axis=0) <= _LOUDEST)).tolist()
+        # One pass without a copy: a sum of squares this small holds no NaN, no infinity and nothing too loud.
+        flat = samples.ravel()
+        with np.errstate(over="ignore", invalid="ignore"):
+            energy = float(flat @ flat)
+        if not energy <= _LOUDEST**2:
+            self._refuse_unless_quiet(samples)
+        return samples
+
+    @staticmethod
+    def _refuse_unless_quiet(samples: NDArray[np.float32]) -> None:
+        # NaN compares false.
+        loud = ~(np.abs(samples).max(axis=0) <= _LOUDEST)
+        if loud.any():
+            channels = np.flatnonzero(loud).tolist()
             raise InvalidArgumentError(
                 f"block: expected finite numbers up to {_LOUDEST:g}, got others in channels {channels}"
             )
-        return samples
 
     def _hear(self, hop: Hop) -> AcousticFrame | None:
         with one_blas_thread():
@@ -192,7 +206,7 @@ class FrontEnd:
             levels = self._meter.push(hop.samples, self._keep)
             if self._tone is not None:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
-        return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
+            return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
         settings = self.settings
@@ -248,8 +262,7 @@ class FrontEnd:
     def _music(self) -> MusicReading | NotUsable:
         if self._listener.music is None:
             return _MUSIC_IS_OFF
-        with one_blas_thread():
-            return self._listener.music.read(self._hops[-1].health.mask)
+        return self._listener.music.read(self._hops[-1].health.mask)
 
     def _tone_stage(self) -> ToneStage | None:
         chosen = self.settings
@@ -259,10 +272,7 @@ class FrontEnd:
         return ToneStage(self.array, self.sample_rate_hz, chosen.tone_band_hz, window_s, chosen.tone_channels)
 
     def _tone_reading(self) -> ToneReading | NotUsable:
-        if self._tone is None:
-            return TONE_IS_OFF
-        with one_blas_thread():
-            return self._tone.read()
+        return TONE_IS_OFF if self._tone is None else self._tone.read()
 
     def _age_s(self, n_hops: int, end: int) -> float:
         hops = self._last(n_hops)
@@ -288,7 +298,7 @@ class FrontEnd:
             return NotUsable(f"needs {settings.looming_hops} hops, heard {len(hops)}")
         # The same microphones throughout: one that fails within the window makes no step.
         keep = self._keep if self._keep.any() else slice(None)
-        energies = np.array([hop.energies[keep].mean() for hop in hops])
+        energies = np.array([hop.energies for hop in hops])[:, keep].mean(axis=1)
         if energies.min() <= SILENCE:
             return NotUsable("silence within the window")
         times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz

@@ -69,7 +69,7 @@ class SubspaceTracker:
     1
     """
 
-    def __init__(self, sources: int, *, guard: int = 4, tolerance: float = 0.05) -> None:
+    def __init__(self, sources: int, *, guard: int = 3, tolerance: float = 0.05) -> None:
         if sources < 1 or guard < 0:
             raise InvalidArgumentError(f"expected sources >= 1, guard >= 0, got {sources}, {guard}")
         self._sources = sources

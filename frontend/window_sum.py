@@ -1,52 +1,66 @@
-"""Sums over a sliding window without subtraction: what has left the window has left no rounding behind."""
+"""Sums of matrices over a sliding window that remember nothing of what has left it."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+# Rounding that may build up, relative to what is in the window, before it is summed again from its parts.
+_DEBT = 1e-5
+_EPS = float(np.finfo(np.float32).eps)
+
 
 class WindowSum:
-    """Sum of the last so many arrays, in a binary tree: each new one costs the additions on its path.
+    """Sum of the last so many sets of positive semidefinite matrices, in single precision.
 
-    A running sum from which the oldest is subtracted keeps the rounding of whatever was loud, and a sound a
-    hundred decibels below would drown in it.
+    Adding the newest and subtracting the oldest costs two passes, but leaves behind the rounding of whatever
+    was loud, and a sound a hundred decibels below would drown in it. So the rounding is kept account of, by
+    the traces that came and went; where it has grown to a hundred-thousandth of what is there, the window is
+    summed again.
 
     Parameters
     ----------
     length : int
-        Arrays in the window.
-    shape : tuple of int
-        Of each.
+        Sets in the window.
+    n_bins, size : int
+        Matrices of a set, and their rows.
+
+    Attributes
+    ----------
+    total : ndarray of complex64, shape (bins, size, size)
+        Sum of the window.
 
     Examples
     --------
-    >>> window = WindowSum(3, (1,))
+    >>> window = WindowSum(3, n_bins=1, size=1)
     >>> for value in (1e30, 1.0, 2.0, 4.0):
-    ...     window.next_slot[...] = value
+    ...     window.open_slot()[...] = value
     ...     window.close_slot()
     >>> window.total.real
-    array([7.], dtype=float32)
+    array([[[7.]]], dtype=float32)
     """
 
-    def __init__(self, length: int, shape: tuple[int, ...]) -> None:
-        # Node n is the sum of nodes 2 n and 2 n + 1; leaves are the nodes from `length` on.
-        self._nodes = np.zeros((2 * length, *shape), np.complex64)
-        self._length = length
+    def __init__(self, length: int, n_bins: int, size: int) -> None:
+        self._parts = np.zeros((length, n_bins, size, size), np.complex64)
+        self.total = np.zeros((n_bins, size, size), np.complex64)
+        self._debt = np.zeros(n_bins)
         self._slot = 0
 
-    @property
-    def next_slot(self) -> NDArray[np.complex64]:
-        """Where the next array is to be written: the place of the oldest."""
-        return np.asarray(self._nodes[self._length + self._slot])
+    def open_slot(self) -> NDArray[np.complex64]:
+        """Take the oldest set out and give its place, for the newest to be written to."""
+        oldest = self._parts[self._slot]
+        self._debt += _EPS * _traces(oldest)
+        self.total -= oldest
+        return np.asarray(oldest)
 
     def close_slot(self) -> None:
-        """Take what was written there."""
-        node = (self._length + self._slot) // 2
-        while node:
-            np.add(self._nodes[2 * node], self._nodes[2 * node + 1], out=self._nodes[node])
-            node //= 2
-        self._slot = (self._slot + 1) % self._length
+        """Take in what was written there."""
+        newest = self._parts[self._slot]
+        self.total += newest
+        self._debt += _EPS * _traces(newest)
+        self._slot = (self._slot + 1) % len(self._parts)
+        if (self._debt > _DEBT * _traces(self.total)).any():
+            np.sum(self._parts, axis=0, out=self.total)
+            self._debt[:] = 0.0
 
-    @property
-    def total(self) -> NDArray[np.complex64]:
-        """Sum of the window; valid until the next array is taken."""
-        return np.asarray(self._nodes[1])
+
+def _traces(matrices: NDArray[np.complex64]) -> NDArray[np.float64]:
+    return np.asarray(np.einsum("bmm->bm", matrices).real.sum(axis=1, dtype=np.float64))

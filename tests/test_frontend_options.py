@@ -155,12 +155,12 @@ def test_the_frame_tells_the_twin_and_the_grid_shows_it() -> None:
     assert np.degrees(solid.bearing_rad) == pytest.approx(30.0, abs=1.0)
 
 
-EGO = FrontEndSettings(music_sources=1, ego_noise=EgoNoiseSettings(guard_hops=0))
+EGO = FrontEndSettings(music_sources=1, ego_noise=EgoNoiseSettings(guard_hops=0, only_from_below=False))
 
 
 def test_prewhitened_music_hears_past_the_own_noise() -> None:
-    """A directed own noise, learned while alone, no longer owns the MUSIC peak when a weaker source joins."""
-    own, source = waves(ARRAY, [(-40.0, 0.0)], 6.0, 1), waves(ARRAY, [(25.0, 0.0)], 2.0, 2)
+    """Own noise from below, learned while alone, no longer owns the MUSIC peak when a weaker source joins."""
+    own, source = waves(ARRAY, [(-40.0, -50.0)], 6.0, 1), waves(ARRAY, [(25.0, 0.0)], 2.0, 2)
     sound = 2.0 * own
     sound[-len(source) :] += source
     learning, plain = FrontEnd(ARRAY, RATE, EGO), FrontEnd(ARRAY, RATE, FrontEndSettings(music_sources=1))
@@ -171,7 +171,7 @@ def test_prewhitened_music_hears_past_the_own_noise() -> None:
     deaf = plain.process(sound)[-1].music
     assert isinstance(heard, MusicReading)
     assert isinstance(deaf, MusicReading)
-    assert np.degrees(deaf.azimuth_rad) == pytest.approx(-40.0, abs=1.0)
+    assert abs(np.degrees(deaf.azimuth_rad) - 25.0) > 10.0
     assert np.degrees(heard.azimuth_rad) == pytest.approx(25.0, abs=1.0)
 
 

@@ -69,15 +69,22 @@ def test_the_roof_needs_few_and_its_power_is_that_of_every_beam() -> None:
     np.testing.assert_allclose(lengths, np.full(lengths.shape, keep.sum()), rtol=1e-5)
 
 
-@settings(deadline=None, max_examples=40)
-@given(length=st.integers(1, 13), values=st.lists(st.integers(-1000, 1000), min_size=1, max_size=40))
-def test_a_window_sum_is_the_sum_of_its_window(length: int, values: list[int]) -> None:
-    window = WindowSum(length, (2,))
-    for n, value in enumerate(values):
-        window.next_slot[...] = [value, 1j]
+@settings(deadline=None, max_examples=60)
+@given(
+    length=st.integers(1, 13),
+    levels=st.lists(st.sampled_from([0.0, 1e-6, 1e-3, 1.0, 1e6]), min_size=1, max_size=40),
+)
+def test_a_window_sum_forgets_what_was_loud(length: int, levels: list[float]) -> None:
+    rng, window = np.random.default_rng(0), WindowSum(length, n_bins=2, size=3)
+    sets: list[np.ndarray] = []
+    for level in levels:
+        x = np.sqrt(level) * circular(rng, 2, 3, 5)
+        sets.append((x @ x.conj().transpose(0, 2, 1)).astype(np.complex64))
+        window.open_slot()[...] = sets[-1]
         window.close_slot()
-        last = values[max(n + 1 - length, 0) : n + 1]
-        np.testing.assert_array_equal(window.total, [sum(last), 1j * len(last)])
+        expected = np.sum([s.astype(complex) for s in sets[-length:]], axis=0)
+        scale = np.einsum("bmm->b", expected).real.max()
+        np.testing.assert_allclose(window.total, expected, atol=2e-5 * scale)
 
 
 @pytest.mark.parametrize(("snr", "sources"), [(0.0, 1), (0.3, 1), (1e4, 1), (0.3, 2), (100.0, 2)])
