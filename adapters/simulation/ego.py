@@ -144,15 +144,8 @@ def ego_sound(
     >>> sound.pressure_pa.shape, round(float(sound.firing_hz.mean()))
     ((8000, 2), 64)
     """
-    positions = finite_array("positions_m", positions_m, (None, 3))
-    speed = finite_array("speed_mps", speed_mps, (None,))
+    positions, speed = _checked(positions_m, speed_mps)
     rate = in_range("sample_rate_hz", sample_rate_hz, 8_000.0, 192_000.0)
-    if not len(positions) or not len(speed):
-        raise InvalidArgumentError(
-            f"expected at least one microphone and one sample, got {len(positions)} and {len(speed)}"
-        )
-    in_range("speed_mps: lowest", speed.min(), 0.0, FASTEST_MPS)
-    in_range("speed_mps: highest", speed.max(), 0.0, FASTEST_MPS)
     # Everything ran before the recording began; what is on its way then is heard at its beginning.
     lead = round(HEAD_START_S * rate)
     driven = np.pad(speed, (lead, 0), mode="edge")
@@ -162,6 +155,18 @@ def ego_sound(
     _add_sources(out, positions, driven, firing, rate, to_noise)
     _add_wind(out, driven, rate, to_wind)
     return EgoSound(np.ascontiguousarray(out[:, lead:].T), firing[lead:])
+
+
+def _checked(positions_m: ArrayLike, speed_mps: ArrayLike) -> tuple[Array, Array]:
+    positions = finite_array("positions_m", positions_m, (None, 3))
+    speed = finite_array("speed_mps", speed_mps, (None,))
+    if not len(positions) or not len(speed):
+        raise InvalidArgumentError(
+            f"expected at least one microphone and one sample, got {len(positions)} and {len(speed)}"
+        )
+    in_range("speed_mps: lowest", speed.min(), 0.0, FASTEST_MPS)
+    in_range("speed_mps: highest", speed.max(), 0.0, FASTEST_MPS)
+    return positions, speed
 
 
 def _add_sources(
