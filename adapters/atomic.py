@@ -57,6 +57,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8 with plain newlines, whole or not at all.
 
+    Parameters
+    ----------
+    path : str or Path
+        Exactly this file.
+    text : str
+        Its content.
+
     Raises
     ------
     InputFileError

@@ -129,6 +129,11 @@ def learn_health(clean: Iterable[Frame], rng: np.random.Generator) -> CameraHeal
     rng : numpy.random.Generator
         Draws the staged noise.
 
+    Returns
+    -------
+    CameraHealth
+        Ready to monitor that camera.
+
     Raises
     ------
     InvalidArgumentError
@@ -265,6 +270,11 @@ def degradation_log(
         The camera's scale.
     level : callable
         From the degradation by family to the one d of a table; `MissRates.level` is one.
+
+    Returns
+    -------
+    DegradationLog
+        One entry a frame.
 
     Raises
     ------

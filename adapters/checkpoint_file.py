@@ -60,6 +60,13 @@ class Checkpoint:
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint to exactly this path, whole or not at all.
 
+    Parameters
+    ----------
+    path : str or Path
+        Exactly this file.
+    checkpoint : Checkpoint
+        Filter and site.
+
     Raises
     ------
     InputFileError
@@ -70,6 +77,16 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Read a checkpoint.
+
+    Parameters
+    ----------
+    path : str or Path
+        What `save_checkpoint` wrote.
+
+    Returns
+    -------
+    Checkpoint
+        Filter and site.
 
     Raises
     ------

@@ -37,6 +37,18 @@ def strength(family: str, degradation: float) -> float:
 
     Linear between the levels, darkness in the logarithm.
 
+    Parameters
+    ----------
+    family : str
+        Blur, darkness or noise: see `FAMILIES`.
+    degradation : float
+        d in [0, 1].
+
+    Returns
+    -------
+    float
+        In the unit of the family.
+
     Raises
     ------
     InvalidArgumentError
@@ -58,6 +70,18 @@ def strength(family: str, degradation: float) -> float:
 
 def level_of(family: str, staged: float) -> float:
     """Return the d in [0, 1] of a strength, the inverse of `strength`; beyond the last level it is 1.
+
+    Parameters
+    ----------
+    family : str
+        Blur, darkness or noise: see `FAMILIES`.
+    staged : float
+        Strength, in the unit of the family.
+
+    Returns
+    -------
+    float
+        d in [0, 1].
 
     Examples
     --------
@@ -88,6 +112,11 @@ def degrade(frame: Frame, family: Family, degradation: float, rng: np.random.Gen
         d in [0, 1]; 0 returns the frame itself.
     rng : numpy.random.Generator
         Draws the noise.
+
+    Returns
+    -------
+    ndarray of uint8, shape of `frame`
+        A new one.
 
     Raises
     ------

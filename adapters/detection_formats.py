@@ -49,6 +49,11 @@ def read_any_detections(
     size_px : tuple of int, optional
         Width and height of the image, which YOLO text is relative to.
 
+    Returns
+    -------
+    DetectionLog
+        In the order of time.
+
     Raises
     ------
     InputFileError
@@ -90,6 +95,11 @@ def read_coco_results(
     frames : int, optional
         How many there are; such a file says nothing of images without boxes, so those after the last box are
         only counted where this is given.
+
+    Returns
+    -------
+    DetectionLog
+        In the order of time.
 
     Raises
     ------
@@ -140,6 +150,11 @@ def read_yolo_text(
         As for `read_coco_results`.
     classes : mapping of int to str
         Names of the numbers; others are called by their number.
+
+    Returns
+    -------
+    DetectionLog
+        In the order of time.
 
     Raises
     ------

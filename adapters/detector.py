@@ -59,6 +59,20 @@ def suppress(
 ) -> NDArray[np.int64]:
     """Return the indices of boxes that no better one overlaps by more, the best first.
 
+    Parameters
+    ----------
+    boxes_px : ndarray, shape (n, 4)
+        Left, top, right, bottom, pixels.
+    scores : ndarray, shape (n,)
+        Higher is better.
+    most_overlap : float
+        Largest intersection over union with a better box.
+
+    Returns
+    -------
+    ndarray of int
+        Indices into `boxes_px`.
+
     Examples
     --------
     >>> boxes = np.array([[0.0, 0.0, 2.0, 2.0], [0.1, 0.0, 2.0, 2.0], [5.0, 5.0, 6.0, 6.0]])

@@ -62,6 +62,11 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
     dataset : str or Path
         Folder that files are looked for in; a name that leads out of it is refused.
 
+    Returns
+    -------
+    list of LabelledWindow
+        In the order of the list.
+
     Raises
     ------
     InputFileError
@@ -79,6 +84,18 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
 def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[NDArray[np.float64]]:
     """Yield the published feature of each window, shape (60,).
 
+    Parameters
+    ----------
+    windows : list of LabelledWindow
+        From `read_labels`.
+    array : MicrophoneArray
+        In the order of the channels.
+
+    Yields
+    ------
+    ndarray, shape (60,)
+        One after the other.
+
     Raises
     ------
     InputFileError
@@ -90,7 +107,20 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
 
 
 def feature_table(windows: list[LabelledWindow], features: list[NDArray[np.float64]]) -> FeatureTable:
-    """Return windows and features, in the same order, as a table."""
+    """Return windows and features, in the same order, as a table.
+
+    Parameters
+    ----------
+    windows : list of LabelledWindow
+        From `read_labels`.
+    features : list of ndarray, shape (60,)
+        One a window.
+
+    Returns
+    -------
+    FeatureTable
+        In the same order.
+    """
     columns = zip(*((w.label, w.window_id, w.environment, w.recording) for w in windows), strict=True)
     labels, ids, environments, recordings = (np.array(column) for column in columns)
     t0_frames = tuple(w.t0_frame for w in windows)

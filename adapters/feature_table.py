@@ -134,6 +134,16 @@ class FeatureTable:
 def read_features(path: str | Path) -> FeatureTable:
     """Read a table of windows.
 
+    Parameters
+    ----------
+    path : str or Path
+        CSV file.
+
+    Returns
+    -------
+    FeatureTable
+        In the order of the file.
+
     Raises
     ------
     InputFileError
@@ -152,6 +162,13 @@ def read_features(path: str | Path) -> FeatureTable:
 def write_features(path: str | Path, table: FeatureTable) -> None:
     """Write a table of windows that `read_features` reads back to the bit, whole or not at all.
 
+    Parameters
+    ----------
+    path : str or Path
+        Exactly this file.
+    table : FeatureTable
+        Windows.
+
     Raises
     ------
     InputFileError
@@ -167,6 +184,16 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
 
 def read_ids(path: str | Path) -> frozenset[str]:
     """Read a list of window IDs: a CSV file with a column ``ID``.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV file.
+
+    Returns
+    -------
+    frozenset of str
+        IDs.
 
     Raises
     ------

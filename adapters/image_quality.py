@@ -63,6 +63,11 @@ def image_quality(frame: NDArray[np.uint8]) -> ImageQuality:
     frame : ndarray of uint8, shape (height, width) or (height, width, 3)
         At least 16 px a side. Its central 640 px are looked at.
 
+    Returns
+    -------
+    ImageQuality
+        Brightness, noise and sharpness.
+
     Raises
     ------
     InvalidArgumentError

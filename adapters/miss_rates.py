@@ -213,6 +213,13 @@ class MissRates:
 def save_miss_rates(path: str | Path, rates: MissRates) -> None:
     """Write miss rates to exactly this path, whole or not at all.
 
+    Parameters
+    ----------
+    path : str or Path
+        Exactly this file.
+    rates : MissRates
+        As they were measured.
+
     Raises
     ------
     InputFileError
@@ -223,6 +230,16 @@ def save_miss_rates(path: str | Path, rates: MissRates) -> None:
 
 def load_miss_rates(path: str | Path) -> MissRates:
     """Read what `save_miss_rates` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        JSON file.
+
+    Returns
+    -------
+    MissRates
+        As they were measured.
 
     Raises
     ------

@@ -82,6 +82,16 @@ class Model:
 def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPolicies]:
     """Read what inference needs; without a path, of the model that ships with the package.
 
+    Parameters
+    ----------
+    path : str or Path, optional
+        JSON file.
+
+    Returns
+    -------
+    signature, policies : SignatureModel or EnsembleModel, and CueingPolicies
+        Ready to use.
+
     Raises
     ------
     InputFileError
@@ -93,6 +103,16 @@ def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPoli
 
 def read_model(path: str | Path | None = None) -> Model:
     """Read a model; without a path, the one that ships with the package.
+
+    Parameters
+    ----------
+    path : str or Path, optional
+        JSON file.
+
+    Returns
+    -------
+    Model
+        With its provenance.
 
     Raises
     ------
@@ -116,6 +136,13 @@ def read_model(path: str | Path | None = None) -> Model:
 def save_model(path: str | Path, model: Model) -> None:
     """Write a model to exactly this path, whole or not at all.
 
+    Parameters
+    ----------
+    path : str or Path
+        Exactly this file.
+    model : Model
+        What to write.
+
     Raises
     ------
     InputFileError
@@ -126,7 +153,18 @@ def save_model(path: str | Path, model: Model) -> None:
 
 
 def model_to_dict(model: Model) -> dict[str, Any]:
-    """Return JSON-able values."""
+    """Return JSON-able values.
+
+    Parameters
+    ----------
+    model : Model
+        What to write.
+
+    Returns
+    -------
+    dict
+        For `json.dumps`.
+    """
     origin = model.provenance
     return {
         **schema_stamp(SCHEMA, VERSION),
@@ -147,6 +185,18 @@ def model_to_dict(model: Model) -> dict[str, Any]:
 
 def model_from_dict(data: object, source: object) -> Model:
     """Return the model that `model_to_dict` wrote; unknown keys are ignored.
+
+    Parameters
+    ----------
+    data : object
+        Decoded JSON.
+    source : object
+        What the message calls it: a path.
+
+    Returns
+    -------
+    Model
+        With its provenance.
 
     Raises
     ------

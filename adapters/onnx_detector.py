@@ -141,6 +141,18 @@ class OnnxDetector:
 def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
     """Open a model file with onnxruntime, on the processor.
 
+    Parameters
+    ----------
+    path : str or Path
+        Model file.
+    settings : OnnxSettings
+        How its outputs are read.
+
+    Returns
+    -------
+    OnnxDetector
+        Ready to detect.
+
     Raises
     ------
     InputFileError

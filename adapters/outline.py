@@ -18,6 +18,16 @@ Image = NDArray[np.float32]
 def difference(frame: NDArray[np.uint8], background: NDArray[np.uint8]) -> Image:
     """Return how far a frame differs from its background, the largest over the colours, (height, width).
 
+    Parameters
+    ----------
+    frame, background : ndarray of uint8, shape (height, width, 3)
+        Of one size.
+
+    Returns
+    -------
+    ndarray of float, shape (height, width)
+        0..255.
+
     Raises
     ------
     InvalidArgumentError
@@ -58,6 +68,11 @@ def outlined_share(apart: Image, region: NDArray[np.bool_], width_px: float) -> 
         Pixels that changed, at least one.
     width_px : float
         Widest edge, w > 0.
+
+    Returns
+    -------
+    float
+        In [0, 1].
 
     Raises
     ------

@@ -169,6 +169,16 @@ class OvadDataset:
 def read_id_list(path: str | Path) -> frozenset[str]:
     r"""Read the IDs of an official list: a CSV file with a column ID.
 
+    Parameters
+    ----------
+    path : str or Path
+        CSV file.
+
+    Returns
+    -------
+    frozenset of str
+        IDs.
+
     Raises
     ------
     InputFileError

@@ -69,6 +69,16 @@ class Video:
 def open_video(path: str | Path) -> Video:
     """Open a video file.
 
+    Parameters
+    ----------
+    path : str or Path
+        Any container that OpenCV reads.
+
+    Returns
+    -------
+    Video
+        With its frame rate and size.
+
     Raises
     ------
     InputFileError

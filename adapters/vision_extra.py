@@ -8,6 +8,11 @@ from worldstate.errors import MissingExtraError
 def opencv() -> Any:
     """Return the module `cv2`.
 
+    Returns
+    -------
+    module
+        `cv2`.
+
     Raises
     ------
     MissingExtraError

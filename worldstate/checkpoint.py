@@ -25,7 +25,18 @@ SCHEMA_VERSION = "2.0.0"
 
 
 def memory_to_dict(memory: Memory) -> dict[str, Any]:
-    """Return all that the filter carries."""
+    """Return all that the filter carries.
+
+    Parameters
+    ----------
+    memory : Memory
+        Of a filter.
+
+    Returns
+    -------
+    dict
+        For `json.dumps`.
+    """
     return {
         "stamp_ns": memory.stamp_ns,
         "log_explanations": list(memory.explanation.log_probabilities),
@@ -45,6 +56,20 @@ def memory_to_dict(memory: Memory) -> dict[str, Any]:
 
 def memory_from_record(record: Record, directions: tuple[str, ...], policy: CueingPolicy) -> Memory:
     """Return what `memory_to_dict` wrote.
+
+    Parameters
+    ----------
+    record : Record
+        Of the checkpoint.
+    directions : tuple of str
+        Sides.
+    policy : CueingPolicy
+        Of the filter.
+
+    Returns
+    -------
+    Memory
+        The filter goes on from it to the bit.
 
     Raises
     ------
@@ -73,13 +98,35 @@ def memory_from_record(record: Record, directions: tuple[str, ...], policy: Cuei
 
 
 def settings_to_dict(settings: FilterSettings) -> dict[str, Any]:
-    """Return the settings; a tuple becomes a list."""
+    """Return the settings; a tuple becomes a list.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Of a filter.
+
+    Returns
+    -------
+    dict
+        For `json.dumps`.
+    """
     values = {field.name: getattr(settings, field.name) for field in fields(settings)}
     return values | {"hidden_std": list(settings.hidden_std)}
 
 
 def settings_from_record(record: Record) -> FilterSettings:
-    """Return what `settings_to_dict` wrote; errors are those of `memory_from_record`."""
+    """Return what `settings_to_dict` wrote; errors are those of `memory_from_record`.
+
+    Parameters
+    ----------
+    record : Record
+        Of the checkpoint.
+
+    Returns
+    -------
+    FilterSettings
+        Checked.
+    """
     spread = record.vector("hidden_std")
     names = [field.name for field in fields(FilterSettings) if field.name not in ("hidden_std", "stream")]
     numbers = {name: record.number(name) for name in names}

@@ -14,6 +14,20 @@ from worldstate.errors import InvalidArgumentError
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> NDArray[np.float64]:
     """Return `value` as finite float64 of the given shape; `None` leaves an axis free.
 
+    Parameters
+    ----------
+    name : str
+        What the message calls the argument.
+    value : array_like
+        Numbers.
+    shape : sequence of int or None
+        Expected shape.
+
+    Returns
+    -------
+    ndarray of float64
+        The same object where it already was one.
+
     Raises
     ------
     InvalidArgumentError
@@ -37,6 +51,13 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ND
 def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None]) -> None:
     """Refuse a shape that does not fit; `None` in `expected` leaves an axis free.
 
+    Parameters
+    ----------
+    name : str
+        What the message calls the argument.
+    got, expected : sequence of int
+        Shapes; None in the expected one leaves an axis free.
+
     Raises
     ------
     InvalidArgumentError
@@ -56,6 +77,22 @@ def in_range(
     name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False
 ) -> float:
     """Return `value` as a float if it lies in the range, ends included unless said otherwise.
+
+    Parameters
+    ----------
+    name : str
+        What the message calls the argument.
+    value : float
+        The number.
+    low, high : float
+        Ends of the range.
+    open_low, open_high : bool
+        Whether that end is left out.
+
+    Returns
+    -------
+    float
+        The number.
 
     Raises
     ------

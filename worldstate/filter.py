@@ -34,6 +34,16 @@ STAMP_SLACK_NS = 5_000_000
 def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
     """Return a policy for trying things out: no false-alarm budget was ever measured for it (alpha 0).
 
+    Parameters
+    ----------
+    directions : int
+        K.
+
+    Returns
+    -------
+    CueingPolicy
+        With alpha 0.
+
     Examples
     --------
     >>> uncalibrated_policy().gamma

@@ -31,6 +31,16 @@ def wrap_angle(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def wrap_angle(angle_rad: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
     """Wrap an angle in radians into (-pi, pi].
 
+    Parameters
+    ----------
+    angle_rad : float or ndarray, any shape
+        Radians.
+
+    Returns
+    -------
+    float or ndarray, same shape
+        Radians.
+
     Examples
     --------
     >>> round(wrap_angle(3 * np.pi / 2), 3), wrap_angle(-np.pi) == np.pi
@@ -43,6 +53,16 @@ def wrap_angle(angle_rad: float | NDArray[np.float64]) -> float | NDArray[np.flo
 def seconds(stamp_ns: int) -> float:
     """Convert integer nanoseconds to seconds.
 
+    Parameters
+    ----------
+    stamp_ns : int
+        Nanoseconds.
+
+    Returns
+    -------
+    float
+        Seconds.
+
     Examples
     --------
     >>> seconds(1_500_000_000)
@@ -53,6 +73,16 @@ def seconds(stamp_ns: int) -> float:
 
 def nanoseconds(time_s: float) -> int:
     """Convert seconds to the nearest integer nanosecond.
+
+    Parameters
+    ----------
+    time_s : float
+        Seconds.
+
+    Returns
+    -------
+    int
+        Nanoseconds.
 
     Examples
     --------

@@ -32,6 +32,18 @@ _LEAST_Q = 1e-3
 def propagate(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
     """Return the state (theta, theta_dot, rho, log r) after `step_s`, shape (4,); theta is not wrapped.
 
+    Parameters
+    ----------
+    state : ndarray, shape (4,)
+        theta in rad, theta_dot in rad/s, rho in 1/s, log of r in metres.
+    step_s : float
+        Seconds.
+
+    Returns
+    -------
+    ndarray, shape (4,)
+        In the same units.
+
     Examples
     --------
     >>> propagate(np.array([0.0, 0.0, -0.5, np.log(20.0)]), 1.0).round(3)
@@ -47,6 +59,18 @@ def propagate(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
 
 def jacobian(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
     """Return d propagate / d state, shape (4, 4).
+
+    Parameters
+    ----------
+    state : ndarray, shape (4,)
+        As for `propagate`.
+    step_s : float
+        Seconds.
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+        Rows: what is derived; columns: by what.
 
     Examples
     --------
@@ -83,6 +107,11 @@ def process_noise(acceleration_psd: float, range_m: float, step_s: float) -> NDA
         Range that accelerations are divided by, m.
     step_s : float
         Time step, s.
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+        Symmetric.
 
     Examples
     --------

@@ -73,6 +73,20 @@ class Track:
 def entity_id(stream: str, kind: str, number: int) -> str:
     """Return the UUID of the n-th entity of a kind in a stream: no randomness, so the same run names alike.
 
+    Parameters
+    ----------
+    stream : str
+        Name of the stream.
+    kind : str
+        Hidden or visible.
+    number : int
+        n.
+
+    Returns
+    -------
+    str
+        In the usual notation.
+
     Examples
     --------
     >>> entity_id("drive", "left", 0) == entity_id("drive", "left", 0) != entity_id("drive", "left", 1)
@@ -99,6 +113,18 @@ def predict_track(track: Track, hidden_share: float, step_s: float, scene: Scene
 
 def relabelled(labels: tuple[tuple[str, float], ...], sighting: Sighting) -> tuple[tuple[str, float], ...]:
     """Return class probabilities drawn a step towards what a detector just said.
+
+    Parameters
+    ----------
+    labels : tuple of (str, float)
+        Class names with their probabilities.
+    sighting : Sighting
+        What a detector said.
+
+    Returns
+    -------
+    tuple of (str, float)
+        Sum to one.
 
     Examples
     --------

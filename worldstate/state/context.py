@@ -179,6 +179,11 @@ def blind_corner(direction: str, side: int) -> Occluder:
     side : {1, -1}
         1 for left, -1 for right.
 
+    Returns
+    -------
+    Occluder
+        On that side.
+
     Examples
     --------
     >>> round(blind_corner("right", -1).edge_azimuth_rad, 2)

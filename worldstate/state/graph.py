@@ -19,6 +19,20 @@ def scene_graph(
     A node carries ``type`` (``"ego"``, ``"occluder"`` or ``"entity"``) and the object as ``value``; an edge
     carries ``probability`` and ``stamp_ns``.
 
+    Parameters
+    ----------
+    entities : iterable of Entity
+        Nodes.
+    relations : iterable of Relation
+        Edges.
+    context : Context
+        The ego vehicle and the occluders, nodes too.
+
+    Returns
+    -------
+    networkx.MultiDiGraph
+        A new one.
+
     Examples
     --------
     >>> graph = scene_graph([], [Relation("corner_left", EGO, "left_of", 1.0, 0)], Context())

@@ -213,6 +213,18 @@ class Record:
 def decode_json(text: str, where: str) -> object:
     """Decode strict JSON: no NaN, no infinity, bounded size and depth.
 
+    Parameters
+    ----------
+    text : str
+        JSON.
+    where : str
+        What the message calls it.
+
+    Returns
+    -------
+    object
+        Decoded.
+
     Raises
     ------
     InvalidArgumentError
@@ -233,6 +245,13 @@ def decode_json(text: str, where: str) -> object:
 
 def check_schema(record: Record, name: str, version: str) -> None:
     """Accept the named schema in any version of the same major number.
+
+    Parameters
+    ----------
+    record : Record
+        With an object "schema".
+    name, version : str
+        What is understood.
 
     Raises
     ------
