@@ -19,7 +19,7 @@ def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> 
     ----------
     name : str
         What the message calls the argument.
-    value : array_like, shape as below
+    value : array_like, any shape
         Real or complex numbers.
     shape : sequence of int or None
         Expected shape; `None` leaves an axis free.

@@ -45,7 +45,13 @@ class WindowSum:
         self._slot = 0
 
     def open_slot(self) -> NDArray[np.complex64]:
-        """Take the oldest set out and give its place, for the newest to be written to."""
+        """Take the oldest set out and give its place, for the newest to be written to.
+
+        Returns
+        -------
+        ndarray of complex64, shape of one set
+            To be written to in place.
+        """
         oldest = self._parts[self._slot]
         self._debt += _EPS * _traces(oldest)
         self.total -= oldest

@@ -18,7 +18,7 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ND
     ----------
     name : str
         What the message calls the argument.
-    value : array_like
+    value : array_like, any shape
         Numbers.
     shape : sequence of int or None
         Expected shape.
