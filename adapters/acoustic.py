@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.adapters.grounding import Grounding, observe
 from worldstate.adapters.protocol import CoEvidenceChannel, Side
 from worldstate.checks import in_range
 from worldstate.frontend.array import MicrophoneArray
@@ -85,6 +86,9 @@ class AcousticAdapter:
         When a bearing counts.
     front_end_settings : FrontEndSettings, optional
         Of the front-end.
+    grounding : Grounding, optional
+        Weighs the model's scores with bearing, approach and engine line, eq. (lik); the scores as they are
+        without.
 
     Attributes
     ----------
@@ -121,6 +125,7 @@ class AcousticAdapter:
         start_ns: int = 0,
         settings: AcousticSettings | None = None,
         front_end_settings: FrontEndSettings | None = None,
+        grounding: Grounding | None = None,
     ) -> None:
         self.source = "acoustic"
         self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
@@ -128,6 +133,7 @@ class AcousticAdapter:
         self._model = model
         self._vision = vision
         self._settings = settings or AcousticSettings()
+        self._grounding = grounding
 
     def measure(self, block: NDArray[np.float32], /) -> list[Measurement]:
         """Take the next samples; return a measurement for each hop that ends in them.
@@ -157,13 +163,15 @@ class AcousticAdapter:
         """
         self.last_frame = frame
         signature = self._model.evidence(frame.feature)
-        bearing = _bearing(frame, self._settings)
+        bearing, approach = _bearing(frame, self._settings), _approach(frame)
+        if self._grounding is not None:
+            signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         return Measurement(
             stamp_ns=frame.stamp_ns,
             signature=signature,
             co_evidence=self._ask(frame.stamp_ns, bearing, signature),
             bearing=bearing,
-            approach=_approach(frame),
+            approach=approach,
             sightings=self._vision.sightings(frame.stamp_ns) if self._vision else (),
             source=self.source,
         )

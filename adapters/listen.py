@@ -14,6 +14,7 @@ from worldstate.adapters.array_xml import read_array_xml
 from worldstate.adapters.audio import open_audio
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import DetectionLog, read_detections
+from worldstate.adapters.grounding import Grounding
 from worldstate.adapters.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.ovad import Recording
@@ -62,6 +63,8 @@ class Source:
         not compare windows with their site.
     site : SiteEstimate or None
         What is known of the site beforehand, from a checkpoint.
+    grounding : Grounding or None
+        Weighs the model's scores with bearing, approach and engine line, eq. (lik).
     """
 
     audio_path: Path
@@ -76,6 +79,7 @@ class Source:
     degradation: float | Callable[[int], float] = 0.0
     site_settings: SiteEstimateSettings | None = None
     site: SiteEstimate | None = None
+    grounding: Grounding | None = None
 
     def signature(self) -> Signature:
         """Return the model as it is at the start of the recording; one that learns its site learns anew."""
@@ -106,6 +110,7 @@ def open_source(
     site_adaptation: bool = True,
     forgetting_s: float | None = None,
     site: SiteEstimate | None = None,
+    grounding: Grounding | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
@@ -135,6 +140,8 @@ def open_source(
         Time constant of that, seconds; see `SiteEstimateSettings`.
     site : SiteEstimate, optional
         What is known of the site beforehand, from a checkpoint.
+    grounding : Grounding, optional
+        Weighs the model's scores with bearing, approach and engine line, eq. (lik); off where not given.
 
     Raises
     ------
@@ -161,6 +168,7 @@ def open_source(
         degradation=_degradation(recording, rates),
         site_settings=_site_settings(forgetting_s) if site_adaptation else None,
         site=site,
+        grounding=grounding,
     )
 
 
@@ -230,7 +238,13 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
             line_of_sight=sight,
             clutter=rates.clutter_rate if rates is not None else None,
         )
-        adapter = AcousticAdapter(source.array, audio.sample_rate_hz, source.signature(), vision=vision)
+        adapter = AcousticAdapter(
+            source.array,
+            audio.sample_rate_hz,
+            source.signature(),
+            vision=vision,
+            grounding=source.grounding,
+        )
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):
                 yield frame, adapter.interpret(frame)

@@ -180,3 +180,14 @@ def test_a_scikit_learn_classifier_drops_in():
         ClassifierSignature(LogisticRegression().fit(X, y == "left"))
     with pytest.raises(InvalidArgumentError, match="class_prior"):
         ClassifierSignature(fitted, {"left": 1.0})
+
+
+def test_tyre_noise_at_the_reference_speed_is_the_directive_s():
+    """Category 1 of Directive 2015/996 at 70 km/h, 125 Hz and 1 kHz: A_R and A_P, power-summed."""
+    low, high = (10.0 * math.log10(10.0**a + 10.0**b) for a, b in ((8.57, 8.92), (9.73, 8.42)))
+    assert tyre_noise_shape().expected([70.0 / 3.6])[0, 0] == pytest.approx(high - low, abs=0.02)
+
+
+def test_tyre_noise_is_held_where_the_directive_ends():
+    slow, slower = tyre_noise_shape().expected([20.0 / 3.6 - 0.5, 1.0])[0]
+    assert slow == pytest.approx(slower, abs=0.1)

@@ -53,6 +53,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)"
     )
+    parser.add_argument(
+        "--grounded",
+        action="store_true",
+        help="weigh the signature with bearing and approach, eq. (lik) (default: off)",
+    )
     parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
     parser.add_argument(
@@ -65,6 +70,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from worldstate.adapters.audio import SilentChannelsError
+    from worldstate.adapters.grounding import Grounding
     from worldstate.adapters.listen import open_source
     from worldstate.cli.listening import listen_with_progress
     from worldstate.evaluation.bearing_gating import write_gating_figure
@@ -80,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         miss_rates=arguments.miss_rates,
         site_adaptation=arguments.site_adaptation,
         forgetting_s=arguments.forgetting,
+        grounding=Grounding() if arguments.grounded else None,
     )
     try:
         report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
