@@ -2,8 +2,12 @@
 
 import argparse
 import json
+from typing import TYPE_CHECKING
 
 from worldstate.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.evaluation.bench import BenchReport
 
 DESCRIPTION = """\
 Time the acoustic front-end per 0.1-s hop, stage by stage: 56 channels at 47,998 Hz, one BLAS thread. Peers
@@ -35,13 +39,17 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(report.to_dict(), allow_nan=False))
         return 0
-    blas = ", ".join(report.blas)
-    print(f"BLAS {blas}; {report.threads} thread; median of {report.rounds} rounds; ms per hop")
-    for name, (median, p99) in report.stages.items():
-        print(f"  {name:32s} {median:9.3f}   p99 {p99:9.3f}")
-    print(f"  {'STFT + SRP181 + feature':32s} {report.total_ms:9.3f}   p99 {report.p99_ms:9.3f}")
-    for name, median in report.peers.items():
-        print(f"  peer {name:27s} {median:9.3f}")
-    for name, ratio in report.ratios.items():
-        print(f"  ratio {name:26s} {ratio:9.1f}")
+    print("\n".join(_lines(report)))
     return 0
+
+
+def _lines(report: "BenchReport") -> list[str]:
+    head = f"BLAS {', '.join(report.blas)}; {report.threads} thread; median of {report.rounds} rounds"
+    rows = [*report.stages.items(), ("STFT + SRP181 + feature", (report.total_ms, report.p99_ms))]
+    return [
+        f"{head}; load {report.load:.1f}; ms per hop",
+        *(f"  {name:32s} {median:9.3f}   p99 {p99:9.3f}" for name, (median, p99) in rows),
+        *(f"  peer {name:27s} {median:9.3f}" for name, median in report.peers.items()),
+        *(f"  ratio {name:26s} {ratio:9.1f}" for name, ratio in report.ratios.items()),
+        *(f"{name}: {setting}" for name, setting in report.settings.items()),
+    ]
