@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.camera_health import DegradationLog, HealthMonitor, degradation_log
+from worldstate.adapters.camera_health import CameraHealth, DegradationLog, HealthMonitor, degradation_log
 from worldstate.adapters.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.detector import Detector
 from worldstate.adapters.image_quality import image_quality
@@ -70,13 +70,11 @@ class Watched:
         )
 
 
-def watch(frames: Iterable[tuple[int, Frame]], detector: Detector, rates: MissRates) -> Watched:
-    """Run a detector over stamped frames and read the camera's health from the same frames.
+class Watcher:
+    """Looks at the frames of one camera as they come: what is in them, and how far to trust it.
 
     Parameters
     ----------
-    frames : iterable of (int, ndarray of uint8)
-        Stamp on the stream's clock, nanoseconds, and image, in the order of time.
     detector : Detector
         A fresh one, where it keeps a state.
     rates : MissRates
@@ -85,21 +83,56 @@ def watch(frames: Iterable[tuple[int, Frame]], detector: Detector, rates: MissRa
     Raises
     ------
     InvalidArgumentError
+        If the rates hold no scale of health.
+    """
+
+    def __init__(self, detector: Detector, rates: MissRates) -> None:
+        self._detector, self._rates = detector, rates
+        self._monitor = HealthMonitor(_scale(rates))
+        self._stamps_ns: list[int] = []
+        self._levels: list[float] = []
+        self._found: list[DetectionFrame] = []
+
+    def look(self, stamp_ns: int, frame: Frame) -> None:
+        """Take the next frame, in the order of time."""
+        self._stamps_ns.append(stamp_ns)
+        self._found.append(self._detector.detect(frame))
+        self._levels.append(self._rates.level(self._monitor.update(stamp_ns, image_quality(frame))))
+
+    def watched(self) -> Watched:
+        """Return what was seen so far.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If there was no frame.
+        """
+        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
+        degradation = DegradationLog(stamps_ns, np.array(self._levels))
+        return Watched(
+            DetectionLog(tuple(self._found), stamps_ns, "watched camera"), degradation, self._rates
+        )
+
+
+def watch(frames: Iterable[tuple[int, Frame]], detector: Detector, rates: MissRates) -> Watched:
+    """Run a detector over stamped frames and read the camera's health from the same frames.
+
+    Parameters
+    ----------
+    frames : iterable of (int, ndarray of uint8)
+        Stamp on the stream's clock, nanoseconds, and image, in the order of time.
+    detector, rates
+        As for `Watcher`.
+
+    Raises
+    ------
+    InvalidArgumentError
         If there is no frame, or the rates hold no scale of health.
     """
-    if rates.health is None:
-        raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
-    monitor = HealthMonitor(rates.health)
-    stamps: list[int] = []
-    levels: list[float] = []
-    found: list[DetectionFrame] = []
+    watcher = Watcher(detector, rates)
     for stamp_ns, frame in frames:
-        stamps.append(stamp_ns)
-        found.append(detector.detect(frame))
-        levels.append(rates.level(monitor.update(stamp_ns, image_quality(frame))))
-    stamps_ns = np.array(stamps, dtype=np.int64)
-    log = DetectionLog(tuple(found), stamps_ns, "watched camera")
-    return Watched(log, DegradationLog(stamps_ns, np.array(levels)), rates)
+        watcher.look(stamp_ns, frame)
+    return watcher.watched()
 
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
@@ -112,10 +145,15 @@ def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
     InvalidArgumentError
         If the rates hold no scale of health.
     """
+    health = _scale(rates)
+    stamped = ((nanoseconds(i / video.frame_rate_hz), frame) for i, frame in enumerate(video.frames()))
+    return degradation_log(stamped, health, rates.level)
+
+
+def _scale(rates: MissRates) -> CameraHealth:
     if rates.health is None:
         raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
-    stamped = ((nanoseconds(i / video.frame_rate_hz), frame) for i, frame in enumerate(video.frames()))
-    return degradation_log(stamped, rates.health, rates.level)
+    return rates.health
 
 
 def any_motion(label: str = "car") -> DetectionFilter:

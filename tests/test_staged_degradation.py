@@ -21,7 +21,8 @@ from worldstate.adapters.video import VIDEO_NAME, open_video
 from worldstate.adapters.vision import VisionSettings
 from worldstate.adapters.watched_camera import any_motion, watch
 from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.staged_degradation import Staging, staged_streams
+from worldstate.evaluation.staged_degradation import CameraState, Staging, stage_recording
+from worldstate.filter import WorldFilter
 
 CAMERA = PinholeCamera()
 WIDTH, HEIGHT = 484, 304
@@ -62,20 +63,37 @@ def rates(video):
 @pytest.mark.xdist_group("approach")
 def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, rates):
     source, recording = open_source(approach.folder), Recording.open(approach.folder)
-    staging = Staging("noise", MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
-    streams = staged_streams(
-        source, video, staging, (0.0, 1.0), np.random.default_rng(0), name="a", label=recording.label
+    staging = Staging(MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
+    states = (CameraState("all", 0.0), CameraState("noise", 1.0))
+    staged = stage_recording(
+        source, video, staging, states, np.random.default_rng(0), name="a", label=recording.label
     )
-    clean, blind = streams[0.0], streams[1.0]
-    assert np.array_equal(clean.log_likelihoods, blind.log_likelihoods)
-    after = clean.there & ~clean.before_sight
-    assert np.array_equal(clean.there, blind.there)
+    assert staged.states == ("clean", "noise 1", "off")
+    clean, blind, off = (staged.stream(state) for state in staged.states)
+    after = staged.after_sight
+    assert after.any()
+    assert not after[staged.time_s < source.t0_s].any()
     assert clean.seen[after].mean() > 0.7
     assert blind.seen[after].mean() <= 0.05
+    assert (off.answer == 0).all()
     asked = (clean.answer > 0) & (blind.answer > 0)
     assert asked.mean() > 0.5
     assert np.median(clean.miss_rate[asked]) < 0.4
     assert np.median(blind.miss_rate[asked]) > 0.9
+    assert np.median(staged.degradation, axis=1) == pytest.approx([0.0, 1.0, 1.0], abs=0.1)
+    assert_the_sound_says_the_same(source, staged)
+
+
+def assert_the_sound_says_the_same(source, staged):
+    """Against the filter itself, on the sound as it was measured and with no camera."""
+    world, presence = WorldFilter(context=source.context, policy=source.policy), []
+    said = []
+    for _, measurement in measure_steps(replace(source, detections=None)):
+        world = world.predict_to(measurement.stamp_ns).update(measurement)
+        presence.append(1.0 - world.explanation.none)
+        said.append(measurement.signature.log_likelihoods)
+    assert staged.log_likelihoods == pytest.approx(np.array(said))
+    assert staged.presence[staged.index("off")] == pytest.approx(np.array(presence))
 
 
 @pytest.mark.xdist_group("approach")

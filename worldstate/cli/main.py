@@ -18,6 +18,7 @@ COMMANDS = (
     "train",
     "calibrate",
     "measure_absence",
+    "evaluate_degradation",
     "evaluate_features",
     "extract_features",
     "twin",

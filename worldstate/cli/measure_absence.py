@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.detector_options import add_detector_options, detector_maker, detector_name
 from worldstate.cli.output import print_summary
 from worldstate.cli.progress import progress_bar
 
@@ -41,12 +42,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
     parser.add_argument("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
-    parser.add_argument(
-        "--detector", choices=("motion", "knn", "onnx"), default="motion",
-        help="background subtraction by mixtures or neighbours, or a model (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--onnx-model", type=Path, metavar="ONNX", help="model in YOLO's output form")
-    parser.add_argument("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of the model")
+    add_detector_options(parser)
     parser.add_argument(
         "--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)"
     )
@@ -67,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.evaluation.absence_figure import write_absence_figure
     from worldstate.evaluation.absence_input import find_videos
 
-    make, settings = _maker(arguments), AbsenceSettings()
+    make, settings = detector_maker(arguments), AbsenceSettings()
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
     with progress_bar("measuring", passes(len(scenes), settings)) as bar:
         rates = measure_absence(
@@ -83,20 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
         write_absence_figure(rates, arguments.figure)
     print_summary(_summary(arguments, rates), as_json=arguments.json)
     return 0
-
-
-def _maker(arguments: argparse.Namespace) -> "MakeDetector":
-    from worldstate.adapters.motion_detector import MotionDetector, MotionSettings
-    from worldstate.adapters.onnx_detector import OnnxSettings, open_onnx
-    from worldstate.errors import InvalidArgumentError
-
-    if arguments.detector == "onnx":
-        if arguments.onnx_model is None:
-            raise InvalidArgumentError("--onnx-model: expected a model for --detector onnx")
-        model = open_onnx(arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
-        return lambda: model
-    settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
-    return lambda: MotionDetector(settings)
 
 
 def _scene(
@@ -124,11 +106,10 @@ def _scene(
 def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
     from importlib.metadata import version
 
-    model = "" if arguments.onnx_model is None else f" {arguments.onnx_model.name}"
     return {
         "data": arguments.input.name,
         "videos": str(videos),
-        "detector": arguments.detector + model,
+        "detector": detector_name(arguments),
         "seed": str(arguments.seed),
         "worldstate": version("worldstate"),
     }

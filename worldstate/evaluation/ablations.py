@@ -1,6 +1,6 @@
-"""Ablations as switches of one evaluation of recorded streams: absence, calibration, looming, degradation."""
+"""Ablations as switches of one evaluation of recorded streams: absence, calibration, looming."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from worldstate.abduction.risk_map import fit_isotonic
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 from worldstate.evaluation.advisories import detection, false_alarms_per_hour, rising_edges
+from worldstate.evaluation.folds import recording_folds
 from worldstate.evaluation.hop_stream import HOP_S, HopStream
 from worldstate.evaluation.metrics import auroc
 from worldstate.evaluation.stream_statistic import StatisticSwitches, presence_statistic, stream_statistic
@@ -126,8 +127,6 @@ def evaluate_ablation(
     reference_prior: Sequence[float],
     rng: np.random.Generator,
     switches: AblationSwitches | None = None,
-    *,
-    calibration: Sequence[HopStream] | None = None,
 ) -> AblationRow:
     """Evaluate one setting of the switches by recording-level folds.
 
@@ -141,23 +140,18 @@ def evaluate_ablation(
         Deals recordings to folds, and draws the floor of the ECE.
     switches : AblationSwitches, optional
         What is left in; all of it where not given.
-    calibration : sequence of HopStream, optional
-        The same recordings in the condition that thresholds and risk maps are set in, for example with a
-        clean camera; `streams` themselves where not given.
 
     Raises
     ------
     InvalidArgumentError
-        If a fold has no hazard-free recording to calibrate on, or the two sequences are of other recordings.
+        If a fold has no hazard-free recording to calibrate on.
     """
-    chosen, clean = switches or AblationSwitches(), streams if calibration is None else calibration
-    if [stream.name for stream in clean] != [stream.name for stream in streams]:
-        raise InvalidArgumentError("calibration: expected the same recordings in the same order")
-    folds = _folds(streams, chosen.folds, rng)
+    chosen = switches or AblationSwitches()
+    folds = recording_folds([stream.label for stream in streams], chosen.folds, rng)
     scored: list[_Scored] = []
     for fold in np.unique(folds):
         learned = _Learned(
-            [clean[i] for i in np.flatnonzero(folds != fold).tolist()], reference_prior, chosen
+            [streams[i] for i in np.flatnonzero(folds != fold).tolist()], reference_prior, chosen
         )
         scored += [learned.score(streams[i]) for i in np.flatnonzero(folds == fold).tolist()]
     return _row(scored, rng)
@@ -196,37 +190,6 @@ def ablation_table(
     return {
         name: evaluate_ablation(streams, reference_prior, np.random.default_rng(seed), row)
         for name, row in rows.items()
-    }
-
-
-def degradation_sweep(
-    by_level: Mapping[float, Sequence[HopStream]],
-    reference_prior: Sequence[float],
-    seed: int,
-    switches: AblationSwitches | None = None,
-) -> dict[float, AblationRow]:
-    """Evaluate the same recordings at each degradation d of the camera, calibrated at the smallest one.
-
-    Parameters
-    ----------
-    by_level : mapping of float to sequence of HopStream
-        Streams of the same recordings in the same order at every d.
-    reference_prior, seed, switches
-        As for `ablation_table`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `evaluate_ablation`, or if there is no level.
-    """
-    if not by_level:
-        raise InvalidArgumentError("by_level: expected at least one degradation")
-    clean = by_level[min(by_level)]
-    return {
-        d: evaluate_ablation(
-            by_level[d], reference_prior, np.random.default_rng(seed), switches, calibration=clean
-        )
-        for d in sorted(by_level)
     }
 
 
@@ -275,15 +238,6 @@ class _Learned:
             calm = [self._statistic(stream, weight) for stream in free]
             areas.append(auroc(*_windows(calm, self._hazards(approaches, weight))) or 0.0)
         return weights[int(np.argmax(areas))]
-
-
-def _folds(streams: Sequence[HopStream], folds: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Deal recordings to folds, each label in its turn."""
-    order = rng.permutation(len(streams))
-    order = order[np.argsort([streams[i].label for i in order], kind="stable")]
-    dealt = np.empty(len(streams), dtype=np.int64)
-    dealt[order] = np.arange(len(streams)) % folds
-    return dealt
 
 
 def _windows(calm: Sequence[Numbers], hazards: Sequence[Numbers]) -> tuple[Numbers, NDArray[np.bool_]]:

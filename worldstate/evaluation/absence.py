@@ -24,7 +24,7 @@ MakeDetector = Callable[[], Detector]
 # Sectors that clutter is counted in lie this far apart.
 _SECTOR_STEP_RAD = np.radians(5.0)
 # Clean frames that the scale of health is learned from, spread over the videos.
-_HEALTH_FRAMES = 3
+_HEALTH_FRAMES = 10
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,54 @@
+"""Options that name a camera's detector, shared by the commands that look at video."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from worldstate.adapters.detections import DetectionFilter
+    from worldstate.evaluation.absence import MakeDetector
+
+
+def add_detector_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --detector, --onnx-model and --labels."""
+    parser.add_argument(
+        "--detector", choices=("motion", "knn", "onnx"), default="motion",
+        help="background subtraction by mixtures or neighbours, or a model (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--onnx-model", type=Path, metavar="ONNX", help="model in YOLO's output form")
+    parser.add_argument("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of the model")
+
+
+def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
+    """Return what makes a detector; a model is opened once.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a model is wanted and none given.
+    """
+    from worldstate.adapters.motion_detector import MotionDetector, MotionSettings
+    from worldstate.adapters.onnx_detector import OnnxSettings, open_onnx
+    from worldstate.errors import InvalidArgumentError
+
+    if arguments.detector == "onnx":
+        if arguments.onnx_model is None:
+            raise InvalidArgumentError("--onnx-model: expected a model for --detector onnx")
+        model = open_onnx(arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
+        return lambda: model
+    settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
+    return lambda: MotionDetector(settings)
+
+
+def detector_filter(arguments: argparse.Namespace) -> "DetectionFilter":
+    """Return which of its boxes count: all of a motion detector's, whose score is no confidence."""
+    from worldstate.adapters.detections import DetectionFilter
+    from worldstate.adapters.watched_camera import any_motion
+
+    return DetectionFilter() if arguments.detector == "onnx" else any_motion()
+
+
+def detector_name(arguments: argparse.Namespace) -> str:
+    """Return the detector's name, with that of its model."""
+    model = "" if arguments.onnx_model is None else f" {arguments.onnx_model.name}"
+    return f"{arguments.detector}{model}"

@@ -1,0 +1,146 @@
+"""`worldstate evaluate-degradation`: hazard awareness while the camera fails, beside vision alone."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.detector_options import (
+    add_detector_options,
+    detector_filter,
+    detector_maker,
+    detector_name,
+)
+from worldstate.cli.output import print_summary
+from worldstate.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.adapters.ovad import Recording
+    from worldstate.evaluation.staged_dataset import StagedDataset
+    from worldstate.evaluation.staged_recording import StagedRecording
+
+DESCRIPTION = """\
+Stage blur, darkness and sensor noise, four levels each, on the video of every recording of a data set, and
+print for every state of the camera: hazard awareness, the share of hops after line-of-sight entry, vehicle in
+view, in which a detection is there or P(hidden) + P(visible) is above its threshold; vision alone; and false
+alarms per hour of the hazard-free recordings, whose camera is degraded alike. Nobody is told the degradation:
+d is read from the frames, and beta from the table that measure-absence wrote on other recordings.
+
+Thresholds are gamma(alpha) on the hazard-free recordings of other folds. A last row, "off", has no camera.
+
+DATASET is in the OVAD layout with video, as `worldstate simulate --video` writes it. Each recording is heard
+once; what is done lies in OUT/staged and is not done again, so an interrupted run goes on where it stopped.
+OUT/degradation.json is the report, OUT/degradation.png the figure."""
+
+EXAMPLE = """\
+example:
+  worldstate simulate --out others --static 12 --seed 1 --video
+  worldstate measure-absence others --detector motion --out beta.json
+  worldstate simulate --out sim --static 24 --seed 2 --video
+  worldstate evaluate-degradation sim --miss-rates beta.json --detector motion --out sweep"""
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    parser = subparsers.add_parser(
+        "evaluate-degradation",
+        help="hazard awareness while the camera fails, beside vision alone",
+        description=DESCRIPTION,
+        epilog=EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="recordings with video")
+    parser.add_argument(
+        "--miss-rates",
+        type=Path,
+        required=True,
+        metavar="JSON",
+        help="of the same detector, on other recordings",
+    )
+    add_detector_options(parser)
+    parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
+    parser.add_argument(
+        "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
+    )
+    parser.add_argument("--most", type=int, metavar="N", help="use the first N recordings")
+    parser.add_argument("--seed", type=int, default=0, help="noise, folds, intervals (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("degradation"), metavar="DIR", help="(default: %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; return its exit code."""
+    import json
+
+    import numpy as np
+
+    from worldstate.adapters.atomic import write_text
+    from worldstate.adapters.model_file import load_model
+    from worldstate.evaluation.degradation_report import sweep_report, sweep_table, write_sweep_figure
+    from worldstate.evaluation.degradation_sweep import SweepSettings, degradation_sweep
+    from worldstate.evaluation.staged_dataset import filmed_recordings
+
+    settings = _settings(arguments)
+    found = filmed_recordings(arguments.dataset, arguments.most)
+    policy = load_model(arguments.model)[1].policies[0]
+    judged_by = SweepSettings(policy.reference_prior, arguments.alpha, policy.sustain_hops)
+    recordings = _stage(arguments.out / "staged", found, settings)
+    rows = degradation_sweep(recordings, judged_by, np.random.default_rng(arguments.seed))
+    report = _origin(arguments, recordings) | sweep_report(rows)
+    write_text(arguments.out / "degradation.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
+    write_sweep_figure(rows, arguments.out / "degradation.png")
+    _print(report, sweep_table(rows), as_json=arguments.json)
+    return 0
+
+
+def _settings(arguments: argparse.Namespace) -> "StagedDataset":
+    from worldstate.adapters.camera import PinholeCamera
+    from worldstate.adapters.miss_rates import load_miss_rates
+    from worldstate.adapters.vision import VisionSettings
+    from worldstate.evaluation.staged_dataset import StagedDataset
+    from worldstate.evaluation.staged_degradation import Staging, camera_states
+
+    staging = Staging(
+        detector_maker(arguments),
+        load_miss_rates(arguments.miss_rates),
+        PinholeCamera(),
+        VisionSettings(keep=detector_filter(arguments)),
+    )
+    return StagedDataset(staging, detector_name(arguments), camera_states(), arguments.seed, arguments.model)
+
+
+def _stage(folder: Path, found: "list[Recording]", settings: "StagedDataset") -> "list[StagedRecording]":
+    from worldstate.adapters.video import VIDEO_NAME, open_video
+    from worldstate.evaluation.staged_dataset import stage_dataset
+
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = sum(open_video(recording.path / VIDEO_NAME).count for recording in found)
+    with progress_bar("staging the camera", frames) as bar:
+        return list(stage_dataset(folder, found, settings, bar.advance))
+
+
+def _origin(arguments: argparse.Namespace, recordings: "list[StagedRecording]") -> dict[str, object]:
+    from worldstate.evaluation.hop_stream import HOP_S
+
+    free = [one for one in recordings if one.hazard_free]
+    return {
+        "out": str(arguments.out),
+        "data": arguments.dataset.name,
+        "detector": detector_name(arguments),
+        "approaches": len(recordings) - len(free),
+        "hops_in_view": int(sum(one.after_sight.sum() for one in recordings)),
+        "hazard_free": len(free),
+        "hazard_free_hours": sum(one.time_s.size for one in free) * HOP_S / 3600.0,
+        "alpha": arguments.alpha,
+        "seed": arguments.seed,
+    }
+
+
+def _print(report: dict[str, object], table: str, *, as_json: bool) -> None:
+    if as_json:
+        print_summary(report, as_json=True)
+        return
+    print_summary({key: value for key, value in report.items() if key != "states"}, as_json=False)
+    print(table)

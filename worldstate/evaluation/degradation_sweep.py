@@ -1,0 +1,233 @@
+"""Hazard awareness beside vision alone, and false alarms beside those of a clean camera, state by state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.abduction.cueing import sustained_alarm
+from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
+from worldstate.checks import in_range
+from worldstate.errors import InvalidArgumentError
+from worldstate.evaluation.advisories import detection, false_alarms_per_hour, rising_edges
+from worldstate.evaluation.folds import recording_folds
+from worldstate.evaluation.hop_stream import HOP_S, UNQUERIED
+from worldstate.evaluation.staged_recording import CLEAN, OFF, StagedRecording
+from worldstate.evaluation.stream_statistic import stream_statistic
+
+DRAWS = 1000
+
+Flags = NDArray[np.bool_]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepSettings:
+    """How thresholds are set.
+
+    Parameters
+    ----------
+    reference_prior : tuple of float
+        Prior of the statistic.
+    alpha : float
+        Share of hazard-free windows in alarm.
+    sustain_hops : int
+        Consecutive hops that the statistic of an advisory has to hold.
+    folds : int
+        Recording-level folds.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> SweepSettings((0.25,) * 4).alpha
+    0.02
+    """
+
+    reference_prior: tuple[float, ...]
+    alpha: float = 0.02
+    sustain_hops: int = 3
+    folds: int = 5
+
+    def __post_init__(self) -> None:
+        in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
+        in_range("sustain_hops", self.sustain_hops, 1, 1000)
+        in_range("folds", self.folds, 2, 1000)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRow:
+    """One state of the camera; None where the recordings hold nothing to form it from.
+
+    Parameters
+    ----------
+    state : str
+        Its name.
+    degradation : float
+        Mean d that was estimated.
+    miss_rate : float or None
+        Mean beta of the channel where it was asked after T0.
+    vision_only : float
+        Share of the hops after T0, vehicle in view, in which a detection is there.
+    awareness : float
+        Share of them in which a detection is there or P(hidden) + P(visible) is above its threshold.
+    awareness_interval : tuple of float
+        Its middle 95 % over recordings drawn again.
+    unseen_awareness : float or None
+        Awareness in the hops without a detection: what the sound holds by itself.
+    detected, lead_time_s : float or None
+        Share of approaches with an advisory in the 5 s before T0, and by how much in the mean.
+    false_alarms_per_hour : float
+        Advisories on hazard-free recordings.
+    false_awareness_per_hour : float
+        Times that the awareness rises on them, for sound or for a false detection.
+    """
+
+    state: str
+    degradation: float
+    miss_rate: float | None
+    vision_only: float
+    awareness: float
+    awareness_interval: Interval
+    unseen_awareness: float | None
+    detected: float
+    lead_time_s: float | None
+    false_alarms_per_hour: float
+    false_awareness_per_hour: float
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON-able values."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def degradation_sweep(
+    recordings: Sequence[StagedRecording], settings: SweepSettings, rng: np.random.Generator
+) -> list[SweepRow]:
+    r"""Judge every state of the camera by the same thresholds.
+
+    Both are set on other recordings' hazard-free hops: gamma(alpha) of the advisory's statistic with the
+    clean camera, as that statistic only falls when absence says less; and that of P(hidden) + P(visible)
+    without a camera, as that only rises.
+
+    Parameters
+    ----------
+    recordings : sequence of StagedRecording
+        Approaches with a T0 and hazard-free recordings, all in the same states.
+    settings : SweepSettings
+        How thresholds are set.
+    rng : numpy.random.Generator
+        Deals folds and draws the intervals.
+
+    Returns
+    -------
+    list of SweepRow
+        One a state, in the order of the first recording's.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If states differ, no vehicle is ever in view after T0, or a fold is left without a hazard-free
+        recording to set thresholds on.
+    """
+    if not recordings or any(one.states != recordings[0].states for one in recordings):
+        raise InvalidArgumentError("recordings: expected at least one, all in the same states")
+    if not any(one.after_sight.any() for one in recordings):
+        raise InvalidArgumentError("recordings: expected an approach that comes into view")
+    folds = recording_folds([one.label for one in recordings], settings.folds, rng)
+    judges = {
+        fold: _Judge([r for r, f in zip(recordings, folds, strict=True) if f != fold], settings)
+        for fold in np.unique(folds).tolist()
+    }
+    pairs = [(one, judges[fold]) for one, fold in zip(recordings, folds.tolist(), strict=True)]
+    draws = _draws(recordings, rng)
+    return [_row(state, [judge(one, state) for one, judge in pairs], draws) for state in recordings[0].states]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """One recording in one state with the decisions on it."""
+
+    recording: StagedRecording
+    row: int
+    alarm: Flags
+    heard: Flags
+
+    @property
+    def seen(self) -> Flags:
+        return np.asarray(self.recording.seen[self.row])
+
+    @property
+    def aware(self) -> Flags:
+        return self.seen | self.heard
+
+    def in_sight(self, flags: Flags) -> Flags:
+        """Return flags of the hops after T0 with the vehicle in view."""
+        return np.asarray(flags[self.recording.after_sight])
+
+
+class _Judge:
+    """The two thresholds of a fold, set on the recordings of the others."""
+
+    def __init__(self, others: Sequence[StagedRecording], settings: SweepSettings) -> None:
+        free = [one for one in others if one.hazard_free]
+        if not free:
+            raise InvalidArgumentError("recordings: expected hazard-free ones in more than one fold")
+        self._settings = settings
+        prior, alpha = settings.reference_prior, settings.alpha
+        calm = [stream_statistic(one.stream(CLEAN), prior) for one in free]
+        self._gamma = neyman_pearson_threshold(calm, alpha, settings.sustain_hops)
+        self._presence = neyman_pearson_threshold([one.presence[one.index(OFF)] for one in free], alpha)
+
+    def __call__(self, one: StagedRecording, state: str) -> _Judged:
+        row, chosen = one.index(state), self._settings
+        statistic = stream_statistic(one.stream(state), chosen.reference_prior)
+        alarm = sustained_alarm(statistic >= self._gamma, chosen.sustain_hops)
+        return _Judged(one, row, alarm, np.asarray(one.presence[row] >= self._presence))
+
+
+def _row(state: str, judged: Sequence[_Judged], draws: Sequence[NDArray[np.intp]]) -> SweepRow:
+    free = [one for one in judged if one.recording.hazard_free]
+    approaches = [one for one in judged if not one.recording.hazard_free]
+    aware = [one.in_sight(one.aware) for one in judged]
+    seen = np.concatenate([one.in_sight(one.seen) for one in judged])
+    unseen = np.concatenate([one.in_sight(one.heard) for one in judged])[~seen]
+    found = [detection(_onsets_s(one), one.recording.t0_s) for one in approaches]
+    leads = [one.lead_time_s for one in found if one.lead_time_s is not None]
+    drawn = [np.concatenate([aware[i] for i in chosen]).mean() for chosen in draws]
+    return SweepRow(
+        state=state,
+        degradation=float(np.mean([one.recording.degradation[one.row].mean() for one in judged])),
+        miss_rate=_mean(np.concatenate([_asked_miss_rates(one) for one in judged])),
+        vision_only=float(seen.mean()),
+        awareness=float(np.concatenate(aware).mean()),
+        awareness_interval=(float(np.quantile(drawn, 0.025)), float(np.quantile(drawn, 0.975))),
+        unseen_awareness=_mean(unseen),
+        detected=float(np.mean([one.detected for one in found])),
+        lead_time_s=_mean(np.array(leads)),
+        false_alarms_per_hour=false_alarms_per_hour([one.alarm for one in free], HOP_S),
+        false_awareness_per_hour=false_alarms_per_hour([one.aware for one in free], HOP_S),
+    )
+
+
+def _asked_miss_rates(one: _Judged) -> NDArray[np.float64]:
+    recording = one.recording
+    asked = recording.after_sight & (recording.answer[one.row] != UNQUERIED)
+    return np.asarray(recording.miss_rate[one.row][asked])
+
+
+def _onsets_s(one: _Judged) -> list[float]:
+    return [float(time_s) for time_s in one.recording.time_s[rising_edges(one.alarm)]]
+
+
+def _mean(values: NDArray[np.float64] | Flags) -> float | None:
+    return float(np.mean(values)) if values.size else None
+
+
+def _draws(recordings: Sequence[StagedRecording], rng: np.random.Generator) -> list[NDArray[np.intp]]:
+    """Approaches in view, drawn with replacement."""
+    shown = np.array([i for i, one in enumerate(recordings) if one.after_sight.any()], dtype=np.intp)
+    return [rng.choice(shown, size=shown.size) for _ in range(DRAWS)]

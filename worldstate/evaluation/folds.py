@@ -1,0 +1,44 @@
+"""Recordings dealt to folds, so that no threshold is set on the recording that it judges."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worldstate.checks import in_range
+
+
+def recording_folds(labels: Sequence[str], folds: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Deal recordings to folds at random, each label in its turn.
+
+    Parameters
+    ----------
+    labels : sequence of str, length n
+        One a recording.
+    folds : int
+        At least 1.
+    rng : numpy.random.Generator
+        Deals.
+
+    Returns
+    -------
+    ndarray of int, shape (n,)
+        Fold of each recording.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no fold.
+
+    Examples
+    --------
+    >>> dealt = recording_folds(["left", "none", "left", "none"], 2, np.random.default_rng(0))
+    >>> sorted(dealt[[0, 2]].tolist()), sorted(dealt[[1, 3]].tolist())
+    ([0, 1], [0, 1])
+    """
+    in_range("folds", folds, 1, 100_000)
+    order = rng.permutation(len(labels))
+    order = order[np.argsort([labels[i] for i in order], kind="stable")]
+    dealt = np.empty(len(labels), dtype=np.int64)
+    dealt[order] = np.arange(len(labels)) % folds
+    return dealt
