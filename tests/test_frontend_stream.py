@@ -1,7 +1,11 @@
 """The streaming front-end: hops, laws, bad input."""
 
 import gc
+import os
+import sys
 import tracemalloc
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from hypothesis import strategies as st
 from worldstate.errors import InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.ego_noise import EgoNoiseSettings
 from worldstate.frontend.looming import Looming
 from worldstate.frontend.music_stage import MusicReading
 from worldstate.frontend.settings import FrontEndSettings
@@ -225,19 +230,53 @@ def test_bad_settings_are_refused(rate: float, settings_: dict[str, object], mes
         FrontEnd(SQUARE, rate, FrontEndSettings(**settings_))  # type: ignore[arg-type]
 
 
+def hear(front_end: FrontEnd, sound: np.ndarray, hops: int, seed: int = 0) -> None:
+    """So many hops out of a sound, with a gap and a dead channel now and then."""
+    rng, size = np.random.default_rng(seed), round(front_end.sample_rate_hz / 10)
+    for hop in range(hops):
+        start = int(rng.integers(0, len(sound) - size))
+        block = sound[start : start + size].copy()
+        if hop % 7 == 0:
+            block[: size // 3] = 0.0
+        if hop % 11 == 0:
+            block[:, rng.integers(0, block.shape[1])] = 0.0
+        front_end.process(block)
+    gc.collect()
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def test_memory_does_not_grow() -> None:
-    front_end = FrontEnd(SQUARE, 8_000)
-    sound = noise_from(SQUARE, 0.5, 8_000, 2.0)
+    """Everything is on: nothing is kept of 1200 hops, and what is kept does not get larger."""
+    chosen = replace(EVERYTHING, nfft=256, ego_noise=EgoNoiseSettings())
+    front_end, sound = FrontEnd(SQUARE, 4_000, chosen), noise_from(SQUARE, 0.5, 4_000, 20.0)
+    front_end.learn_ego_noise(1.0)
+    hear(front_end, sound, 200)
+    blocks = sys.getallocatedblocks()
+    hear(front_end, sound, 1200, seed=1)
+    assert sys.getallocatedblocks() - blocks < 500
     tracemalloc.start()
-    traced = []
-    for _ in range(2):
-        for _ in range(10):
-            front_end.process(sound)
-        gc.collect()
-        traced.append(tracemalloc.get_traced_memory()[0])
+    hear(front_end, sound, 60, seed=2)
+    traced = tracemalloc.get_traced_memory()[0]
+    hear(front_end, sound, 120, seed=3)
+    grown = tracemalloc.get_traced_memory()[0] - traced
     tracemalloc.stop()
-    # 200 hops at 2 kB each would be eight times the limit.
-    assert traced[1] - traced[0] < 50_000
+    assert grown < 12_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the resident set is read from there")
+def test_memory_does_not_grow_in_an_hour_of_56_channels() -> None:
+    """A single float a channel and hop would be twice the limit."""
+    front_end = FrontEnd(roof_array_56(), 47_998, EVERYTHING)
+    sound = noise_from(roof_array_56(), 0.5, 47_998, 8.0)
+    hear(front_end, sound, 600)
+    blocks, resident = sys.getallocatedblocks(), resident_bytes()
+    hear(front_end, sound, 36_000, seed=1)
+    assert sys.getallocatedblocks() - blocks < 1000
+    assert resident_bytes() - resident < 4_000_000
 
 
 def test_running_second_is_the_srp_of_the_frames_that_end_in_it() -> None:
