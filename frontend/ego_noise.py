@@ -11,14 +11,19 @@ The gate is the caller's: `EgoNoise.weight`, the probability that no source is t
 after the next `guard_hops` hops have passed, with the least weight of all these, so that a source is not
 learned in the moments before anybody believes in it.
 
-Sources: the references of `prewhitening`; unit-length snapshots as in D. E. Tyler, "Statistical analysis for
-the angular central Gaussian distribution on the sphere", 1987; guard cells as in any detector of constant
-false-alarm rate.
+What is learned is used as far as it comes from below, where the own vehicle is and no street: see
+`from_below`. A street that was learned by mistake, or because the vehicle stands, changes nothing.
+
+Whitened noise that has changed since it was learned, with the speed say, leaves a level c above that of white
+noise. Its mean over all directions is learned by the same gate, and the steered power is divided by it: as in
+any detector of constant false-alarm rate, noise reads 1/M in a slow drive and in a fast one.
+
+Sources: the references of `prewhitening` and `from_below`; unit-length snapshots as in D. E. Tyler,
+"Statistical analysis for the angular central Gaussian distribution on the sphere", 1987; guard cells as in
+any detector of constant false-alarm rate.
 """
 
-import math
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +32,22 @@ from numpy.typing import NDArray
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
+from .from_below import FromBelow
+from .guarded import Guard
 from .harmonic_cancellation import HarmonicCanceller
+from .noise_memory import NoiseCovariance, NoiseLevel
 from .phat import whiten
 from .prewhitening import shrunk_inverse_root, white_share
 from .steering import Steering, cross_spectra
+from .whitened_beams import WhitenedBeams
 
 _TINY = np.float32(1e-30)
+# Shares from below at which noise begins to be whitened, and is wholly. Simulated streets: below 0.1; drives
+# at walking pace, where the street is as loud: above 0.6.
+_STREET_SHARE, _EGO_SHARE = 0.3, 0.6
+# So many bins a hop are brought up to date where the share has changed so much, and whenever so many times as
+# much has been learned: the first roots are made from a handful of frames.
+_URGENT_BINS, _ANOTHER_SHARE, _ANOTHER_LENGTH = 4, 0.2, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +66,16 @@ class EgoNoiseSettings:
         Least shrinkage towards white noise, in (0, 1]: no direction is amplified by more than its inverse
         root.
     refresh_hops : int
-        Every so many hops the whitening of one bin, in turn, is brought up to date; every hop until all
-        bins have been. It costs an M x M eigendecomposition.
+        Every so many hops the whitening of one bin, in turn, is brought up to date; several bins every hop
+        at first, and again where the vehicle starts or stops. It costs an M x M eigendecomposition.
     harmonics : int
         Lines of the engine that are cancelled before, once `FrontEnd.follow_engine` says its speed.
     feature : bool
         Compute the published feature from prewhitened sound too. Off, because its classifier was trained
         without.
+    only_from_below : bool
+        Use what was learned as far as it comes from under the array. Off, everything that is learned is
+        whitened, the street's own noise too.
 
     Raises
     ------
@@ -77,6 +95,7 @@ class EgoNoiseSettings:
     refresh_hops: int = 4
     harmonics: int = 40
     feature: bool = False
+    only_from_below: bool = True
 
     def __post_init__(self) -> None:
         in_range("forgetting_s", self.forgetting_s, 0.1, 1e5)
@@ -87,118 +106,10 @@ class EgoNoiseSettings:
         _whole("refresh_hops", self.refresh_hops, 1, 1000)
 
 
-class NoiseCovariance:
-    """Recursive mean of unit-length snapshots' covariance, per bin.
-
-    Parameters
-    ----------
-    n_bins, n_microphones : int
-        Shape.
-    forgetting_frames : float
-        Time constant, learned frames.
-
-    Examples
-    --------
-    >>> noise = NoiseCovariance(n_bins=1, n_microphones=2, forgetting_frames=1e6)
-    >>> noise.learn(np.array([[[[2.0, 2.0], [2.0, 2.0]]]], np.complex64)[0], n_frames=2, weight=1.0)
-    >>> noise.mean(0).real.tolist(), noise.n_frames
-    ([[1.0, 1.0], [1.0, 1.0]], 2.0)
-    """
-
-    def __init__(self, n_bins: int, n_microphones: int, forgetting_frames: float) -> None:
-        self.n_frames = 0.0
-        self._sum = np.zeros((n_bins, n_microphones, n_microphones), np.complex64)
-        self._forgetting = forgetting_frames
-
-    def learn(self, total: NDArray[np.complex64], n_frames: int, weight: float) -> None:
-        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
-
-        Parameters
-        ----------
-        total : ndarray of complex64, shape (bins, M, M)
-            Sum of cross-spectra; consumed.
-        n_frames : int
-            How many frames it sums.
-        weight : float
-            In (0, 1].
-        """
-        kept = math.exp(-weight * n_frames / self._forgetting)
-        total *= np.float32(weight)
-        self._sum *= np.float32(kept)
-        self._sum += total
-        self.n_frames = kept * self.n_frames + weight * n_frames
-
-    def mean(self, bin_index: int) -> NDArray[np.complex64]:
-        """Covariance of one bin; the mean of its diagonal is one.
-
-        Parameters
-        ----------
-        bin_index : int
-            From 0.
-
-        Returns
-        -------
-        ndarray of complex64, shape (M, M)
-            Hermitian.
-        """
-        return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
-
-
-class WhitenedBeams:
-    r"""Beams for whitened spectra, brought up to date bin by bin.
-
-    With :math:`W = B C` of `Steering`, the weights for :math:`y = R^{-1/2} x` are
-    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the living
-    microphones: those with any noise).
-
-    Parameters
-    ----------
-    plain : Steering
-        Beams for spectra as they are.
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array import MicrophoneArray
-    >>> plain = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
-    >>> beams = WhitenedBeams(plain)
-    >>> beams.update(0, 3.0 * np.eye(2, dtype=np.complex64))
-    >>> bool(np.allclose(beams.steering.weights, plain.weights))
-    True
-    """
-
-    def __init__(self, plain: Steering) -> None:
-        self._plain = plain
-        basis = None if plain.basis is None else plain.basis.copy()
-        self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
-
-    def update(self, bin_index: int, root: NDArray[np.complex64]) -> None:
-        """Use another inverse root (M, M) in one bin.
-
-        Parameters
-        ----------
-        bin_index : int
-            From 0.
-        root : ndarray of complex64, shape (M, M)
-            Inverse root of the noise covariance.
-        """
-        plain, ours = self._plain, self.steering
-        weights = plain.weights[bin_index]
-        if plain.basis is None or ours.basis is None:
-            weights = root.conj() @ weights
-            gram = np.square(np.abs(weights)).sum(axis=0)
-        else:
-            basis = root.conj() @ plain.basis[bin_index]
-            ours.basis[bin_index] = basis
-            gram = (weights.conj() * ((basis.conj().T @ basis) @ weights)).real.sum(axis=0)
-        alive = np.float32(np.count_nonzero(np.einsum("mm->m", root)))
-        scaled = weights * np.sqrt(alive / np.maximum(gram, _TINY))
-        ours.weights[bin_index], ours.conjugate[bin_index] = scaled, scaled.conj()
-
-
 class EgoNoise:
     """Learns the ego-noise of a stream and whitens its spectra, hop by hop.
 
-    Until something has been learned, spectra and beams are what they were, bit for bit. Set `weight` to the
+    Until something from below has been learned, spectra are what they were, bit for bit. Set `weight` to the
     probability that no source is there: it holds for all hops from then on.
 
     Parameters
@@ -212,7 +123,9 @@ class EgoNoise:
     beams : sequence of (Steering, slice)
         Beams to keep whitened, each with its bins among those of the spectra.
     engine : HarmonicCanceller, optional
-        For the same spectra.
+        For the bins of the beams, from the first to the last.
+    from_below : FromBelow, optional
+        For these bins; without it all that is learned counts as from below.
 
     Examples
     --------
@@ -234,24 +147,28 @@ class EgoNoise:
         n_microphones: int,
         beams: Sequence[tuple[Steering, slice]],
         engine: HarmonicCanceller | None = None,
+        from_below: FromBelow | None = None,
     ) -> None:
         self.weight = 0.0
         self.engine = engine
+        self.from_below = 0.0
+        self._judge = from_below
         self._beams = [WhitenedBeams(plain) for plain, _ in beams]
-        first, last = min(bins.start for _, bins in beams), max(bins.stop for _, bins in beams)
-        self._bins = slice(first, last)
+        self._bins = spanned(bins for _, bins in beams)
+        first, n_bins = self._bins.start, self._bins.stop - self._bins.start
         self._slices = [slice(bins.start - first, bins.stop - first) for _, bins in beams]
-        n_bins = last - first
         self._settings = settings
         self._covariance = NoiseCovariance(n_bins, n_microphones, 0.5 * settings.forgetting_s * frames_per_s)
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
-        self._waiting: deque[tuple[NDArray[np.complex64] | None, int]] = deque()
-        self._weights: deque[float] = deque(maxlen=settings.guard_hops + 1)
+        self._guard: Guard[tuple[NDArray[np.complex64] | None, int]] = Guard(settings.guard_hops)
+        self._level = NoiseLevel(settings.guard_hops)
         self._is_odd = False
         self._next_bin = 0
         self._stale = 0
         self._hops_since_refresh = 0
-        self._all_bins_seen = False
+        # Bins to bring up to date at once, and what that is for: the share, the frames learned.
+        self._urgent = n_bins
+        self._aim = self._aim_frames = 0.0
 
     @property
     def learned_frames(self) -> float:
@@ -271,55 +188,119 @@ class EgoNoise:
         list of (ndarray of complex64, shape (frames, its bins, M), Steering)
             For each set of beams.
         """
-        rest = spectra if self.engine is None else self.engine.cancel(spectra)
-        heard = rest[:, self._bins]
+        heard = spectra[:, self._bins]
+        if self.engine is not None:
+            heard = self.engine.cancel(heard)
         self._learn(heard)
         self._refresh()
         whitened = self._whitened(heard)
         both = zip(self._slices, self._beams, strict=True)
-        return [(whitened[:, bins], beams.steering) for bins, beams in both]
+        used = bool(self.from_below)
+        return [(whitened[:, bins], beams.steering if used else beams.plain) for bins, beams in both]
+
+    def levelled(self, power: NDArray[np.float64], n_frames: int) -> NDArray[np.float64]:
+        """Divide a hop's steered power by the level that whitened noise had while it was learned.
+
+        Parameters
+        ----------
+        power : ndarray of float64, shape (directions,)
+            Of the first set of beams, summed over the frames of the hop that was processed last.
+        n_frames : int
+            Their number.
+
+        Returns
+        -------
+        ndarray of float64, shape (directions,)
+            White noise of unit modulus has M in every frame and bin. As it was where nothing is whitened.
+        """
+        if not self._aim_frames or not self.from_below:
+            return power
+        n_bins = self._slices[0].stop - self._slices[0].start
+        white = n_frames * n_bins * self._roots.shape[1]
+        level = self._level.push(float(power.mean()) / white, self._gated())
+        return np.asarray(power / max(level, 1e-6) ** self.from_below)
+
+    def _gated(self) -> float:
+        return self.weight if self.weight >= self._settings.min_weight else 0.0
 
     def _whitened(self, heard: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        if not self.learned_frames:
+        if not self.from_below:
             return whiten(heard)
         by_bin = heard.transpose(1, 0, 2) @ self._roots.transpose(0, 2, 1)
         return whiten(by_bin).transpose(1, 0, 2)
 
     def _learn(self, spectra: NDArray[np.complex64]) -> None:
         """Put this hop in the queue, take the one that has waited long enough."""
-        used = self.weight if self.weight >= self._settings.min_weight else 0.0
-        self._weights.append(used)
+        weight = self._gated()
         # Ego-noise is steady: every second hop says nearly everything.
         self._is_odd = not self._is_odd
-        total = _direction_sum(spectra) if used > 0.0 and self._is_odd else None
-        self._waiting.append((total, len(spectra)))
-        if len(self._waiting) <= self._settings.guard_hops:
+        total = _direction_sum(spectra) if weight > 0.0 and self._is_odd else None
+        ripe = self._guard.push((total, len(spectra)), weight)
+        if ripe is None:
             return
-        total, n_frames = self._waiting.popleft()
-        weight = min(self._weights)
+        (total, n_frames), weight = ripe
         if total is not None and weight > 0.0:
             self._covariance.learn(total, n_frames, weight)
             self._stale = len(self._roots)
 
     def _refresh(self) -> None:
-        """Bring the next bin up to date if it is time, until all have seen what was learned last."""
+        """Bring the next bins up to date if it is time, until all have seen what was learned last."""
         self._hops_since_refresh += 1
-        due = not self._all_bins_seen or self._hops_since_refresh >= self._settings.refresh_hops
+        grown = self.learned_frames > _ANOTHER_LENGTH * self._aim_frames
+        due = grown or self._urgent or self._hops_since_refresh >= self._settings.refresh_hops
         if not (self._stale and due):
             return
-        self._update(self._next_bin)
-        self._next_bin = (self._next_bin + 1) % len(self._roots)
-        self._all_bins_seen |= self._next_bin == 0
-        self._stale -= 1
+        self._judge_share()
+        for _ in range(min(_URGENT_BINS, self._urgent) or 1):
+            self._update(self._next_bin)
+            self._next_bin = (self._next_bin + 1) % len(self._roots)
+            self._stale, self._urgent = max(self._stale - 1, 0), max(self._urgent - 1, 0)
         self._hops_since_refresh = 0
+
+    def _judge_share(self) -> None:
+        """Decide how far what was learned is used; where that has changed, all bins are urgent."""
+        self.from_below = self._share_used()
+        is_another = abs(self.from_below - self._aim) > _ANOTHER_SHARE
+        if is_another or self.learned_frames > _ANOTHER_LENGTH * self._aim_frames:
+            self._aim, self._aim_frames = self.from_below, self.learned_frames
+            self._urgent = self._stale = len(self._roots)
+
+    def _share_used(self) -> float:
+        """How far what was learned is used: 0 for a street, 1 for a vehicle's own noise."""
+        if self._judge is None:
+            return 1.0
+        share = self._judge.share(self._covariance.total)
+        return min(max((share - _STREET_SHARE) / (_EGO_SHARE - _STREET_SHARE), 0.0), 1.0)
 
     def _update(self, index: int) -> None:
         R = self._covariance.mean(index)
-        shrinkage = max(self._settings.min_shrinkage, white_share(R, self.learned_frames))
-        self._roots[index] = shrunk_inverse_root(R, shrinkage)
+        least = max(self._settings.min_shrinkage, 1.0 - self.from_below)
+        self._roots[index] = shrunk_inverse_root(R, max(least, white_share(R, self.learned_frames)))
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
                 beams.update(index - bins.start, self._roots[index])
+
+
+def spanned(slices: Iterable[slice]) -> slice:
+    """Return the bins from the first to the last of several sets.
+
+    Parameters
+    ----------
+    slices : iterable of slice
+        At least one, with start and stop.
+
+    Returns
+    -------
+    slice
+        Covers them all.
+
+    Examples
+    --------
+    >>> spanned([slice(2, 5), slice(0, 3)])
+    slice(0, 5, None)
+    """
+    parts = list(slices)
+    return slice(min(part.start for part in parts), max(part.stop for part in parts))
 
 
 def _direction_sum(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:

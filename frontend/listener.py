@@ -9,8 +9,9 @@ from .array import MicrophoneArray
 from .bins import band_bins, bin_frequencies_hz
 from .channel_health import ArrayHealth
 from .channel_monitor import ChannelMonitor
-from .ego_noise import EgoNoise
+from .ego_noise import EgoNoise, spanned
 from .feature import feature_steering, pair_sum, pair_sum_of
+from .from_below import FromBelow
 from .harmonic_cancellation import HarmonicCanceller
 from .masking import ChannelMask
 from .music_stage import MusicStage
@@ -100,7 +101,7 @@ class Listener:
         self.music = self._music(array.n_microphones, settings)
         self._unwatched = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
-        self.ego_noise = self._ego_noise(array.n_microphones, sample_rate_hz, bins, settings)
+        self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
 
     def push(self, samples: NDArray[np.float32]) -> HopSums:
         """Sum over the frames that these samples (n, M) complete; at least one frame.
@@ -149,10 +150,7 @@ class Listener:
         quiet = self.ego_noise.process(spectra)
         for heard, _ in quiet:
             mask.silence(heard)
-        if self.ego_noise.learned_frames:
-            return quiet
-        plain = (self._beams, self._feature_beams)
-        return [(heard, beams) for (heard, _), beams in zip(quiet, plain, strict=False)]
+        return quiet
 
     def _push_music(
         self, music: MusicStage, spectra: Spectra, powers: NDArray[np.float32], quiet: list[Steered]
@@ -174,7 +172,10 @@ class Listener:
             pairs = pair_sum(*quiet[1])
         else:
             pairs = pair_sum_of(mask.cross(matrices), self._feature_beams)
-        return steered_power(*srp) * mask.power_scale, pairs * mask.pair_scale
+        power = steered_power(*srp) * mask.power_scale
+        if self.ego_noise is not None:
+            power = self.ego_noise.levelled(power, len(srp[0]))
+        return power, pairs * mask.pair_scale
 
     def _music(self, n_microphones: int, settings: FrontEndSettings) -> MusicStage | None:
         if not settings.music_sources:
@@ -191,7 +192,7 @@ class Listener:
         return ChannelMonitor(array, frequencies, sample_rate_hz, settings.speed_of_sound_m_s)
 
     def _ego_noise(
-        self, n_microphones: int, sample_rate_hz: float, bins: range, settings: FrontEndSettings
+        self, array: MicrophoneArray, sample_rate_hz: float, bins: range, settings: FrontEndSettings
     ) -> EgoNoise | None:
         chosen, nfft = settings.ego_noise, settings.nfft
         if chosen is None:
@@ -199,8 +200,13 @@ class Listener:
         beams = [(self._beams, self._srp)]
         if chosen.feature:
             beams.append((self._feature_beams, self._feature))
-        engine = HarmonicCanceller(bins, sample_rate_hz, nfft, harmonics=chosen.harmonics)
-        return EgoNoise(chosen, 2.0 * sample_rate_hz / nfft, n_microphones, beams, engine)
+        part = spanned(part for _, part in beams)
+        heard = bins[part]
+        engine = HarmonicCanceller(heard, sample_rate_hz, nfft, harmonics=chosen.harmonics)
+        frequencies, speed = bin_frequencies_hz(heard, sample_rate_hz, nfft), settings.speed_of_sound_m_s
+        judge = FromBelow.of(array, frequencies, speed) if chosen.only_from_below else None
+        frames_per_s = 2.0 * sample_rate_hz / nfft
+        return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, judge)
 
     def _centre(self, n_new: int) -> float:
         """Middle of the new frames; frame t covers samples t N/2 .. t N/2 + N."""

@@ -245,6 +245,8 @@ def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
 
 
 def _shrunk_root(R: NDArray[np.complexfloating], s: float) -> ComplexArray:
+    if s >= 1.0:
+        return np.eye(len(R), dtype=R.dtype)
     values, vectors = np.linalg.eigh(R)
     shrunk = (1.0 - s) * np.maximum(values, 0.0) + s
     gains = 1.0 / np.sqrt(np.maximum(shrunk, np.finfo(values.dtype).tiny))

@@ -1,0 +1,114 @@
+r"""What comes from below: the share of a covariance that a street cannot have made.
+
+The own vehicle lies under its microphones, the street at their height and above. Of each bin's covariance the
+part between different microphones is fitted by two fields,
+
+.. math:: \hat p = \arg\min_p \sum_{i \ne j} |R_{ij} - p_b\, \Gamma^b_{ij} - p_s\, \Gamma^s_{ij}|^2,
+          \qquad q = \frac{\sum_k \Delta_k\, p_{b,k}}{\sum_k \Delta_k\, (p_{b,k} + p_{s,k})},
+
+plane waves from all azimuths and from elevations well under the horizon (b) or from the horizon upwards (s).
+Bins count by the determinant of their normal equations: where the array is small against the wavelength the
+fields look alike and say nothing. Wind and sensor noise are on the diagonal only and play no part.
+
+Source: isotropic model fields as in B. F. Cron and C. H. Sherman, "Spatial-correlation functions for various
+noise models", J. Acoust. Soc. Am. 34, 1962; weighted least squares.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .array import MicrophoneArray
+from .geometry import SPEED_OF_SOUND_M_S
+
+_BELOW_DEG, _STREET_DEG = (-60.0, -50.0, -40.0, -30.0, -20.0), (0.0, 10.0, 20.0, 30.0)
+_AZIMUTHS_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
+# Least 1 - cos^2 of the angle between the fields: a level array cannot tell them apart at all.
+_LEAST_CONTRAST = 0.02
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FromBelow:
+    """Tells noise of the own vehicle from that of the street, by elevation.
+
+    Parameters
+    ----------
+    below, street : ndarray of float32, shape (bins, 2 M^2)
+        Combinations of the model fields, real and imaginary parts in turn, that give the power of one field
+        times the determinant.
+    can_tell : bool
+        Whether the array has the height for it.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import roof_array_56
+    >>> array = roof_array_56()
+    >>> judge = FromBelow.of(array, [500.0, 1000.0])
+    >>> def heard(elevation):
+    ...     a = array.steering([500.0, 1000.0], 0.3, elevation)
+    ...     return (a @ a.conj().transpose(0, 2, 1)).astype(np.complex64)
+    >>> [judge.share(heard(np.radians(elevation))) > 0.5 for elevation in (-40, 5)]
+    [True, False]
+    """
+
+    below: NDArray[np.float32]
+    street: NDArray[np.float32]
+    can_tell: bool
+
+    @classmethod
+    def of(
+        cls,
+        array: MicrophoneArray,
+        frequencies_hz: ArrayLike,
+        speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+    ) -> "FromBelow":
+        """Make the model fields of an array at the frequencies of its bins.
+
+        Parameters
+        ----------
+        array : MicrophoneArray
+            Microphones.
+        frequencies_hz : array_like, shape (bins,)
+            Hz.
+        speed_of_sound_m_s : float
+            c.
+
+        Returns
+        -------
+        FromBelow
+            For covariances of these bins.
+        """
+        b, s = (_field(array, frequencies_hz, el, speed_of_sound_m_s) for el in (_BELOW_DEG, _STREET_DEG))
+        bb, ss, bs = (np.einsum("kn,kn->k", x, y)[:, None] for x, y in ((b, b), (s, s), (b, s)))
+        contrast = float((bb * ss - bs**2).sum() / max(float((bb * ss).sum()), _TINY))
+        below, street = ss * b - bs * s, bb * s - bs * b
+        scale = 1.0 / max(float(np.abs(below).max()), _TINY)
+        below, street = (np.ascontiguousarray(scale * x, np.float32) for x in (below, street))
+        return cls(below, street, can_tell=contrast >= _LEAST_CONTRAST)
+
+    def share(self, covariance: NDArray[np.complex64]) -> float:
+        """Return q in [0, 1] of (bins, M, M), all bins at like power; 1 for an array that cannot tell.
+
+        Parameters
+        ----------
+        covariance : ndarray of complex64, shape (bins, M, M)
+            Hermitian.
+        """
+        if not self.can_tell:
+            return 1.0
+        parts = covariance.reshape(len(covariance), -1).view(np.float32)
+        below, street = (max(float(np.vdot(parts, field)), 0.0) for field in (self.below, self.street))
+        return below / (below + street) if below > _TINY * street else 0.0
+
+
+def _field(
+    array: MicrophoneArray, frequencies_hz: ArrayLike, elevations_deg: tuple[float, ...], speed: float
+) -> NDArray[np.float64]:
+    """Covariance between different microphones of waves from all around at some elevations, (bins, 2 M^2)."""
+    azimuths, elevations = np.meshgrid(_AZIMUTHS_RAD, np.radians(elevations_deg))
+    A = array.steering(frequencies_hz, azimuths.ravel(), elevations.ravel(), speed)
+    field = A @ A.conj().transpose(0, 2, 1) / A.shape[2]
+    field[:, np.arange(array.n_microphones), np.arange(array.n_microphones)] = 0.0
+    return np.asarray(np.ascontiguousarray(field.reshape(len(field), -1)).view(np.float64))

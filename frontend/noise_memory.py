@@ -1,0 +1,116 @@
+"""What is remembered of noise: its covariance, and its level once it is whitened."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .guarded import Guard
+
+# Memory of the level of whitened noise, hops.
+_LEVEL_HOPS = 10.0
+
+
+class NoiseCovariance:
+    """Recursive mean of unit-length snapshots' covariance, per bin.
+
+    Parameters
+    ----------
+    n_bins, n_microphones : int
+        Shape.
+    forgetting_frames : float
+        Time constant, learned frames.
+
+    Examples
+    --------
+    >>> noise = NoiseCovariance(n_bins=1, n_microphones=2, forgetting_frames=1e6)
+    >>> noise.learn(np.array([[[[2.0, 2.0], [2.0, 2.0]]]], np.complex64)[0], n_frames=2, weight=1.0)
+    >>> noise.mean(0).real.tolist(), noise.n_frames
+    ([[1.0, 1.0], [1.0, 1.0]], 2.0)
+    """
+
+    def __init__(self, n_bins: int, n_microphones: int, forgetting_frames: float) -> None:
+        self.n_frames = 0.0
+        self._sum = np.zeros((n_bins, n_microphones, n_microphones), np.complex64)
+        self._forgetting = forgetting_frames
+
+    def learn(self, total: NDArray[np.complex64], n_frames: int, weight: float) -> None:
+        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
+
+        Parameters
+        ----------
+        total : ndarray of complex64, shape (bins, M, M)
+            Sum of cross-spectra; consumed.
+        n_frames : int
+            How many frames it sums.
+        weight : float
+            In (0, 1].
+        """
+        kept = math.exp(-weight * n_frames / self._forgetting)
+        total *= np.float32(weight)
+        self._sum *= np.float32(kept)
+        self._sum += total
+        self.n_frames = kept * self.n_frames + weight * n_frames
+
+    def mean(self, bin_index: int) -> NDArray[np.complex64]:
+        """Covariance of one bin; the mean of its diagonal is one.
+
+        Parameters
+        ----------
+        bin_index : int
+            From 0.
+
+        Returns
+        -------
+        ndarray of complex64, shape (M, M)
+            Hermitian.
+        """
+        return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
+
+    @property
+    def total(self) -> NDArray[np.complex64]:
+        """Sum that the mean is made of, (bins, M, M)."""
+        return self._sum
+
+
+class NoiseLevel:
+    """Level of whitened noise over that of white noise, learned like the covariance.
+
+    Parameters
+    ----------
+    guard_hops : int
+        A hop counts so many hops later.
+
+    Examples
+    --------
+    >>> level = NoiseLevel(guard_hops=0)
+    >>> level.push(3.0, 1.0), level.push(9.0, 0.0), level.push(5.0, 1.0)
+    (3.0, 3.0, 4.04...)
+    """
+
+    def __init__(self, guard_hops: int) -> None:
+        self._guard: Guard[float] = Guard(guard_hops)
+        self._sum = self._weights = 0.0
+
+    def push(self, level: float, weight: float) -> float:
+        """Take a hop's level with the weight of the gate; return the level learned, 1 before there is any.
+
+        Parameters
+        ----------
+        level : float
+            Mean over directions, 1 for white noise.
+        weight : float
+            In [0, 1]; 0 for a hop that is not learned.
+
+        Returns
+        -------
+        float
+            Mean with a memory of a second of learning.
+        """
+        ripe = self._guard.push(level, weight)
+        if ripe is not None and ripe[1] > 0.0:
+            learned, weight = ripe
+            kept = math.exp(-weight / _LEVEL_HOPS)
+            self._sum = kept * self._sum + weight * learned
+            self._weights = kept * self._weights + weight
+        return self._sum / self._weights if self._weights else 1.0

@@ -1,0 +1,59 @@
+"""Beams for spectra that are whitened by a root of their own in every bin."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .steering import Steering
+
+_TINY = np.float32(1e-30)
+
+
+class WhitenedBeams:
+    r"""Beams for whitened spectra, brought up to date bin by bin.
+
+    With :math:`W = B C` of `Steering`, the weights for :math:`y = R^{-1/2} x` are
+    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the living
+    microphones: those with any noise).
+
+    Parameters
+    ----------
+    plain : Steering
+        Beams for spectra as they are.
+
+    Examples
+    --------
+    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> plain = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
+    >>> beams = WhitenedBeams(plain)
+    >>> beams.update(0, 3.0 * np.eye(2, dtype=np.complex64))
+    >>> bool(np.allclose(beams.steering.weights, plain.weights))
+    True
+    """
+
+    def __init__(self, plain: Steering) -> None:
+        self.plain = plain
+        basis = None if plain.basis is None else plain.basis.copy()
+        self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
+
+    def update(self, bin_index: int, root: NDArray[np.complex64]) -> None:
+        """Use another inverse root (M, M) in one bin.
+
+        Parameters
+        ----------
+        bin_index : int
+            From 0.
+        root : ndarray of complex64, shape (M, M)
+            Inverse root of the noise covariance.
+        """
+        plain, ours = self.plain, self.steering
+        weights = plain.weights[bin_index]
+        if plain.basis is None or ours.basis is None:
+            weights = root.conj() @ weights
+            gram = np.square(np.abs(weights)).sum(axis=0)
+        else:
+            basis = root.conj() @ plain.basis[bin_index]
+            ours.basis[bin_index] = basis
+            gram = (weights.conj() * ((basis.conj().T @ basis) @ weights)).real.sum(axis=0)
+        alive = np.float32(np.count_nonzero(np.einsum("mm->m", root)))
+        scaled = weights * np.sqrt(alive / np.maximum(gram, _TINY))
+        ours.weights[bin_index], ours.conjugate[bin_index] = scaled, scaled.conj()
