@@ -29,6 +29,7 @@ from worldstate.adapters.simulation.propagation import add_sources
 from worldstate.adapters.simulation.receiver import Receiver, add_turning
 from worldstate.adapters.simulation.scattered_sound import add_scattered
 from worldstate.adapters.simulation.scene import Site
+from worldstate.adapters.simulation.static_field import StaticSources
 from worldstate.frontend.array import MicrophoneArray
 
 FS = 48_000.0
@@ -74,7 +75,7 @@ def test_a_moving_ego_hears_the_doppler_of_its_own_speed():
     sound = emission(receiver, tone(1000.0))
     out = np.zeros((1, receiver.samples), np.float32)
     still = MovingSource(sound, place[0], np.full(len(sound.knots_s), place[1]))
-    add_sources(out, [still], FREE_FIELD, receiver, 40.0)
+    add_sources(out, StaticSources(out, FS), [still], FREE_FIELD, receiver, 40.0)
     time = np.arange(receiver.samples) / FS
     distance = np.sqrt((20.0 - ego.x_m(time)) ** 2 + 3.0**2 + 1.4**2)
     exact = np.cos(2 * np.pi * 1000.0 * (time - distance / C)) / distance
@@ -119,8 +120,10 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
     (path,) = trajectories(scene, emitted.knots_s)
     out = np.zeros((1, receiver.samples), np.float32)
     source = MovingSource(emitted, *path.behind(0.9))
-    add_sources(out, [source], scene.site, receiver, 24.0, outdoors=True)
-    add_scattered(out, source, scene.site, receiver, scene.preset)
+    static = StaticSources(out, FS)
+    add_sources(out, static, [source], scene.site, receiver, 24.0, outdoors=True)
+    add_scattered(out, static, source, scene.site, receiver, scene.preset)
+    static.render()
     return out[0].astype(float)
 
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from worldstate.adapters.simulation import propagation
 from worldstate.adapters.simulation.bands import octave_masks, split_octaves
 from worldstate.adapters.simulation.delay import (
     KNOT_SAMPLES,
@@ -16,16 +17,22 @@ from worldstate.adapters.simulation.delay import (
 from worldstate.adapters.simulation.diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from worldstate.adapters.simulation.emission import Emission, MovingSource
 from worldstate.adapters.simulation.late_field import sphere
-from worldstate.adapters.simulation.propagation import add_sources
 from worldstate.adapters.simulation.receiver import Receiver
 from worldstate.adapters.simulation.scene import Site
-from worldstate.adapters.simulation.static_field import add_static, plane_wave_delays
+from worldstate.adapters.simulation.static_field import StaticSources, add_static, plane_wave_delays
 from worldstate.adapters.simulation.vehicle import SOURCE_HEIGHT_M
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS
 # Corners far to the sides: everything is in the light and nothing reflects.
 FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, side_order=0, facade_order=0)
+
+
+def add_sources(out, *arguments):
+    """Add sources and whatever waits."""
+    static = StaticSources(out, FS)
+    propagation.add_sources(out, static, *arguments)
+    static.render()
 
 
 def receiver(positions: np.ndarray, blocks: int) -> Receiver:

@@ -33,6 +33,7 @@ from worldstate.adapters.simulation.emission import Emission, MovingSource
 from worldstate.adapters.simulation.paths import trace_paths
 from worldstate.adapters.simulation.propagation import add_sources
 from worldstate.adapters.simulation.receiver import Receiver
+from worldstate.adapters.simulation.static_field import StaticSources
 from worldstate.adapters.simulation.vehicle import drive, propulsion_level_db, rolling_level_db
 from worldstate.cli import simulate as cli
 from worldstate.cli.main import main
@@ -57,7 +58,9 @@ def pass_by(tone_hz: float, name: str, approach: str) -> np.ndarray:
     path = drive(emission.knots_s, entry_s=2.5, entry_y_m=entry, lane_x_m=lane, speed_mps=9.0)
     receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / FS)
     out = np.zeros((1, blocks * KNOT_SAMPLES), np.float32)
-    add_sources(out, [MovingSource(emission, lane, path.axle_y_m())], plan, receiver, 24.0)
+    static = StaticSources(out, FS)
+    add_sources(out, static, [MovingSource(emission, lane, path.axle_y_m())], plan, receiver, 24.0)
+    static.render()
     return out[0].astype(float)
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.fft import irfft, next_fast_len, rfftfreq
 
 from .bands import REFERENCE_PA, level_curve
 from .presets import Preset
 from .scene import Site, site_generator
-from .static_field import add_static, plane_wave_delays
+from .static_field import StaticSources, plane_wave_delays
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]
@@ -20,6 +20,7 @@ WIND_FLOOR_HZ = 20.0  # below, wind stays as it is there
 
 def add_background(
     out: Signal,
+    static: StaticSources,
     site: Site,
     preset: Preset,
     positions_m: Array,
@@ -32,6 +33,8 @@ def add_background(
     ----------
     out : ndarray, shape (M, n)
         Pa, added to in place.
+    static : StaticSources
+        Where the plane waves go.
     site : Site
         Its name decides from where the ambient sound comes.
     preset : Preset
@@ -47,9 +50,10 @@ def add_background(
     level_db = np.array(preset.ambient_octaves_db) + preset.ambient_spread_db * rng.standard_normal()
     azimuth, power = ambient_directions(site, preset, rng)
     waves = _ambient_waves(power, level_db, preset, out.shape[1], sample_rate_hz, rng)
-    add_static(out, waves, plane_wave_delays(unit_vectors(azimuth, rng), offsets), sample_rate_hz)
+    static.add(waves, plane_wave_delays(unit_vectors(azimuth, rng), offsets))
     for _ in range(min(int(rng.poisson(preset.far_rate)), 2)):
-        _add_far_vehicle(out, level_db + preset.far_level_db, offsets, sample_rate_hz, rng)
+        far_db = level_db + preset.far_level_db
+        static.add(*_far_vehicle(out.shape[1], far_db, offsets, sample_rate_hz, rng))
     _add_channel_noise(out, preset, sample_rate_hz, rng)
 
 
@@ -91,11 +95,12 @@ def shaped_noise(density: Array, samples: int, rng: np.random.Generator, channel
     ndarray, shape (channels, samples)
     """
     n = next_fast_len(samples, real=True)
-    shape = np.sqrt(density / 2.0).astype(np.float32)
+    shape = np.sqrt(density * n / 4.0).astype(np.float32)
     noise = np.empty((channels, samples), np.float32)
     for channel in noise:
-        white = rng.standard_normal(n, dtype=np.float32)
-        channel[:] = irfft(rfft(white) * shape, n)[:samples]
+        # The transform of white noise is white noise.
+        white = rng.standard_normal(2 * len(shape), dtype=np.float32).view(np.complex64)
+        channel[:] = irfft(white * shape, n)[:samples]
     return noise
 
 
@@ -117,18 +122,17 @@ def _ambient_waves(
     return waves
 
 
-def _add_far_vehicle(
-    out: Signal, level_db: Array, offsets_m: Array, rate: float, rng: np.random.Generator
-) -> None:
-    """Add a vehicle some streets away: one direction, one facade reflection, gone in seconds."""
-    samples = out.shape[1]
+def _far_vehicle(
+    samples: int, level_db: Array, offsets_m: Array, rate: float, rng: np.random.Generator
+) -> tuple[Signal, Array]:
+    """Draw a vehicle some streets away: one direction, one facade reflection, gone in seconds."""
     noise = shaped_noise(level_curve(level_db, noise_frequencies(samples, rate)) * rate, samples, rng, 1)
     time = np.arange(samples) / rate
     centre, width = rng.uniform(0.0, time[-1] + 1.0 / rate), rng.uniform(1.5, 4.0)
     noise *= np.exp(-0.5 * ((time - centre) / width) ** 2).astype(np.float32)
     echo = np.roll(noise, int(rng.uniform(0.01, 0.05) * rate)) * np.float32(rng.uniform(0.3, 0.8))
     directions = unit_vectors(rng.uniform(-np.pi, np.pi, 2), rng)
-    add_static(out, np.concatenate([noise, echo]), plane_wave_delays(directions, offsets_m), rate)
+    return np.concatenate([noise, echo]), plane_wave_delays(directions, offsets_m)
 
 
 def _add_channel_noise(out: Signal, preset: Preset, rate: float, rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ from worldstate.errors import InvalidArgumentError
 from .background import noise_frequencies, shaped_noise
 from .bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
-from .static_field import add_static
+from .static_field import StaticSources
 from .vehicle import (
     HARMONIC_SHARE,
     POWER_TO_1M_DB,
@@ -173,7 +173,7 @@ def _add_sources(
     out: Signal, positions: Array, speed: Array, firing: Array, rate: float, rng: np.random.Generator
 ) -> None:
     roof = _roof_edge(float(positions[:, 2].min()) - ROOF_BELOW_ARRAY_M)
-    levels = _levels_db(speed[::KNOT])
+    levels, static = _levels_db(speed[::KNOT]), StaticSources(out, rate)
     for place, level_db, lines in zip(_places(), levels, _line_shares(), strict=True):
         bands = split_octaves(_emission(firing, lines, rate, rng), rate)
         bands *= _at_samples(_pressure_pa(level_db), len(speed))
@@ -181,7 +181,8 @@ def _add_sources(
             length, detour = _paths_m(place * [1.0, 1.0, image], positions, roof)
             screen = 10.0 ** (-screen_attenuation_db(detour, OCTAVES_HZ, SCREEN_CAP_DB) / 20.0)
             signal = (reflection * screen).astype(np.float32) @ bands
-            add_static(out, signal[None], length[None] / SPEED_OF_SOUND_MPS, rate, 1.0 / length[None])
+            static.add(signal[None], length[None] / SPEED_OF_SOUND_MPS, 1.0 / length[None])
+    static.render()
 
 
 def _places() -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from .scene import Site, site_generator
-from .static_field import add_static, plane_wave_delays
+from .static_field import StaticSources, plane_wave_delays
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]
@@ -70,8 +70,9 @@ def street_field(site: Site, lobe_share: float) -> tuple[Array, Array]:
 
 
 def add_late_field(
-    out: Signal,
+    static: StaticSources,
     dry: Signal,
+    samples: int,
     decay_s: float,
     positions_m: Array,
     sample_rate_hz: float,
@@ -84,10 +85,12 @@ def add_late_field(
 
     Parameters
     ----------
-    out : ndarray, shape (M, n)
-        Pa, added to in place.
-    dry : ndarray, shape (pre + n,)
+    static : StaticSources
+        Where the waves go.
+    dry : ndarray, shape (pre + samples,)
         What feeds the field; it begins ``pre`` samples before the first heard one.
+    samples : int
+        How many are heard.
     decay_s : float
         Reverberation time (60 dB).
     positions_m : ndarray, shape (M, 3)
@@ -107,9 +110,9 @@ def add_late_field(
     spectrum = rfft(dry, n)
     envelope = 10.0 ** (-3.0 * np.arange(tail) / tail * TAIL_DECAYS)
     envelope /= np.sqrt((envelope**2).sum())
-    waves = np.empty((len(shares), out.shape[1]), np.float32)
+    waves = np.empty((len(shares), samples), np.float32)
     for wave, share in zip(waves, shares, strict=True):
         response = (np.sqrt(share) * envelope * rng.standard_normal(tail)).astype(np.float32)
-        wave[:] = irfft(spectrum * rfft(response, n), n)[len(dry) - out.shape[1] : len(dry)]
+        wave[:] = irfft(spectrum * rfft(response, n), n)[len(dry) - samples : len(dry)]
     offsets = positions_m - positions_m.mean(axis=0)
-    add_static(out, waves, plane_wave_delays(directions, offsets), sample_rate_hz)
+    static.add(waves, plane_wave_delays(directions, offsets))

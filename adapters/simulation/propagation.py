@@ -15,7 +15,7 @@ from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_path
 from .receiver import NEAREST_M, Receiver, add_turning
 from .scene import Site
 from .screened import screened_legs
-from .static_field import add_static
+from .static_field import StaticSources
 from .vehicle import SOURCE_HEIGHT_M
 
 Array = NDArray[np.float64]
@@ -27,6 +27,7 @@ FAINTEST = 1e-3  # a path below this share of the whole is left out
 
 def add_sources(
     out: Signal,
+    static: StaticSources,
     sources: Sequence[MovingSource],
     site: Site,
     receiver: Receiver,
@@ -41,6 +42,8 @@ def add_sources(
     ----------
     out : ndarray, shape (M, K * KNOT_SAMPLES)
         Pa, float32, added to in place.
+    static : StaticSources
+        Where goes what places that stand still send to microphones that stand still.
     sources : sequence of MovingSource
         Places of one vehicle: what bends round a corner is added up there before it goes on.
     site : Site
@@ -65,7 +68,7 @@ def add_sources(
             for edge in (LEFT, RIGHT):
                 _add_bent(bent[images.index(path.receiver), edge], source, path, edge, site, receiver)
             _add_lit(out, source, path, receiver)
-    _add_corners(out, bent, images, site, receiver)
+    _add_corners(out, static, bent, images, site, receiver)
 
 
 def _paths(
@@ -168,7 +171,12 @@ def _round(before: Array, along: Array, across: Array, rise: float, x_m: Array) 
 
 
 def _add_corners(
-    out: Signal, bent: Signal, images: list[ReceiverImage], site: Site, receiver: Receiver
+    out: Signal,
+    static: StaticSources,
+    bent: Signal,
+    images: list[ReceiverImage],
+    site: Site,
+    receiver: Receiver,
 ) -> None:
     """Let every corner, as every side image sees it, sound to all microphones."""
     places = [(image, y) for image in images for y in (site.corner_left_m, -site.corner_right_m)]
@@ -176,7 +184,7 @@ def _add_corners(
     used = np.flatnonzero(np.abs(signals).max(axis=1) > 0.0)
     if len(used) and receiver.ego.stands:
         delays = np.stack([_corner_delays(*place, site.corner_ahead_m, receiver) for place in places])
-        add_static(out, signals[used], delays[used], receiver.sample_rate_hz)
+        static.add(signals[used], delays[used])
     elif len(used):
         for i in used:
             image, y = places[i]

@@ -24,6 +24,7 @@ from .receiver import Receiver
 from .scatter import scattering
 from .scattered_sound import add_scattered
 from .settings import SimulationSettings
+from .static_field import StaticSources
 from .truth import describe
 from .vehicle import SOURCE_HEIGHT_M, Trajectory, emit
 
@@ -151,11 +152,13 @@ def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     to_emission, to_street, to_channels = rng.spawn(3)
     receiver = _receiver(settings, array, to_channels)
     sound = np.zeros((len(receiver.positions_m), receiver.samples), np.float32)
+    static = StaticSources(sound, settings.sample_rate_hz)
     paths = trajectories(settings, _knots(settings))
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
-        _add_vehicle_sound(sound, settings, path, receiver, draws)
+        _add_vehicle_sound(sound, static, settings, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
-    add_background(sound, settings.site, settings.preset, positions, rate, to_street)
+    add_background(sound, static, settings.site, settings.preset, positions, rate, to_street)
+    static.render()
     if not settings.ego.stands:
         time = np.arange(receiver.samples) / rate
         sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_channels.spawn(1)[0]).T
@@ -187,6 +190,7 @@ def _knots(settings: SimulationSettings) -> Array:
 
 def _add_vehicle_sound(
     sound: Signal,
+    static: StaticSources,
     settings: SimulationSettings,
     path: Trajectory,
     receiver: Receiver,
@@ -197,15 +201,17 @@ def _add_vehicle_sound(
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
     mirrored = np.sqrt(1.0 - scattering(preset))
-    add_sources(sound, sources, settings.site, receiver, preset.screen_cap_db, mirrored, outdoors=True)
+    cap_db, site = preset.screen_cap_db, settings.site
+    add_sources(sound, static, sources, site, receiver, cap_db, mirrored, outdoors=True)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
     body = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
-    add_scattered(sound, body, settings.site, receiver, preset)
+    add_scattered(sound, static, body, site, receiver, preset)
     dry = whole * _late_gain(settings, path, len(whole))
     heard = dry[: round(-path.time_s[0] * rate) + sound.shape[1]]
-    field = street_field(settings.site, preset.late_lobe_share)
-    add_late_field(sound, heard, preset.late_decay_s, receiver.positions_m, rate, rng, field)
+    field = street_field(site, preset.late_lobe_share)
+    samples, positions = sound.shape[1], receiver.positions_m
+    add_late_field(static, heard, samples, preset.late_decay_s, positions, rate, rng, field)
 
 
 def _moving(path: Trajectory, signal: Signal, behind_m: float, height_m: float, rate: float) -> MovingSource:

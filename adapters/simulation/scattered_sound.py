@@ -10,7 +10,7 @@ from .presets import Preset
 from .receiver import NEAREST_M, Receiver, add_turning, distance_m
 from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, scattering, seen_through_mouth
 from .scene import Site
-from .static_field import add_static
+from .static_field import StaticSources
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]
@@ -18,6 +18,7 @@ Signal = NDArray[np.float32]
 
 def add_scattered(
     out: Signal,
+    static: StaticSources,
     source: MovingSource,
     site: Site,
     receiver: Receiver,
@@ -27,7 +28,7 @@ def add_scattered(
 
     Parameters
     ----------
-    out, site, receiver
+    out, static, site, receiver
         As for `add_sources`.
     source : MovingSource
         The whole vehicle as one.
@@ -44,7 +45,7 @@ def add_scattered(
                 site, group, index, source.x_m, source.y_m, source.height_m, preset.screen_cap_db
             ):
                 _add_leg(signal, source.emission, leg, amplitude, receiver, group.positions_m[index])
-        _add_patches(out, arrived, group, site, receiver)
+        _add_patches(out, static, arrived, group, site, receiver)
 
 
 def _add_leg(
@@ -62,13 +63,15 @@ def _add_leg(
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 
 
-def _add_patches(out: Signal, arrived: Signal, group: Patches, site: Site, receiver: Receiver) -> None:
+def _add_patches(
+    out: Signal, static: StaticSources, arrived: Signal, group: Patches, site: Site, receiver: Receiver
+) -> None:
     """Let every patch sound to all microphones."""
     if receiver.ego.stands:
         distance, gain = last_leg(group, receiver.positions_m)
         centre = np.linalg.norm(group.positions_m - receiver.centre_m, axis=1)
         delays = (distance - centre[:, None]) / SPEED_OF_SOUND_MPS + receiver.skew_s
-        add_static(out, arrived, delays, receiver.sample_rate_hz, gain)
+        static.add(arrived, delays, gain)
         return
     x = receiver.ego.x_m(receiver.knots_s)
     for place, normal, signal in zip(group.positions_m, group.normals, arrived, strict=True):

@@ -1,7 +1,8 @@
 """Many sources that do not move, heard by all microphones at once.
 
 Delays across an array are a few milliseconds at most, so every source is a phase ramp per block of a weighted
-overlap-add; all sources reach all microphones in one batched matrix product.
+overlap-add; all sources reach all microphones in one batched matrix product. Most of the cost is the way back
+from the spectra, once per microphone however many sources there are: sources are best rendered together.
 """
 
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from .diffraction import SPEED_OF_SOUND_MPS
 BLOCK = 4096
 HOP = BLOCK // 2
 BLOCKS_AT_ONCE = 16
+PENDING = 160  # as many sources wait, with their signals, to be rendered together
 
 
 def plane_wave_delays(directions: NDArray[np.float64], offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -33,6 +35,51 @@ def plane_wave_delays(directions: NDArray[np.float64], offsets_m: NDArray[np.flo
     array([[-0.001]])
     """
     return -(directions @ offsets_m.T) / SPEED_OF_SOUND_MPS
+
+
+class StaticSources:
+    """Sources that wait to be rendered together.
+
+    Parameters
+    ----------
+    out : ndarray, shape (M, n)
+        Added to in place.
+    sample_rate_hz : float
+        Rate in Hz.
+
+    Examples
+    --------
+    >>> out, click = np.zeros((2, 8000), np.float32), np.zeros((1, 8000), np.float32)
+    >>> click[0, 5000] = 1.0
+    >>> waiting = StaticSources(out, 8000.0)
+    >>> waiting.add(click, np.array([[0.0, 0.005]]))
+    >>> waiting.render()
+    >>> out.argmax(axis=1)
+    array([5000, 5040])
+    """
+
+    def __init__(self, out: NDArray[np.float32], sample_rate_hz: float) -> None:
+        self._out, self._rate = out, sample_rate_hz
+        self._waiting: list[tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def add(
+        self,
+        signals: NDArray[np.float32],
+        delays_s: NDArray[np.float64],
+        gains: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Add sources; see `add_static`."""
+        factors = np.ones_like(delays_s) if gains is None else gains
+        self._waiting.append((signals, delays_s, factors))
+        if sum(len(delays) for _, delays, _ in self._waiting) > PENDING:
+            self.render()
+
+    def render(self) -> None:
+        """Render what waits."""
+        if self._waiting:
+            signals, delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in range(3))
+            self._waiting.clear()
+            add_static(self._out, signals, delays, self._rate, gains)
 
 
 def add_static(
