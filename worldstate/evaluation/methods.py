@@ -141,7 +141,7 @@ def distant_site(rng: np.random.Generator) -> Classifier:
     """Make the classifier for a site unlike all of training: the quiet reference alone, hardly held back.
 
     Level, which the ridge favours, is what a moving ego's own noise covers; the pattern above the quietest
-    windows is left. Chosen among fifteen recipes for each moving junction on the other two: thrice the same.
+    windows is left. Chosen among some thirty for each moving junction on the other two: thrice the same.
     """
     return SiteEnsembleClassifier((Recipe("quiet", 1e-5),))
 
