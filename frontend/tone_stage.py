@@ -229,8 +229,8 @@ class _Spectrum:
         inner, outer = (_PADDING * r for r in _RING)
         below = power[max(centre - outer, 1) : max(centre - inner, 1)]
         above = power[centre + inner : centre + outer]
-        median = np.median(np.concatenate([below, above])) / MEDIAN_OF_EXPONENTIAL
-        return float(median) + _least(power)
+        around = np.sort(np.concatenate([below, above]))
+        return float(around[len(around) // 2]) / MEDIAN_OF_EXPONENTIAL + _least(power)
 
 
 def _vertex(left: float, middle: float, right: float) -> float:

@@ -41,6 +41,7 @@ class WindowSum:
     def __init__(self, length: int, n_bins: int, size: int) -> None:
         self._parts = np.zeros((length, n_bins, size, size), np.complex64)
         self.total = np.zeros((n_bins, size, size), np.complex64)
+        self._traces = np.zeros((length, n_bins))
         self._debt = np.zeros(n_bins)
         self._slot = 0
 
@@ -53,7 +54,7 @@ class WindowSum:
             To be written to in place.
         """
         oldest = self._parts[self._slot]
-        self._debt += _EPS * _traces(oldest)
+        self._debt += _EPS * self._traces[self._slot]
         self.total -= oldest
         return np.asarray(oldest)
 
@@ -61,12 +62,9 @@ class WindowSum:
         """Take in what was written there."""
         newest = self._parts[self._slot]
         self.total += newest
-        self._debt += _EPS * _traces(newest)
+        self._traces[self._slot] = np.einsum("bmm->bm", newest).real.sum(axis=1)
+        self._debt += _EPS * self._traces[self._slot]
         self._slot = (self._slot + 1) % len(self._parts)
-        if (self._debt > _DEBT * _traces(self.total)).any():
+        if (self._debt > _DEBT * self._traces.sum(axis=0)).any():
             np.sum(self._parts, axis=0, out=self.total)
             self._debt[:] = 0.0
-
-
-def _traces(matrices: NDArray[np.complex64]) -> NDArray[np.float64]:
-    return np.asarray(np.einsum("bmm->bm", matrices).real.sum(axis=1, dtype=np.float64))
