@@ -253,7 +253,8 @@ class HarmonicCanceller:
             return spectra
         time: FloatArray = self._frame_s * np.arange(1.0, len(spectra) + 1)
         shapes = _LineShapes.of(self._engine, time, orders, self._bins, self._bin_hz)
-        now = _Fit.of(shapes, spectra)
+        heard = np.ascontiguousarray(spectra)
+        now = _Fit.of(shapes, heard)
         error = 0.0
         if self._fit is not None:
             error = now.phase_ahead(self._fit, self._evident)
@@ -261,8 +262,9 @@ class HarmonicCanceller:
         self._fit, self._evident = now, now.evident_amplitudes()
         self._engine = self._engine.after(float(time[-1]), error).within(*self._limits_hz)
         turn = np.exp(1j * orders * error).astype(np.complex64)
-        lines = shapes.whole @ (turn[:, None] * self._evident)
-        return np.asarray(spectra - lines.reshape(spectra.shape))
+        lines = shapes.over_bins(shapes.turn) @ (turn[:, None] * self._evident)
+        rest = lines.reshape(heard.shape)
+        return np.subtract(heard, rest, out=rest)
 
     def _orders(self, frequency_hz: float) -> NDArray[np.int64]:
         """Return the orders that reach the bins."""
@@ -287,7 +289,6 @@ class _LineShapes:
     orders: NDArray[np.int64]
     kernel: NDArray[np.float32]
     turn: NDArray[np.complex64]
-    whole: NDArray[np.complex64]
 
     @classmethod
     def of(
@@ -301,13 +302,24 @@ class _LineShapes:
         kernel = _signed_kernel(engine.frequencies(time_s.mean()) * orders / bin_hz, bins)
         angle = np.mod(engine.phases(time_s), 2.0 * np.pi)[:, None] * orders
         turn = np.exp(1j * angle).astype(np.complex64)
-        whole = (kernel * turn[:, None, :]).reshape(-1, len(orders))
-        return cls(orders, kernel, turn, whole)
+        return cls(orders, kernel, turn)
+
+    def over_bins(
+        self, turn: NDArray[np.complex64], weights: NDArray[np.float32] | None = None
+    ) -> ComplexArray:
+        """Spread turns (frames, H) over the bins, with a weight each (bins,): (frames * bins, H)."""
+        kernel = self.kernel if weights is None else weights[:, None] * self.kernel
+        return np.asarray((turn[:, None, :] * kernel).reshape(-1, len(self.orders)))
 
     def weighted_gram(self, weights: NDArray[np.float32]) -> ComplexArray:
         """Return G^H W G with a weight per bin (bins,), without the product over all frames and bins."""
         over_bins = self.kernel.T @ (weights[:, None] * self.kernel)
         return np.asarray((self.turn.conj().T @ self.turn) * over_bins)
+
+    def weighted_moment(self, weights: NDArray[np.float32], spectra: NDArray[np.complex64]) -> ComplexArray:
+        """Return G^H W X, (H, M)."""
+        adjoint = self.over_bins(self.turn.conj(), weights).T
+        return np.asarray(adjoint @ spectra.reshape(-1, spectra.shape[2]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,15 +343,12 @@ class _Fit:
 
     @classmethod
     def of(cls, shapes: _LineShapes, spectra: NDArray[np.complex64]) -> "_Fit":
-        n_frames, n_bins, n_microphones = spectra.shape
+        n_frames, n_bins, _ = spectra.shape
         weights = _inverse_power(spectra)
-        weighted = (shapes.whole.reshape(n_frames, n_bins, -1) * weights[:, None]).reshape(
-            -1, len(shapes.orders)
-        )
-        moment = weighted.conj().T @ spectra.reshape(-1, n_microphones)
+        gram, moment = shapes.weighted_gram(weights), shapes.weighted_moment(weights, spectra)
         # In every bin that is not silent the mean power is one.
         energy = float(n_frames * np.count_nonzero(weights))
-        return cls(shapes.orders, shapes.weighted_gram(weights), moment, energy, float(n_frames * n_bins))
+        return cls(shapes.orders, gram, moment, energy, float(n_frames * n_bins))
 
     def _shared(self, other: "_Fit") -> tuple[slice, slice]:
         """Return where both have the same orders; orders are successive."""
@@ -417,6 +426,6 @@ def _signed_kernel(place: FloatArray, bins: NDArray[np.int64]) -> NDArray[np.flo
 
 def _inverse_power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
     """Return the weights that give every bin unit power, (bins,); silent bins get no say."""
-    parts = np.ascontiguousarray(spectra).view(np.float32)
+    parts = spectra.view(np.float32)
     power = np.einsum("tbm,tbm->b", parts, parts) / np.float32(spectra.shape[0] * spectra.shape[2])
     return np.where(power > _TINY, 1.0 / np.maximum(power, _TINY), 0.0).astype(np.float32)
