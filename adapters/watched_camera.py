@@ -20,6 +20,9 @@ from worldstate.values import nanoseconds
 
 Frame = NDArray[np.uint8]
 
+# Health is read this often: a lens that soils or a night that falls takes longer than a frame.
+HEALTH_PERIOD_NS = 400_000_000
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Watched:
@@ -30,7 +33,7 @@ class Watched:
     detections : DetectionLog
         One entry a frame.
     degradation : DegradationLog
-        d of every frame, on the scale of the measured table.
+        d as last read, on the scale of the measured table.
     rates : MissRates
         Miss and clutter rates of the same detector behind the same camera.
     """
@@ -90,6 +93,7 @@ class Watcher:
         self._detector, self._rates = detector, rates
         self._monitor = HealthMonitor(_scale(rates))
         self._stamps_ns: list[int] = []
+        self._read_ns: list[int] = []
         self._levels: list[float] = []
         self._found: list[DetectionFrame] = []
 
@@ -97,7 +101,9 @@ class Watcher:
         """Take the next frame, in the order of time."""
         self._stamps_ns.append(stamp_ns)
         self._found.append(self._detector.detect(frame))
-        self._levels.append(self._rates.level(self._monitor.update(stamp_ns, image_quality(frame))))
+        if not self._read_ns or stamp_ns - self._read_ns[-1] >= HEALTH_PERIOD_NS:
+            self._read_ns.append(stamp_ns)
+            self._levels.append(self._rates.level(self._monitor.update(stamp_ns, image_quality(frame))))
 
     def watched(self) -> Watched:
         """Return what was seen so far.
@@ -108,7 +114,7 @@ class Watcher:
             If there was no frame.
         """
         stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
-        degradation = DegradationLog(stamps_ns, np.array(self._levels))
+        degradation = DegradationLog(np.array(self._read_ns, dtype=np.int64), np.array(self._levels))
         return Watched(
             DetectionLog(tuple(self._found), stamps_ns, "watched camera"), degradation, self._rates
         )

@@ -59,20 +59,20 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from worldstate.adapters.miss_rates import save_miss_rates
-    from worldstate.evaluation.absence import AbsenceSettings, measure_absence, passes
+    from worldstate.evaluation.absence import AbsenceSettings, measure_absence
     from worldstate.evaluation.absence_figure import write_absence_figure
     from worldstate.evaluation.absence_input import find_videos
 
     make, settings = detector_maker(arguments), AbsenceSettings()
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
-    with progress_bar("measuring", passes(len(scenes), settings)) as bar:
+    with progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
         rates = measure_absence(
             scenes,
             make,
             np.random.default_rng(arguments.seed),
             settings,
             provenance=_provenance(arguments, len(scenes)),
-            on_video=bar.advance,
+            on_frame=bar.advance,
         )
     save_miss_rates(arguments.out, rates)
     if arguments.figure is not None:

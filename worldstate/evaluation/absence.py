@@ -112,7 +112,7 @@ def measure_absence(
     settings: AbsenceSettings | None = None,
     *,
     provenance: dict[str, str] | None = None,
-    on_video: Callable[[], None] = lambda: None,
+    on_frame: Callable[[], None] = lambda: None,
 ) -> MissRates:
     r"""Count how often reference boxes are found again on degraded frames.
 
@@ -132,8 +132,8 @@ def measure_absence(
         How it is counted.
     provenance : dict of str, optional
         Written into the file.
-    on_video : callable
-        Called after each pass over a video, `passes` of them.
+    on_frame : callable
+        Called after each frame of each video, all levels of all families done.
 
     Raises
     ------
@@ -149,12 +149,13 @@ def measure_absence(
     tallies = {family: _Tally(edges, chosen) for family in chosen.families}
     clean = _Tally(edges, chosen)
     for scene in scenes:
-        clean.watch(scene, make_detector(), "all", 0, rng)
-        on_video()
+        looks = [_Look(clean, make_detector(), "all", 0)]
         for family, tally in tallies.items():
-            for level in range(1, len(LEVELS)):
-                tally.watch(scene, make_detector(), family, level, rng)
-                on_video()
+            looks += [_Look(tally, make_detector(), family, level) for level in range(1, len(LEVELS))]
+        for number, frame in enumerate(scene.video.frames()):
+            for look in looks:
+                look.take(scene, number, frame, rng)
+            on_frame()
     if not clean.looks[:, 0].any():
         raise InputFileError(scenes[0].reference.source, "expected moving objects in view, found none")
     return MissRates(
@@ -164,17 +165,6 @@ def measure_absence(
         health=_health(scenes, rng),
         repeats=chosen.repeats,
     )
-
-
-def passes(scenes: int, settings: AbsenceSettings) -> int:
-    """Return how often `measure_absence` goes over a video.
-
-    Examples
-    --------
-    >>> passes(2, AbsenceSettings(families=("blur", "noise")))
-    18
-    """
-    return scenes * (1 + len(settings.families) * (len(LEVELS) - 1))
 
 
 class _Tally:
@@ -187,15 +177,6 @@ class _Tally:
         self.looks, self.misses = np.zeros(shape), np.zeros(shape)
         self.sectors, self.clutter = np.zeros(len(LEVELS)), np.zeros(len(LEVELS))
 
-    def watch(
-        self, scene: Scene, detector: Detector, family: Family, level: int, rng: np.random.Generator
-    ) -> None:
-        """Go over a video at one level."""
-        for number, frame in enumerate(scene.video.frames()):
-            found = detector.detect(degrade(frame, family, LEVELS[level], rng))
-            if self._settings.warm_up <= number < len(scene.reference):
-                self._look(scene, number, found, level)
-
     def counts(self, clean: "_Tally") -> FamilyCounts:
         """Return the counts, those of the clean frames in the first column."""
         for mine, theirs in zip(self._all(), clean._all(), strict=True):
@@ -205,7 +186,10 @@ class _Tally:
     def _all(self) -> tuple[Numbers, ...]:
         return self.looks, self.misses, self.sectors, self.clutter
 
-    def _look(self, scene: Scene, number: int, found: DetectionFrame, level: int) -> None:
+    def look(self, scene: Scene, number: int, found: DetectionFrame, level: int) -> None:
+        """Count what was found in a frame at a level."""
+        if not self._settings.warm_up <= number < len(scene.reference):
+            return
         there = scene.reference.frames[number]
         counted = _counted(scene.reference, number, self._settings)
         boxes = there.boxes_px[counted]
@@ -231,6 +215,21 @@ class _Tally:
             if not any(sector.touches(azimuth, width) for azimuth, width in objects):
                 self.sectors[level] += 1.0
                 self.clutter[level] += any(sector.touches(azimuth, width) for azimuth, width in false)
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """One detector on the frames of a video at one level of one family."""
+
+    tally: _Tally
+    detector: Detector
+    family: Family
+    level: int
+
+    def take(self, scene: Scene, number: int, frame: NDArray[np.uint8], rng: np.random.Generator) -> None:
+        """Degrade a frame, look at it and count."""
+        found = self.detector.detect(degrade(frame, self.family, LEVELS[self.level], rng))
+        self.tally.look(scene, number, found, self.level)
 
 
 def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> NDArray[np.int64]:
