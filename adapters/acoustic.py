@@ -155,6 +155,25 @@ class AcousticAdapter:
         """
         return [self.interpret(frame) for frame in self.front_end.process(block)]
 
+    def believe(self, none_probability: float) -> None:
+        """Say how likely it is, after the last measurement, that no source is there.
+
+        Where the front-end's settings have `ego_noise`, what is heard while nothing is there is learned as
+        the own vehicle's noise; see `FrontEnd.learn_ego_noise`. Without, nothing happens.
+
+        Parameters
+        ----------
+        none_probability : float
+            `WorldFilter.explanation.none`, in [0, 1].
+
+        Raises
+        ------
+        InvalidArgumentError
+            If it is out of range.
+        """
+        if self.front_end.settings.ego_noise is not None:
+            self.front_end.learn_ego_noise(none_probability)
+
     def interpret(self, frame: AcousticFrame) -> Measurement:
         """Turn what was heard at one hop into a measurement, the camera's answer included.
 

@@ -25,6 +25,8 @@ from worldstate.adapters.vision import VisionQuery
 from worldstate.adapters.watched_camera import video_degradation
 from worldstate.filter import WorldFilter
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
+from worldstate.frontend.ego_noise import EgoNoiseSettings
+from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.measurement import Measurement
 from worldstate.state import Context, WorldState
@@ -65,6 +67,8 @@ class Source:
         What is known of the site beforehand, from a checkpoint.
     grounding : Grounding or None
         Weighs the model's scores with bearing, approach and engine line, eq. (lik).
+    ego_noise : EgoNoiseSettings or None
+        Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it.
     """
 
     audio_path: Path
@@ -80,6 +84,7 @@ class Source:
     site_settings: SiteEstimateSettings | None = None
     site: SiteEstimate | None = None
     grounding: Grounding | None = None
+    ego_noise: EgoNoiseSettings | None = None
 
     def signature(self) -> Signature:
         """Return the model as it is at the start of the recording; one that learns its site learns anew."""
@@ -111,6 +116,7 @@ def open_source(
     forgetting_s: float | None = None,
     site: SiteEstimate | None = None,
     grounding: Grounding | None = None,
+    ego_noise: bool | EgoNoiseSettings = False,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
@@ -142,6 +148,9 @@ def open_source(
         What is known of the site beforehand, from a checkpoint.
     grounding : Grounding, optional
         Weighs the model's scores with bearing, approach and engine line, eq. (lik); off where not given.
+    ego_noise : bool or EgoNoiseSettings
+        Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
+        spatial spectrum, bearing and prominence. The signature hears what it was trained with.
 
     Raises
     ------
@@ -169,6 +178,7 @@ def open_source(
         site_settings=_site_settings(forgetting_s) if site_adaptation else None,
         site=site,
         grounding=grounding,
+        ego_noise=(EgoNoiseSettings() if ego_noise else None) if isinstance(ego_noise, bool) else ego_noise,
     )
 
 
@@ -213,13 +223,24 @@ def listen_steps(source: Source) -> Iterator[Step]:
         If the sound file is damaged or does not fit the array.
     """
     world = WorldFilter(context=source.context, policy=source.policy)
-    for frame, measurement in measure_steps(source):
+    measured = measure_steps(source, lambda: world.explanation.none)
+    for frame, measurement in measured:
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         yield Step(frame, measurement, world.state)
 
 
-def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]:
+def measure_steps(
+    source: Source, none_probability: Callable[[], float] | None = None
+) -> Iterator[tuple[AcousticFrame, Measurement]]:
     """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
+
+    Parameters
+    ----------
+    source : Source
+        What to listen to.
+    none_probability : callable, optional
+        Asked after every hop for the belief that nothing is there, which gates the learning of ego-noise;
+        without it none is learned.
 
     Raises
     ------
@@ -244,10 +265,13 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
             source.signature(),
             vision=vision,
             grounding=source.grounding,
+            front_end_settings=FrontEndSettings(ego_noise=source.ego_noise),
         )
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):
                 yield frame, adapter.interpret(frame)
+                if none_probability is not None:
+                    adapter.believe(none_probability())
 
 
 def line_of_sight(context: Context) -> Sector:

@@ -264,7 +264,7 @@ class HarmonicCanceller:
         turn = np.exp(1j * orders * error).astype(np.complex64)
         lines = shapes.over_bins(shapes.turn) @ (turn[:, None] * self._evident)
         rest = lines.reshape(heard.shape)
-        return np.subtract(heard, rest, out=rest)
+        return np.asarray(np.subtract(heard, rest, out=rest))
 
     def _orders(self, frequency_hz: float) -> NDArray[np.int64]:
         """Return the orders that reach the bins."""

@@ -58,6 +58,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         action="store_true",
         help="weigh the signature with bearing and approach, eq. (lik) (default: off)",
     )
+    parser.add_argument(
+        "--ego-noise",
+        action="store_true",
+        help="learn the own vehicle's noise while nothing is there and hear past it (default: off)",
+    )
     parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
     parser.add_argument(
@@ -87,6 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         site_adaptation=arguments.site_adaptation,
         forgetting_s=arguments.forgetting,
         grounding=Grounding() if arguments.grounded else None,
+        ego_noise=arguments.ego_noise,
     )
     try:
         report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
