@@ -11,10 +11,7 @@ from hypothesis import strategies as st
 from sklearn.covariance import OAS
 from sklearn.metrics import roc_auc_score
 
-from worldstate.adapters.simulation import SimulationSettings, draw_settings, simulate_recording, site
 from worldstate.adapters.simulation.ego import ENGINE_M, ego_noise, ego_sound
-from worldstate.adapters.simulation.presets import Preset
-from worldstate.adapters.simulation.recording import FULL_SCALE_PA
 from worldstate.errors import InvalidArgumentError
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise import EgoNoise, EgoNoiseSettings
@@ -566,70 +563,3 @@ def test_the_bearing_stays_where_it_was_without_ego_noise() -> None:
     rms = {name: float(np.degrees(np.sqrt(np.mean(np.square(error))))) for name, error in errors.items()}
     assert rms["plain"] < 1.0
     assert rms["learned"] < rms["plain"] + 0.1
-
-
-SILENT = Preset(
-    "silent",
-    ambient_octaves_db=(-20.0,) * 8,
-    ambient_spread_db=0.0,
-    far_rate=0.0,
-    wind_100hz_db=-20.0,
-    self_noise_db=0.0,
-)
-
-
-def junction_from_a_moving_ego(seed: int) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], float]:
-    """Vehicle, two empty streets and two drives of the ego, Pa at 47,998 Hz, and when it comes in sight."""
-    rng, array = np.random.default_rng(seed), roof_array_56()
-    junction = ("SA1", "SA2", "SB1", "SB2", "SB3")[seed % 5]
-    drawn = draw_settings(junction, ("left", "right")[seed // 5 % 2], rng, duration_s=7.0)
-    drawn = replace(drawn, entry_s=6.0, parked_car=False)
-    vehicle = simulate_recording(replace(drawn, preset=SILENT), rng, array)
-    empty = replace(drawn, approach="none", entry_s=0.0)
-    streets = [simulate_recording(empty, rng, array).audio * FULL_SCALE_PA for _ in range(2)]
-    start, gained = rng.uniform(3, 14), rng.uniform(-0.8, 0.4)
-    rate = drawn.sample_rate_hz
-    speed = np.clip(start + gained * np.arange(len(vehicle.audio)) / rate, 1, 20)
-    egos = [ego_noise(array.centred_m + LIFTED_M, speed, rate, rng) for _ in range(2)]
-    return vehicle.audio * FULL_SCALE_PA, streets, egos, vehicle.t0_frame / 10
-
-
-def last_second(sound: np.ndarray, learn: bool, in_sight_s: float) -> np.ndarray:
-    """Log peak and log prominence of the windows that end in the last second before sight, (11, 2)."""
-    rate = SimulationSettings(site("SA1"), "none").sample_rate_hz
-    front_end = FrontEnd(roof_array_56(), rate, FrontEndSettings(ego_noise=EgoNoiseSettings()))
-    frames = []
-    for weight, part in ((1.0, sound[: round(3.0 * rate)]), (0.0, sound[round(3.0 * rate) :])):
-        front_end.learn_ego_noise(weight if learn else 0.0)
-        frames += front_end.process(part)
-    ends = np.array([frame.sample_index for frame in frames]) / rate
-    near = (ends > in_sight_s - 1.05) & (ends < in_sight_s + 0.05)
-    srp = np.array([frame.srp for frame in frames])[near]
-    return np.log(np.stack([srp.max(axis=1), srp.max(axis=1) / np.median(srp, axis=1)], axis=1))
-
-
-@pytest.mark.slow
-def test_presence_at_junctions_from_a_moving_ego() -> None:
-    """The library's junctions; a hidden vehicle 5 dB below the ego noise, or 8 dB below the street alone."""
-    found: dict[tuple[str, bool, bool], list[np.ndarray]] = {}
-    for seed in range(6000, 6012):
-        vehicle, streets, egos, in_sight_s = junction_from_a_moving_ego(seed)
-        last = slice(round((in_sight_s - 2.0) * 47_998), round(in_sight_s * 47_998))
-        drives = [street + ego for street, ego in zip(streets, egos, strict=True)]
-        for condition, noises, masker, snr_db in (
-            ("ego", drives, egos, -5.0),
-            ("street", streets, streets, -8.0),
-        ):
-            level = in_band(masker[0][last], 47_998).std() * 10 ** (snr_db / 20)
-            gain = np.float32(level / in_band(vehicle[last], 47_998).std())
-            for present, sound in ((True, noises[0] + gain * vehicle), (False, noises[1])):
-                for learn in (True, False):
-                    scores = last_second(sound, learn, in_sight_s)
-                    found.setdefault((condition, learn, present), []).append(scores)
-    score = {
-        (condition, learn): auroc(found[condition, learn, True], found[condition, learn, False])
-        for condition in ("ego", "street")
-        for learn in (True, False)
-    }
-    assert (score["ego", True] - score["ego", False] >= 0.1).all(), score
-    assert (score["street", True] - score["street", False] > -0.01).all(), score

@@ -1,12 +1,12 @@
 """Acceptance of ego-noise cancellation: is a hidden vehicle more present in SRP, and is nothing lost without?
 
-Presence statistics: log peak of the decision window's SRP, and log of its ratio to the median. Windows end in the
-last second before line of sight. A rise of at least 0.10 AUROC is asked for where the vehicle is 5 dB below the ego
-noise in the band of SRP at the array, and a fall of less than 0.01 without ego noise. The seeds of the slow
-tests were written down before they were first run, and none was used to choose anything.
+Presence statistics: log peak of the decision window's SRP, and log of its ratio to the median. Windows end in
+the last second before line of sight. A rise of at least 0.10 AUROC is asked for where the vehicle is 5 dB
+below the ego noise in the band of SRP at the array, and a fall of less than 0.01 without ego noise. The seeds
+of the slow test were committed before it was first run; the method was chosen on seeds 100 to 147.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,10 +61,8 @@ class Scene:
     def with_vehicle(self) -> Sound:
         last = slice(round((self.in_sight_s - 2.0) * self.rate_hz), round(self.in_sight_s * self.rate_hz))
         wanted = in_band(self.masker[last], self.rate_hz).std() * 10 ** (self.level_db / 20)
-        return (
-            self.others[0]
-            + np.float32(wanted / in_band(self.vehicle[last], self.rate_hz).std()) * self.vehicle
-        )
+        gain = wanted / in_band(self.vehicle[last], self.rate_hz).std()
+        return self.others[0] + np.float32(gain) * self.vehicle
 
 
 def in_band(sound: Sound, rate_hz: float) -> Sound:
@@ -130,9 +128,8 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
     world = WorldFilter(context=Context(), policy=policies.for_alpha(0.02))
     adapter.believe(float(gate == "open"))
     rows = []
-    for block in np.array_split(
-        np.asarray(sound / FULL_SCALE_PA, np.float32), round(20 * len(sound) / scene.rate_hz)
-    ):
+    heard, blocks = np.asarray(sound / FULL_SCALE_PA, np.float32), round(20 * len(sound) / scene.rate_hz)
+    for block in np.array_split(heard, blocks):
         for frame in adapter.front_end.process(block):
             if gate == "belief":
                 measurement = adapter.interpret(frame)
@@ -163,9 +160,8 @@ def gains(found: Scores, name: str) -> np.ndarray:
     """AUROC less that without cancellation, gates (belief, open) by statistics (peak, prominence)."""
     shut = aurocs(found, name, "shut")
     gained = np.array([aurocs(found, name, gate) - shut for gate in ("belief", "open")])
-    print(
-        f"{name}: without {shut.round(3)}, gained by belief {gained[0].round(3)}, open {gained[1].round(3)}"
-    )
+    by_belief, by_open = gained.round(3)
+    print(f"{name}: without {shut.round(3)}, gained by belief {by_belief}, open {by_open}")
     return gained
 
 
@@ -177,12 +173,14 @@ Scenes = Callable[[int, MicrophoneArray, float], list[Scene]]
     ("scenes", "array", "rate_hz", "seeds"),
     [
         pytest.param(drives, WHOLE, 47_998.0, range(7000, 7010), id="drives, 56 microphones"),
-        pytest.param(drives, THIN, 16_000.0, range(7010, 7020), id="drives, 14 microphones"),
+        pytest.param(
+            drives, THIN, 16_000.0, [*range(7010, 7020), *range(7030, 7040)], id="drives, 14 microphones"
+        ),
         pytest.param(approaches, WHOLE, 16_000.0, range(7020, 7030), id="approaches, 56 microphones"),
     ],
 )
 def test_presence_rises_under_ego_noise_and_stays_without(
-    scenes: Scenes, array: MicrophoneArray, rate_hz: float, seeds: range
+    scenes: Scenes, array: MicrophoneArray, rate_hz: float, seeds: Sequence[int]
 ) -> None:
     found: Scores = {}
     for seed in seeds:
