@@ -15,9 +15,6 @@ from worldstate.errors import InvalidArgumentError
 # No edge of an image is narrower: pixels have a size, and noise is smoothed before it is looked for.
 NARROWEST_EDGE_PX = 3.0
 
-# OpenCV's own for one channel: a change of brightness by four standard deviations is motion.
-THRESHOLD_STD = 4.0
-
 Background = Literal["mog2", "knn"]
 
 
@@ -134,16 +131,6 @@ class MotionDetector:
             return self._cv2.createBackgroundSubtractorKNN(chosen.history, detectShadows=False)
         return self._cv2.createBackgroundSubtractorMOG2(chosen.history, detectShadows=False)
 
-    def _set_threshold(self, channels: int) -> None:
-        """Ask of all colours together what is asked of one.
-
-        OpenCV adds up the squares of the colours and compares them with the threshold of a single one. Video
-        has little noise of its own in each colour, most of it is brightness, so that the sum is up to as many
-        times as large.
-        """
-        if self.settings.background == "mog2":
-            self._background.setVarThreshold(THRESHOLD_STD**2 * channels)
-
     def _reduced(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         height, width = frame.shape[:2]
         if width <= self.settings.width_px:
@@ -154,8 +141,6 @@ class MotionDetector:
 
     def _moving(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Mask of what moves: specks removed, parts of one object joined."""
-        if not self._seen:
-            self._set_threshold(channels=1 if frame.ndim == 2 else frame.shape[2])
         mask = self._background.apply(frame)
         speck = np.ones((3, 3), dtype=np.uint8)
         joint = np.ones((frame.shape[1] // 80 * 2 + 1,) * 2, dtype=np.uint8)
