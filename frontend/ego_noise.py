@@ -11,8 +11,8 @@ The gate is the caller's: `EgoNoise.weight`, the probability that no source is t
 after the next `guard_hops` hops have passed, with the least weight of all these, so that a source is not
 learned in the moments before anybody believes in it.
 
-What is learned is used as far as it comes from below, where the own vehicle is and no street: see
-`from_below`. A street that was learned by mistake, or because the vehicle stands, changes nothing.
+What is heard is learned, and what was learned used, as far as it comes from below, where the own vehicle is
+and no street: see `from_below`. A gate that opens by mistake, or because the vehicle stands, changes nothing.
 
 Whitened noise that has changed since it was learned, with the speed say, leaves a level c above that of white
 noise. Its mean over all directions is learned by the same gate, and the steered power is divided by it: as in
@@ -23,6 +23,7 @@ Sources: the references of `prewhitening` and `from_below`; unit-length snapshot
 any detector of constant false-alarm rate.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -32,7 +33,7 @@ from numpy.typing import NDArray
 from worldstate.checks import in_range
 from worldstate.errors import InvalidArgumentError
 
-from .from_below import FromBelow
+from .from_below import FromBelow, share_of
 from .guarded import Guard
 from .harmonic_cancellation import HarmonicCanceller
 from .noise_memory import NoiseCovariance, NoiseLevel
@@ -45,6 +46,8 @@ _TINY = np.float32(1e-30)
 # Shares from below at which noise begins to be whitened, and is wholly. Simulated streets: below 0.1; drives
 # at walking pace, where the street is as loud: above 0.6.
 _STREET_SHARE, _EGO_SHARE = 0.3, 0.6
+# Hops over which is judged whether to learn at all: a street must not linger when the vehicle sets off.
+_RECENT_HOPS = 5.0
 # So many bins a hop are brought up to date where the share has changed so much, and whenever so many times as
 # much has been learned: the first roots are made from a handful of frames.
 _URGENT_BINS, _ANOTHER_SHARE, _ANOTHER_LENGTH = 4, 0.2, 2.0
@@ -162,6 +165,7 @@ class EgoNoise:
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
         self._guard: Guard[tuple[NDArray[np.complex64] | None, int]] = Guard(settings.guard_hops)
         self._level = NoiseLevel(settings.guard_hops)
+        self._recent = np.zeros(2)
         self._is_odd = False
         self._next_bin = 0
         self._stale = 0
@@ -240,8 +244,10 @@ class EgoNoise:
             return
         (total, n_frames), weight = ripe
         if total is not None and weight > 0.0:
-            self._covariance.learn(total, n_frames, weight)
-            self._stale = len(self._roots)
+            weight *= self._recent_share(total)
+            if weight > 0.0:
+                self._covariance.learn(total, n_frames, weight)
+                self._stale = len(self._roots)
 
     def _refresh(self) -> None:
         """Bring the next bins up to date if it is time, until all have seen what was learned last."""
@@ -267,10 +273,15 @@ class EgoNoise:
 
     def _share_used(self) -> float:
         """How far what was learned is used: 0 for a street, 1 for a vehicle's own noise."""
+        return 1.0 if self._judge is None else _use_of(*self._judge.powers(self._covariance.total))
+
+    def _recent_share(self, total: NDArray[np.complex64]) -> float:
+        """How far the last second that could be learned, this hop the newest, is the vehicle's own noise."""
         if self._judge is None:
             return 1.0
-        share = self._judge.share(self._covariance.total)
-        return min(max((share - _STREET_SHARE) / (_EGO_SHARE - _STREET_SHARE), 0.0), 1.0)
+        kept = math.exp(-1.0 / _RECENT_HOPS)
+        self._recent = kept * self._recent + self._judge.powers(total)
+        return _use_of(*self._recent)
 
     def _update(self, index: int) -> None:
         R = self._covariance.mean(index)
@@ -279,6 +290,12 @@ class EgoNoise:
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
                 beams.update(index - bins.start, self._roots[index])
+
+
+def _use_of(below: float, street: float) -> float:
+    """From powers to 0 for a street, 1 for a vehicle's own noise."""
+    share = share_of(below, street)
+    return min(max((share - _STREET_SHARE) / (_EGO_SHARE - _STREET_SHARE), 0.0), 1.0)
 
 
 def spanned(slices: Iterable[slice]) -> slice:

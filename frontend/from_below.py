@@ -24,8 +24,8 @@ from .geometry import SPEED_OF_SOUND_M_S
 
 _BELOW_DEG, _STREET_DEG = (-60.0, -50.0, -40.0, -30.0, -20.0), (0.0, 10.0, 20.0, 30.0)
 _AZIMUTHS_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
-# Least 1 - cos^2 of the angle between the fields: a level array cannot tell them apart at all.
-_LEAST_CONTRAST = 0.02
+# Least 1 - cos^2 of the angle between the fields: 0.95 for the roof array, 0.1 for a level line.
+_LEAST_CONTRAST = 0.2
 _TINY = 1e-12
 
 
@@ -88,19 +88,59 @@ class FromBelow:
         below, street = (np.ascontiguousarray(scale * x, np.float32) for x in (below, street))
         return cls(below, street, can_tell=contrast >= _LEAST_CONTRAST)
 
-    def share(self, covariance: NDArray[np.complex64]) -> float:
-        """Return q in [0, 1] of (bins, M, M), all bins at like power; 1 for an array that cannot tell.
+    def powers(self, covariance: NDArray[np.complex64]) -> NDArray[np.float64]:
+        """Return the two sums of q, from below and from the street; an array that cannot tell says below.
 
         Parameters
         ----------
         covariance : ndarray of complex64, shape (bins, M, M)
-            Hermitian.
+            All bins at like power; a sum or a mean.
+
+        Returns
+        -------
+        ndarray of float64, shape (2,)
+            By chance they may be negative.
         """
         if not self.can_tell:
-            return 1.0
+            return np.array([1.0, 0.0])
         parts = covariance.reshape(len(covariance), -1).view(np.float32)
-        below, street = (max(float(np.vdot(parts, field)), 0.0) for field in (self.below, self.street))
-        return below / (below + street) if below > _TINY * street else 0.0
+        return np.array([np.vdot(parts, self.below), np.vdot(parts, self.street)], np.float64)
+
+    def share(self, covariance: NDArray[np.complex64]) -> float:
+        """Return q, near 0 for a street and near 1 for what comes from below.
+
+        Parameters
+        ----------
+        covariance : ndarray of complex64, shape (bins, M, M)
+            All bins at like power.
+
+        Returns
+        -------
+        float
+            In [0, 1]; 1 for an array that cannot tell.
+        """
+        return share_of(*self.powers(covariance))
+
+
+def share_of(below: float, street: float) -> float:
+    """Return the share of the first power, negative ones counted as none.
+
+    Parameters
+    ----------
+    below, street : float
+        See `FromBelow.powers`.
+
+    Returns
+    -------
+    float
+        In [0, 1].
+
+    Examples
+    --------
+    >>> share_of(3.0, 1.0), share_of(-1.0, 2.0), share_of(1.0, -0.1), share_of(0.0, 0.0)
+    (0.75, 0.0, 1.0, 0.0)
+    """
+    return float(below / (below + max(street, 0.0))) if below > 0.0 else 0.0
 
 
 def _field(
