@@ -162,3 +162,26 @@ def test_folds_are_even_in_every_label():
 def test_missing_miss_rates_are_one_line(tmp_path, capsys):
     assert main(["evaluate-degradation", str(tmp_path), "--miss-rates", str(tmp_path / "beta.json")]) == 2
     assert "beta.json" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_end_to_end_and_again_from_what_it_kept(tmp_path, capsys):
+    """Two approaches and two empty streets, short; the second run stages nothing."""
+    sim, out = tmp_path / "sim", tmp_path / "sweep"
+    assert main(["simulate", "--out", str(sim), "--static", "4", "--duration", "3", "--video"]) == 0
+    beta = tmp_path / "beta.json"
+    assert main(["measure-absence", str(sim), "--out", str(beta)]) == 0
+    command = ["evaluate-degradation", str(sim), "--miss-rates", str(beta), "--out", str(out), "--json"]
+    capsys.readouterr()
+    assert main(command) == 0
+    first = json.loads(capsys.readouterr().out)
+    kept = {path: path.stat().st_mtime_ns for path in (out / "staged").iterdir()}
+    assert len(kept) == 4
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert [row["state"] for row in first["states"]] == list(STATES)
+    assert first["clean_vision_only"] > 0.5
+    assert first["least_vision_only"] <= 0.05
+    assert json.loads((out / "degradation.json").read_text()) == first
+    assert (out / "degradation.png").is_file()
