@@ -19,7 +19,7 @@ _PICKED = 8
 _SHORTEST_STILL = 16
 _STILL_CHANCE = 1e-12
 # Splice: mean squared jump over the channels, in units of each channel's own, a single one counting 25 at
-# most; clean simulated streets stay below 7.5 and nine in ten cuts are above 15.
+# most; clean simulated streets stay below 7.5 and most cuts are above 15.
 _JUMP_CEILING = 5.0
 _JUMP_LIMIT = 12.0
 # ... and against the hop's own jumps: white sound from straight ahead jumps together, too.

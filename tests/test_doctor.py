@@ -67,7 +67,7 @@ def test_it_says_what_to_do(street: np.ndarray, write: Callable, capsys: pytest.
     spoilt = street.copy()
     spoilt[:, [3, 40]] = street[:, [40, 3]]
     spoilt[:, 12] *= -1
-    spoilt[:, 20] = street[:, 20].clip(-0.5 * street.std(), 0.5 * street.std())
+    spoilt[:, 20] = street[:, 20].clip(-street.std(), street.std())
     spoilt[:, 30] += 3 * street.std()
     spoilt[:, 50] = street.std() * np.random.default_rng(5).standard_normal(len(street))
     spoilt = np.delete(spoilt, np.arange(60_000, 62_000), axis=0)
