@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
@@ -180,6 +180,7 @@ def _outline(x: float, y: float, width: float, depth: float, turn: float) -> np.
 
 
 @given(points, points, st.floats(0.2, 4.0), st.floats(0.2, 4.0), st.floats(0.0, 3.0), points, points)
+@example(-2.0, 0.0, 1.0, 1.0, 0.0, -5.6e-73, 0.0)
 def test_a_body_hides_what_lies_behind_it(x, y, width, depth, turn, source_x, source_y):
     """Brute force: a point of the line inside the body; and no way round is shorter than a taut string."""
     corners = _outline(x, y, width, depth, turn)

@@ -107,9 +107,11 @@ def _offsets(
     """Lateral offset of every corner from the line, and how far along it is, 0..1, shape (corners, T)."""
     corners = np.array(occluder.corners_m)[:, :, None]
     dx, dy = x_m - end_m[0], y_m - end_m[1]
-    length = np.maximum(np.hypot(dx, dy), 1e-6)
+    length = np.hypot(dx, dy)
+    # A line of no length has no direction, and nothing stands across it.
+    per_length = np.where(length > 1e-6, 1.0 / np.maximum(length, 1e-6), 0.0)
     to_x, to_y = corners[:, 0] - end_m[0], corners[:, 1] - end_m[1]
-    return (to_y * dx - to_x * dy) / length, (to_x * dx + to_y * dy) / length**2
+    return (to_y * dx - to_x * dy) * per_length, (to_x * dx + to_y * dy) * per_length**2
 
 
 def _crosses(offset: Array, along: Array) -> NDArray[np.bool_]:
