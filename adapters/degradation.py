@@ -27,6 +27,8 @@ STRENGTHS: Mapping[str, tuple[float, ...]] = MappingProxyType(
 )
 
 # A blur of so many pixels leaves nothing that half the pixels would not show.
+# A neighbour's weight exp(-1 / 2 sigma^2) is then less than half a grey level, and OpenCV finds no kernel.
+_NO_BLUR_PX = 0.25
 _WIDE_PX = 4.0
 # Of the staged noise; it ends at 4.3 sigma.
 _QUANTILES = 1 << 16
@@ -149,6 +151,8 @@ def degrade(frame: Frame, family: Family, degradation: float, rng: np.random.Gen
 def _blurred(frame: Frame, sigma_px: float, rng: np.random.Generator) -> Frame:
     """Blur; a wide one on a reduced image, whose pixels are themselves a box of variance (f^2 - 1) / 12."""
     cv2 = opencv()
+    if sigma_px < _NO_BLUR_PX:
+        return frame
     height, width = frame.shape[:2]
     factor = 1
     while factor < sigma_px / _WIDE_PX and min(height, width) >= 32 * factor:

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
@@ -67,6 +67,16 @@ def test_blur_is_that_of_its_definition(d, sigma_px):
     # OpenCV rounds twice, once a direction.
     assert np.abs(blurred - expected).max() <= 2.5
     assert np.abs(blurred - expected).mean() <= 0.5
+
+
+@given(st.floats(0.0, 1.0))
+@settings(deadline=None, max_examples=25)
+@example(2.9e-173)
+@example(5e-324)
+@example(0.01)
+def test_any_strength_of_any_family_gives_an_image(d):
+    for family in FAMILIES:
+        assert degrade(GREY[:64, :96], family, d, np.random.default_rng(0)).shape == (64, 96, 3)
 
 
 def test_the_stages_are_those_of_their_definition():
