@@ -12,6 +12,7 @@ from sklearn.metrics import roc_auc_score
 
 from worldstate.abduction.signature_training import PublishedClassifier
 from worldstate.adapters.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
+from worldstate.adapters.model_file import load_model
 from worldstate.cli import evaluate_features, train
 from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.evaluation.features import cross_validate
@@ -109,7 +110,7 @@ def most_probable(row):
 @pytest.mark.parametrize("protocol", ["cv", "lojo"])
 def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path, capsys, protocol):
     out = tmp_path / "p.csv"
-    words = ("--protocol", protocol, "--seeds", 2, "--json", "--predictions", out)
+    words = ("--method", "baseline", "--protocol", protocol, "--seeds", 2, "--json", "--predictions", out)
     assert command("evaluate-features", csv_path, *words) == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures) >= KEYS
@@ -136,7 +137,7 @@ def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path,
 def test_the_same_command_prints_the_same(csv_path, capsys):
     outputs = []
     for _ in range(2):
-        command("evaluate-features", csv_path, "--seeds", 1, "--json")
+        command("evaluate-features", csv_path, "--method", "baseline", "--seeds", 1, "--json")
         outputs.append(capsys.readouterr().out)
     assert outputs[0] == outputs[1]
 
@@ -145,7 +146,8 @@ def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_
     ids = tmp_path / "ids.csv"
     ids.write_text("ID\n" + "\n".join(f"none_{n}" for n in (1, 3, 5, 7)) + "\nleft_0\nright_6\n")
     model = tmp_path / "m"
-    assert command("train", csv_path, "--exclude", ids, "--out", model, "--json") == 0
+    words = ("--method", "baseline", "--exclude", ids, "--out", model, "--json")
+    assert command("train", csv_path, *words) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["n_recordings"] == 66
     assert summary["n_excluded_windows"] == 8
@@ -158,8 +160,20 @@ def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_
     assert set(figures) >= KEYS
 
 
+def test_what_ships_is_what_train_makes_if_nothing_else_is_asked_for(csv_path, tmp_path):
+    assert command("train", csv_path, "--out", tmp_path / "m") == 0
+    assert type(load_model(tmp_path / "m")[0]) is type(load_model(None)[0])
+
+
+def test_a_site_with_one_recording_is_told_what_else_to_use(csv_path, tmp_path):
+    table = made_up_table()
+    lonely = table.select((table.environments != "SA1") | (table.recordings == table.recordings[0]))
+    with pytest.raises(InvalidArgumentError, match=r"another recording of its junction.*baseline"):
+        command("train", write_csv(tmp_path / "lonely.csv", lonely), "--out", tmp_path / "m")
+
+
 def test_figures_for_people_show_every_junction(csv_path, capsys):
-    assert command("evaluate-features", csv_path, "--seeds", 1) == 0
+    assert command("evaluate-features", csv_path, "--method", "baseline", "--seeds", 1) == 0
     printed = capsys.readouterr().out
     assert all(junction in printed for junction in JUNCTIONS)
 

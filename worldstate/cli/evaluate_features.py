@@ -38,7 +38,7 @@ With --model a finished model is evaluated instead; it is refused where it was t
 
 EXAMPLE = """\
 examples:
-  worldstate evaluate-features features.csv --group static --protocol lojo --method worldstate --json
+  worldstate evaluate-features features.csv --group static --protocol lojo --json
   worldstate evaluate-features features.csv --model model.json --only testset.csv"""
 
 

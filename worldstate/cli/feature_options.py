@@ -14,5 +14,5 @@ def add_table_options(parser: argparse.ArgumentParser) -> None:
         help="standing ego, moving ego or both (default: %(default)s)",
     )
     parser.add_argument(
-        "--method", choices=("baseline", "worldstate"), default="baseline", help="(default: %(default)s)"
+        "--method", choices=("baseline", "worldstate"), default="worldstate", help="(default: %(default)s)"
     )

@@ -49,6 +49,9 @@ def with_site_references(table: FeatureTable, chosen: NDArray[np.bool_] | None =
         mine = keys == key
         others = (table.environments == table.environments[mine][0]) & ~mine & allowed
         if not others.any():
-            raise InvalidArgumentError(f"recording {key}: expected another recording of its junction")
+            raise InvalidArgumentError(
+                f"recording {key}: expected another recording of its junction, to compare it with; "
+                "method baseline compares with none"
+            )
         references[mine] = site_reference(levels[others]).row
     return replace(table, features=np.hstack([table.features, references]))
