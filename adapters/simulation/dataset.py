@@ -16,6 +16,7 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.atomic import atomic_path, write_text
+from worldstate.adapters.ovad_layout import AUDIO_NAME, DETECTION_NAMES, LOG_NAME
 from worldstate.adapters.video import VIDEO_NAME
 from worldstate.checks import in_range
 from worldstate.errors import InputFileError
@@ -28,10 +29,7 @@ from .scene import MOVING_SITES, SITES
 from .settings import APPROACHES, draw_settings
 from .video import Picture, camera_frames, write_video
 
-AUDIO_NAME = "out_multi.wav"
-DETECTIONS_NAME = "camera_baseline_results.json"
 TRUTH_NAME = "truth.json"
-LOG_NAME = "DataLog.csv"
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
 # OVAD's location numbers 00 to 09, then the scenes in the open.
 PLACES = (*SITES, *MOVING_SITES, *(occluded_scene(name).site.name for name in OCCLUSIONS))
@@ -158,7 +156,7 @@ def write_recording(
         temporary.mkdir()
         _write_audio(temporary / AUDIO_NAME, recording)
         if recording.detections:
-            _write_json(temporary / DETECTIONS_NAME, to_json(list(recording.detections)))
+            _write_json(temporary / DETECTION_NAMES[0], to_json(list(recording.detections)))
         _write_json(temporary / TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
