@@ -11,8 +11,9 @@ COLUMNS = (
     ("d", "degradation"), ("beta", "miss_rate"), ("vision", "vision_only"), ("aware", "awareness"),
     ("unseen", "unseen_awareness"), ("detected", "detected"), ("lead s", "lead_time_s"),
     ("FA/h", "false_alarms_per_hour"), ("false aware/h", "false_awareness_per_hour"),
+    ("share", "false_awareness"),
 )  # fmt: skip
-_FIGURES = ("false_alarms_per_hour", "false_awareness_per_hour")
+_FIGURES = ("false_alarms_per_hour", "false_awareness_per_hour", "false_awareness")
 
 
 def sweep_report(rows: Sequence[SweepRow]) -> dict[str, object]:
@@ -48,7 +49,7 @@ def sweep_table(rows: Sequence[SweepRow]) -> str:
     lines = [f"{'state':14}" + "".join(f"{title:>14}" for title, _ in COLUMNS)]
     for row in rows:
         values = [getattr(row, name) for _, name in COLUMNS]
-        texts = ["-" if value is None else f"{value:.{0 if value >= 20.0 else 2}f}" for value in values]
+        texts = ["-" if value is None else f"{value:.{0 if value >= 20.0 else 3}f}" for value in values]
         lines.append(f"{row.state:14}" + "".join(f"{text:>14}" for text in texts))
     return "\n".join(lines)
 

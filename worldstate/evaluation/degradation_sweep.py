@@ -85,6 +85,8 @@ class SweepRow:
         Advisories on hazard-free recordings.
     false_awareness_per_hour : float
         Times that the awareness rises on them, for sound or for a false detection.
+    false_awareness : float
+        Share of their hops in awareness: where the hours are few, steadier than the count of its rises.
     """
 
     state: str
@@ -98,6 +100,7 @@ class SweepRow:
     lead_time_s: float | None
     false_alarms_per_hour: float
     false_awareness_per_hour: float
+    false_awareness: float
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON-able values."""
@@ -210,6 +213,7 @@ def _row(state: str, judged: Sequence[_Judged], draws: Sequence[NDArray[np.intp]
         lead_time_s=_mean(np.array(leads)),
         false_alarms_per_hour=false_alarms_per_hour([one.alarm for one in free], HOP_S),
         false_awareness_per_hour=false_alarms_per_hour([one.aware for one in free], HOP_S),
+        false_awareness=float(np.concatenate([one.aware for one in free]).mean()),
     )
 
 
