@@ -28,8 +28,8 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
                        recordings; mirror-symmetric ensemble; eq. (post) with the visible explanation removed.
                        "rows" and "gains" compare it with the baseline, with the untrained loudest direction,
                        and with itself given hazard-free windows of the site (a commissioning drive);
-                       under transfer also with "distant_site": one expert of the pattern above the site's
-                       quiet windows, its risks shifted until hazards are as frequent as in training
+                       Under transfer it is one expert of the pattern above the site's quiet windows, its
+                       risks shifted until hazards are as frequent as in training, and "ensemble" a row
 
 Thresholds and risk maps are set on inner out-of-fold scores. Figures are means over the seeds; intervals are
 the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
@@ -99,12 +99,12 @@ def _evaluate_method(
         run_passes,
     )
     from worldstate.evaluation.feature_report import report
-    from worldstate.evaluation.methods import ROWS
+    from worldstate.evaluation.methods import ROWS, row_of
 
     for option in ("seeds", "jobs"):
         if getattr(arguments, option) < 1:
             raise InvalidArgumentError(f"--{option}: expected at least 1, got {getattr(arguments, option)}")
-    row = arguments.method
+    row = row_of(arguments.method, arguments.protocol)
     afar = arguments.protocol == "transfer"
     names = (row,) if row == "baseline" else (row, *(COMPARED_AFAR if afar else COMPARED))
     methods = list(dict.fromkeys(ROWS[name].method for name in names))
@@ -121,7 +121,8 @@ def _evaluate_method(
         )
     detail = report(table, passes[row]) if row == "baseline" else {}
     compared = comparison(table, passes, row, arguments.alpha)
-    figures = _origin(arguments, row, arguments.protocol, arguments.seeds) | detail | compared
+    origin = _origin(arguments, arguments.method, arguments.protocol, arguments.seeds)
+    figures = origin | {"row": row} | detail | compared
     return figures, row_predictions(passes, row)
 
 

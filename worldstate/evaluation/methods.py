@@ -149,7 +149,7 @@ def distant_site(rng: np.random.Generator) -> Classifier:
 METHODS = {
     "baseline": Method(as_read, PublishedClassifier, fit_isotonic, two_levels=False),
     "loudest_direction": Method(as_read, loudest_direction, fit_isotonic, two_levels=False),
-    "worldstate": Method(with_site_references, site_ensemble, fit_platt, two_levels=True),
+    "ensemble": Method(with_site_references, site_ensemble, fit_platt, two_levels=True),
     "commissioning_drive": Method(with_commissioning_drive, site_ensemble, fit_platt, two_levels=True),
     "distant_site": Method(
         with_site_references, distant_site, fit_platt, two_levels=False, match_prevalence=True
@@ -161,7 +161,22 @@ ROWS = {
     "baseline": Row("baseline", PUBLISHED_MISS_RATE),
     "baseline_absent": Row("baseline", ABSENT_MISS_RATE),
     "loudest_direction": Row("loudest_direction", ABSENT_MISS_RATE),
-    "worldstate": Row("worldstate", ABSENT_MISS_RATE),
+    "ensemble": Row("ensemble", ABSENT_MISS_RATE),
     "commissioning_drive": Row("commissioning_drive", ABSENT_MISS_RATE),
     "distant_site": Row("distant_site", ABSENT_MISS_RATE),
 }
+
+# What `worldstate` is: the ensemble where the ego drives as it did in training, one expert where it does not.
+# How the ego drives is known to whoever asks, and nothing else decides.
+OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "distant_site"}
+
+
+def row_of(method: str, protocol: Protocol) -> str:
+    """Return the name in `ROWS` of what a method is under a protocol.
+
+    Examples
+    --------
+    >>> row_of("worldstate", "lojo"), row_of("worldstate", "transfer"), row_of("baseline", "cv")
+    ('ensemble', 'distant_site', 'baseline')
+    """
+    return OURS[protocol] if method == "worldstate" else method
