@@ -14,6 +14,8 @@ from worldstate.errors import InvalidArgumentError
 
 # No edge of an image is narrower: pixels have a size, and noise is smoothed before it is looked for.
 NARROWEST_EDGE_PX = 3.0
+# MOG2's own: a pixel moves when it is so many variances from every mode of its background.
+MOG2_VARIANCES = 16.0
 
 Background = Literal["mog2", "knn"]
 
@@ -32,6 +34,9 @@ class MotionSettings:
         Frames that the background remembers.
     warm_up : int
         First frames, in which nothing is reported.
+    least_contrast : float
+        Smallest difference that is motion, grey levels, Euclidean over the colours, > 0. The codec and the
+        sensor of a street camera scatter by some 3 grey levels a colour, 5 over three: three times that.
     min_area : float
         Smallest object as a share of the image, in (0, 1).
     max_area : float
@@ -59,6 +64,7 @@ class MotionSettings:
     width_px: int = 640
     history: int = 100
     warm_up: int = 5
+    least_contrast: float = 15.0
     min_area: float = 0.0015
     max_area: float = 0.6
     edge_width: float = 0.01
@@ -71,6 +77,7 @@ class MotionSettings:
         in_range("width_px", self.width_px, 16, 8192)
         in_range("history", self.history, 1, 100_000)
         in_range("warm_up", self.warm_up, 0, 100_000)
+        in_range("least_contrast", self.least_contrast, 0.0, 255.0, open_low=True)
         in_range("min_area", self.min_area, 0.0, self.max_area, open_low=True)
         in_range("max_area", self.max_area, 0.0, 1.0)
         in_range("edge_width", self.edge_width, 0.0, 1.0, open_low=True)
@@ -127,9 +134,12 @@ class MotionDetector:
 
     def _make_background(self) -> Any:
         chosen = self.settings
+        least = chosen.least_contrast**2
         if chosen.background == "knn":
-            return self._cv2.createBackgroundSubtractorKNN(chosen.history, detectShadows=False)
-        return self._cv2.createBackgroundSubtractorMOG2(chosen.history, detectShadows=False)
+            return self._cv2.createBackgroundSubtractorKNN(chosen.history, least, detectShadows=False)
+        model = self._cv2.createBackgroundSubtractorMOG2(chosen.history, MOG2_VARIANCES, detectShadows=False)
+        model.setVarMin(least / MOG2_VARIANCES)
+        return model
 
     def _reduced(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         height, width = frame.shape[:2]
