@@ -46,6 +46,8 @@ class Recording:
     t0_frame : int or None
         Frame, from the start of the recording, in which the vehicle enters line of sight; None where there is
         no vehicle or it is not known.
+    logged_frame : int or None
+        T0 of the log as it stands: recordings without a vehicle have one too, at which nothing happens.
 
     Examples
     --------
@@ -59,6 +61,7 @@ class Recording:
     environment: str | None = None
     label: Label | None = None
     t0_frame: int | None = None
+    logged_frame: int | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> "Recording":
@@ -235,7 +238,9 @@ def _recording(log: Path, line: int, row: dict[str, str]) -> Recording:
     if not _is_label(label):
         raise InputFileError(log, f"line {line}: expected Class left, none or right, got {label!r}")
     folder = log.parent / environment / label / identifier
-    return Recording(folder, identifier, environment, label, _t0_frame(log, line, label, row["T0"]))
+    logged = _logged_frame(log, line, label, row["T0"])
+    entry = None if label == "none" else logged
+    return Recording(folder, identifier, environment, label, entry, logged)
 
 
 def _identifier(path: Path, line: int, text: str) -> str:
@@ -244,13 +249,12 @@ def _identifier(path: Path, line: int, text: str) -> str:
     return text
 
 
-def _t0_frame(log: Path, line: int, label: Label, text: str) -> int | None:
-    # The log gives recordings without a vehicle a T0 too, at which nothing happens.
+def _logged_frame(log: Path, line: int, label: Label, text: str) -> int | None:
     if label == "none" and not text:
         return None
     if not (text.isascii() and text.isdecimal() and len(text) < 8 and int(text) <= MAX_T0_FRAME):
         raise InputFileError(log, f"line {line}: expected T0 as a frame number, an integer, got {text!r}")
-    return None if label == "none" else int(text)
+    return int(text)
 
 
 def _refuse_duplicates(path: Path, ids: list[str]) -> None:

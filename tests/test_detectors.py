@@ -66,6 +66,18 @@ def test_motion_finds_the_car_and_little_else(background):
     assert false <= 8
 
 
+@pytest.mark.parametrize("background", ["mog2", "knn"])
+@pytest.mark.parametrize(("step", "seen"), [(7, False), (11, True)])
+def test_both_backgrounds_have_the_same_smallest_contrast(background, step, seen):
+    detector = MotionDetector(MotionSettings(background=background, width_px=96, least_contrast=15.0))
+    empty = np.full((64, 96, 3), 100, dtype=np.uint8)
+    for _ in range(60):
+        assert len(detector.detect(empty)) == 0
+    there = empty.copy()
+    there[20:44, 30:60] += step  # Euclidean over the colours: sqrt(3) times
+    assert bool(len(detector.detect(there))) is seen
+
+
 def test_motion_sees_nothing_in_an_empty_street():
     detector = MotionDetector()
     assert sum(len(detector.detect(frame)) for frame in street(15, car=False)) == 0

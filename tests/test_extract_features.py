@@ -52,7 +52,8 @@ def write_labels(path, rows, header=HEADER):
 def command(dataset, labels, out):
     parser = argparse.ArgumentParser()
     extract_features.add_parser(parser.add_subparsers(required=True))
-    words = [dataset, "--labels", labels, "--array", dataset.parent / "mics.xml", "--out", out, "--json"]
+    listed = [] if labels is None else ["--labels", labels]
+    words = [dataset, *listed, "--array", dataset.parent / "mics.xml", "--out", out, "--json"]
     arguments = parser.parse_args(["extract-features", *map(str, words)])
     return arguments.run(arguments)
 
@@ -104,3 +105,48 @@ def test_another_array_is_refused(dataset, tmp_path):
     write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]))
     with pytest.raises(InputFileError, match="channels"):
         command(dataset, write_labels(tmp_path / "l.csv", ROWS), tmp_path / "f.csv")
+
+
+LOG = """ID,Environment,Class,T0
+1_00_0001,SA1,left,12
+2_00_0002,SA1,none,20
+3_06_0003,DA2,right,13
+1_02_0004,SB1,left,21
+"""
+
+
+def test_without_labels_windows_lie_where_the_released_program_cuts_them(tmp_path, capsys):
+    root, rng = tmp_path / "ovad", np.random.default_rng(1)
+    sounds = {}
+    for row in csv.DictReader(LOG.splitlines()):
+        path = root / row["Environment"] / row["Class"] / row["ID"] / "out_multi.wav"
+        path.parent.mkdir(parents=True)
+        soundfile.write(path, 0.1 * rng.standard_normal((round(3.5 * RATE), 3)), RATE, subtype="PCM_16")
+        sounds[row["ID"]] = soundfile.read(path, dtype="float32")[0]
+    (root / "DataLog.csv").write_text(LOG)
+    write_array_xml(tmp_path / "mics.xml", ARRAY)
+    assert command(root, None, tmp_path / "f.csv") == 0
+    assert json.loads(capsys.readouterr().out)["n_left_out"] == 1  # the last one's front, which ends at 3.6 s
+    table = read_features(tmp_path / "f.csv")
+    found = dict(zip(table.ids, zip(table.labels, table.features, strict=True), strict=True))
+    expected = {
+        "1_00_0001": ("left", "1_00_0001", 1.2), "0_00_0000": ("front", "1_00_0001", 2.7),
+        "2_00_0002": ("none", "2_00_0002", 2.0), "3_06_0003": ("right", "3_06_0003", 1.8),
+        "0_06_0001": ("front", "3_06_0003", 3.3), "1_02_0004": ("left", "1_02_0004", 2.1),
+    }  # fmt: skip
+    assert found.keys() == expected.keys()
+    for name, (label, recording, end_s) in expected.items():
+        cut = sounds[recording][round((end_s - 1.0) * RATE) : round(end_s * RATE)]
+        assert found[name][0] == label
+        np.testing.assert_allclose(found[name][1], published_feature(cut, ARRAY, RATE), rtol=1e-5)
+    assert table.recordings.tolist() == ["0", "0", "1", "2", "2", "3"]
+
+
+def test_a_data_set_of_recordings_too_short_is_refused(tmp_path):
+    path = tmp_path / "SA1" / "left" / "1_00_0001" / "out_multi.wav"
+    path.parent.mkdir(parents=True)
+    soundfile.write(path, 0.1 * np.random.default_rng(0).standard_normal((round(1.2 * RATE), 3)), RATE)
+    (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n1_00_0001,SA1,left,4\n")
+    write_array_xml(tmp_path.parent / "mics.xml", ARRAY)
+    with pytest.raises(InputFileError, match=r"DataLog\.csv.*2 are cut off"):
+        command(tmp_path, None, tmp_path / "f.csv")

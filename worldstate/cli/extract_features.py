@@ -2,9 +2,13 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate.cli.output import print_summary
 from worldstate.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.adapters.feature_extraction import LabelledWindow
 
 DESCRIPTION = """\
 Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
@@ -12,10 +16,14 @@ array of one's own. The list of labels is CSV with the columns ID, Class (front,
 Environment (S.. standing ego, D.. moving ego, then the junction) and Recording ID; optional are File,
 relative to DATASET, End, the end of the window in seconds from the start of the file (default: its last
 second), and T0. Where no File is given, DATASET/Environment/Class/ID/out_multi.wav and DATASET/ID.wav are
-looked for."""
+looked for.
+
+Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
+none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that."""
 
 EXAMPLE = """\
-example:
+examples:
+  worldstate simulate --out sim --static 40 && worldstate extract-features sim --out features.csv
   worldstate extract-features recordings --labels labels.csv --array mics.xml --out features.csv
   worldstate train features.csv --method worldstate --out model.json"""
 
@@ -30,7 +38,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
-    parser.add_argument("--labels", type=Path, required=True, metavar="CSV", help="list of windows")
+    parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
     parser.add_argument(
         "--array", type=Path, metavar="XML", help="microphones (default: the 56-microphone roof array)"
@@ -44,12 +52,12 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from worldstate.adapters.array_xml import read_array_xml
-    from worldstate.adapters.feature_extraction import extract_features, feature_table, read_labels
+    from worldstate.adapters.feature_extraction import extract_features, feature_table
     from worldstate.adapters.feature_table import write_features
     from worldstate.frontend.array import roof_array_56
 
     array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
-    windows = read_labels(arguments.labels, arguments.dataset)
+    windows, left_out = _windows(arguments)
     features = []
     with progress_bar("extracting", len(windows)) as bar:
         for feature in extract_features(windows, array):
@@ -60,9 +68,25 @@ def run(arguments: argparse.Namespace) -> int:
     summary = {
         "out": str(arguments.out),
         "n_windows": len(table),
+        "n_left_out": left_out,
         "n_recordings": len(np.unique(table.recording_keys)),
         "n_hazard": int(table.hazards.sum()),
         "n_hazard_free": int(table.hazard_free.sum()),
     }
     print_summary(summary, as_json=arguments.json)
     return 0
+
+
+def _windows(arguments: argparse.Namespace) -> "tuple[list[LabelledWindow], int]":
+    from worldstate.adapters.feature_extraction import read_labels
+    from worldstate.adapters.ovad_layout import LOG_NAME
+    from worldstate.adapters.sample_windows import sample_windows
+    from worldstate.errors import InputFileError
+
+    if arguments.labels is not None:
+        return read_labels(arguments.labels, arguments.dataset), 0
+    windows, left_out = sample_windows(arguments.dataset)
+    if not windows:
+        problem = f"expected a recording with a second of sound before T0, found none; {left_out} are cut off"
+        raise InputFileError(arguments.dataset / LOG_NAME, problem)
+    return windows, left_out

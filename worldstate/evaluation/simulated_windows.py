@@ -1,9 +1,9 @@
 """Labelled feature windows of simulated junctions, laid out as the released real ones.
 
-Every recording gives what a real one gives: a hazard window that ends at or shortly before T0 and a front
-window that begins there, or one hazard-free window. How the real hazard windows sit relative to T0 is not
-stated by their authors; this choice is ours. Rendered at a quarter of the array's rate with a quarter of the
-frame length, which leaves the feature's bins (50-1500 Hz) where they are.
+The program released with the real recordings says where its windows lie. With a standing ego the hazard and
+hazard-free windows end at T0, the frame of the 10-Hz video in which the vehicle comes into sight; with a
+moving ego they end 0.5 s later. The front window ends 1.5 s after the first. Rendered at a quarter of the
+array's rate with a quarter of the frame length, which leaves the feature's bins (50-1500 Hz) where they are.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,8 +16,19 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
+from worldstate.adapters.feature_extraction import WINDOW_S
 from worldstate.adapters.feature_table import FeatureTable
-from worldstate.adapters.simulation import SITES, Preset, draw_settings, preset, simulate_recording
+from worldstate.adapters.sample_windows import window_ends_s
+from worldstate.adapters.simulation import (
+    SITES,
+    Preset,
+    SimulationSettings,
+    draw_settings,
+    preset,
+    simulate_recording,
+)
+from worldstate.adapters.simulation.detector import FRAME_RATE_HZ
+from worldstate.adapters.simulation.scene import MOVING_SITES
 from worldstate.checks import in_range
 from worldstate.frontend.array import roof_array_56
 from worldstate.frontend.bins import band_bins
@@ -37,8 +48,10 @@ Numbers = NDArray[np.float64]
 DECIMATION = 4
 RATE_HZ = 47_998.0 / DECIMATION
 NFFT = FEATURE_NFFT // DECIMATION
-WINDOW_S, ENTRY_S, LATEST_END_S = 1.0, 1.65, 0.3
-DURATION_S = 3.0
+# Changes whenever a window of the same seed would be another one.
+LAYOUT = 2
+ENTRY_S, DURATION_S = 1.65, 3.8
+FRAME_S = 1.0 / FRAME_RATE_HZ
 MAX_PER_CLASS = 1000
 
 
@@ -61,7 +74,7 @@ def simulated_windows(
     levels: Preset | None = None,
     progress: Callable[[], None] = lambda: None,
 ) -> FeatureTable:
-    """Simulate windows of standing-ego junctions.
+    """Simulate windows of junctions.
 
     Parameters
     ----------
@@ -70,7 +83,7 @@ def simulated_windows(
     seed : int
         Of all; every recording has a seed of its own.
     sites : sequence of str
-        Names of sites.
+        Names of sites, of either group.
     jobs : int
         Processes.
     levels : Preset, optional
@@ -122,15 +135,21 @@ def _each(work: Callable[[WindowPlan], list[Row]], plans: list[WindowPlan], jobs
 
 def _windows(levels: Preset, plan: WindowPlan) -> list[Row]:
     rng = np.random.default_rng(plan.seed)
-    drawn = draw_settings(plan.environment, plan.approach, rng, DURATION_S)
-    scene = replace(drawn, entry_s=ENTRY_S, sample_rate_hz=RATE_HZ, preset=levels)
-    early = float(rng.uniform(0.0, LATEST_END_S))
+    scene = _scene(plan, levels, rng)
+    first_frame_s = ENTRY_S + float(rng.uniform(0.0, FRAME_S))
     audio = simulate_recording(scene, rng).audio
-    starts = {("none" if plan.approach == "none" else plan.approach): ENTRY_S - WINDOW_S - early}
-    if plan.approach != "none":
-        starts["front"] = ENTRY_S + 0.5 * early
+    ends = window_ends_s(plan.approach, first_frame_s, plan.environment in MOVING_SITES)
     about = (plan.environment, str(plan.number))
-    return [(window_feature(_cut(audio, start)), label, *about) for label, start in starts.items()]
+    return [(window_feature(_cut(audio, end - WINDOW_S)), label, *about) for label, end in ends.items()]
+
+
+def _scene(plan: WindowPlan, levels: Preset, rng: np.random.Generator) -> SimulationSettings:
+    """Draw a scene in which the vehicle, or the end of a hazard-free window, comes at `ENTRY_S`."""
+    drawn = draw_settings(plan.environment, plan.approach, rng, DURATION_S)
+    ego = drawn.ego
+    if not ego.stands:
+        ego = replace(ego, stop_s=ego.stop_s - drawn.entry_s + ENTRY_S)
+    return replace(drawn, entry_s=ENTRY_S, ego=ego, sample_rate_hz=RATE_HZ, preset=levels)
 
 
 def _cut(audio: NDArray[np.float32], start_s: float) -> NDArray[np.float32]:
