@@ -1,5 +1,7 @@
 """The comparison of simulated with real windows, on sets whose answer is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -105,3 +107,29 @@ def test_simulated_windows_are_laid_out_as_the_released_ones():
     again = simulated_windows(1, 3, sites=("SB1",))
     np.testing.assert_array_equal(again.features, table.features)
     assert "SB1" in SITES
+
+
+def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
+    """They end at T0, a frame, or half a second later if the ego moves; the front window 1.5 s after."""
+    ends, entries = {}, []
+
+    def rendered(scene, rng):
+        entries.append(scene.entry_s)
+        return SimpleNamespace(audio=np.arange(round(scene.duration_s * RATE_HZ)))
+
+    def feature(cut):
+        assert len(cut) == round(RATE_HZ)
+        ends.setdefault(len(entries), []).append(cut[-1] / RATE_HZ - entries[-1])
+        return np.zeros(60)
+
+    monkeypatch.setattr("worldstate.evaluation.simulated_windows.simulate_recording", rendered)
+    monkeypatch.setattr("worldstate.evaluation.simulated_windows.window_feature", feature)
+    table = simulated_windows(20, 1, sites=("SA1", "DA1"))
+    hidden = np.array([found[0] for found in ends.values()])
+    moving = np.array([name == "DA1" for name in table.environments[table.labels != "front"]])
+    assert (np.abs(hidden[~moving] - 0.05) <= 0.0502).all()
+    assert (np.abs(hidden[moving] - 0.55) <= 0.0502).all()
+    assert np.ptp(hidden[moving]) > 0.08
+    later = [found[1] - found[0] for found in ends.values() if len(found) == 2]
+    assert len(later) == 80
+    np.testing.assert_allclose(later, 1.5, atol=1e-3)

@@ -27,6 +27,7 @@ from worldstate.adapters.simulation import (
     write_dataset,
     write_recording,
 )
+from worldstate.adapters.simulation.background import far_passages_s
 from worldstate.adapters.simulation.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.detector import line_of_sight
 from worldstate.adapters.simulation.emission import Emission, MovingSource
@@ -292,6 +293,17 @@ def test_the_command_writes_and_reports(tmp_path, capsys):
 def test_the_command_offers_what_the_simulation_has():
     assert sorted(cli.KINDS) == sorted(KINDS)
     assert sorted(cli.SCENES) == sorted(["junction", *OCCLUSIONS])
+
+
+@pytest.mark.parametrize("duration_s", [2.0, 30.0])
+def test_distant_vehicles_are_as_frequent_in_a_short_recording_as_in_a_long_one(duration_s):
+    rng = np.random.default_rng(3)
+    busy = replace(preset(), far_rate=1.2)
+    found = np.concatenate([far_passages_s(busy, duration_s, rng) for _ in range(2000)])
+    inside = ((found >= 0.0) & (found < duration_s)).sum() / 2000.0
+    outside = (found < 0.0).sum() / 2000.0
+    assert inside == pytest.approx(0.12 * duration_s, rel=0.1)
+    assert outside == pytest.approx(0.12 * 8.0, rel=0.1)  # they are heard before and after they are loudest
 
 
 def test_hidden_approaches_are_louder_and_sharper_than_empty_streets():

@@ -276,17 +276,18 @@ def test_a_folder_that_is_not_there_is_named(streams, tmp_path):
 
 
 @pytest.mark.slow
-def test_realism_stands_beside_the_figures(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(("group", "sites"), [("static", ("SA1", "SB1")), ("dynamic", ("DA1", "DB1"))])
+def test_realism_stands_beside_the_figures(group, sites, tmp_path, capsys, monkeypatch):
     """Simulated windows of one seed against those of another, which take the part of the real ones."""
     from worldstate.adapters.feature_table import write_features
     from worldstate.cli import twin
 
-    write_features(tmp_path / "real.csv", simulated_windows(3, seed=9))
-    monkeypatch.setattr(twin, "WINDOWS", 3)
+    write_features(tmp_path / "real.csv", simulated_windows(8, seed=9, sites=sites))
+    monkeypatch.setattr(twin, "WINDOWS", 8)
     monkeypatch.setattr(twin, "REALISM_SEEDS", (1,))
     arguments = ["twin", "--static", "4", "--duration", "1.5", "--out", str(tmp_path / "t"), "--json"]
     arguments += ["--model", "default"]
-    assert main([*arguments, "--realism", str(tmp_path / "real.csv")]) == 0
+    assert main([*arguments, "--realism", str(tmp_path / "real.csv"), "--realism-group", group]) == 0
     realism = json.loads(capsys.readouterr().out)["realism"]
     assert set(realism) == {"1"}
     assert set(realism["1"]) == {"medians", "transfers", "c2st"}

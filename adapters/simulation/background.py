@@ -14,6 +14,9 @@ Signal = NDArray[np.float32]
 
 FLUCTUATION_STEP_S = 1.0
 LOBES = 3
+# A distant vehicle swells and fades with these standard deviations; two of them off it is 9 dB down.
+FAR_WIDTH_S, FAR_AUDIBLE_S = (1.5, 4.0), 8.0
+FAR_RATE_PER_S, MAX_FAR = 10.0, 16
 WIND_SLOPE = -2.2
 WIND_FLOOR_HZ = 20.0  # below, wind stays as it is there
 
@@ -51,9 +54,9 @@ def add_background(
     azimuth, power = ambient_directions(site, preset, rng)
     waves = _ambient_waves(power, level_db, preset, out.shape[1], sample_rate_hz, rng)
     static.add(waves, plane_wave_delays(unit_vectors(azimuth, rng), offsets))
-    for _ in range(min(int(rng.poisson(preset.far_rate)), 2)):
-        far_db = level_db + preset.far_level_db
-        static.add(*_far_vehicle(out.shape[1], far_db, offsets, sample_rate_hz, rng))
+    far_db = level_db + preset.far_level_db
+    for loudest_s in far_passages_s(preset, out.shape[1] / sample_rate_hz, rng):
+        static.add(*_far_vehicle(loudest_s, out.shape[1], far_db, offsets, sample_rate_hz, rng))
     _add_channel_noise(out, preset, sample_rate_hz, rng)
 
 
@@ -122,14 +125,28 @@ def _ambient_waves(
     return waves
 
 
+def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> Array:
+    """Draw when distant vehicles are loudest: a Poisson process that knows nothing of the recording's ends.
+
+    Examples
+    --------
+    >>> busy = Preset("busy", far_rate=10.0)
+    >>> times_s = far_passages_s(busy, 2.0, np.random.default_rng(0))
+    >>> bool(times_s.min() < 0.0 and times_s.max() > 2.0)
+    True
+    """
+    expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_RATE_PER_S
+    number = min(int(rng.poisson(expected)), MAX_FAR)
+    return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, number)
+
+
 def _far_vehicle(
-    samples: int, level_db: Array, offsets_m: Array, rate: float, rng: np.random.Generator
+    loudest_s: float, samples: int, level_db: Array, offsets_m: Array, rate: float, rng: np.random.Generator
 ) -> tuple[Signal, Array]:
     """Draw a vehicle some streets away: one direction, one facade reflection, gone in seconds."""
     noise = shaped_noise(level_curve(level_db, noise_frequencies(samples, rate)) * rate, samples, rng, 1)
     time = np.arange(samples) / rate
-    centre, width = rng.uniform(0.0, time[-1] + 1.0 / rate), rng.uniform(1.5, 4.0)
-    noise *= np.exp(-0.5 * ((time - centre) / width) ** 2).astype(np.float32)
+    noise *= np.exp(-0.5 * ((time - loudest_s) / rng.uniform(*FAR_WIDTH_S)) ** 2).astype(np.float32)
     echo = np.roll(noise, int(rng.uniform(0.01, 0.05) * rate)) * np.float32(rng.uniform(0.3, 0.8))
     directions = unit_vectors(rng.uniform(-np.pi, np.pi, 2), rng)
     return np.concatenate([noise, echo]), plane_wave_delays(directions, offsets_m)

@@ -1,18 +1,21 @@
 """Levels and shapes of everything that is not geometry: named, versioned, frozen.
 
-`street-4` has air and ground, two source heights and engine lines that follow the drive. Its levels come
-from `street-3`, which was set by hand on medians of level, peak, prominence and segment-to-segment change of
-the published features of SA1, SB1 and SB2, windows that end up to 0.3 s before T0, no classifier involved;
-wind and vehicle level were set again on the same medians.
+`street-5` differs from `street-4` in this. Distant vehicles are a Poisson process that knows nothing of a
+recording's ends, so that a short recording hears as many as a long one. Wind is 1 dB louder. Drivers are slower
+where a wall stands opposite, faster where none does, and more of them brake (`settings.py`). Wind and drivers
+were set by hand, in a dozen tries, on medians of level, peak, width, prominence and change of the released
+windows of SA1, SB1 and SB2, beside simulated windows cut as those are; no classifier was involved. The rest
+comes from `street-4` and `street-3`, which were set on the same medians with windows cut too early.
 
-Distant vehicles are the free knob of false alarms. Their level and rate were set on 24 hazard-free recordings
-of another seed than the twin's, vehicles 2 dB quieter than now, so that the published rule, trained on the
-same simulated junctions, comes to some 350 false alarms an hour: 50 at rate 1 and -6 dB, 860 at rate 1.5 and
-+4 dB, 260 at rate 0.4 and +4 dB; 0.5 is the interpolation.
+Distant vehicles are the free knob of false alarms. The published rule, trained on the same simulated junctions
+as in the twin, made on 40 hazard-free recordings of another seed than the twin's: 158 false alarms an hour
+with 0.4 in ten seconds at +4 dB, 227 with 0.7, 208 with 1.2 (the classifier learns to live with them), and 336
+with 0.6 at +8 dB, which is nearest to the published 350 and was taken.
 
-The history is not all clean: `street-2`, two presets ago, was chosen among candidates after one look at a
-classifier's scores on simulated windows; what was kept of it (ambient octaves) is older than that look.
-Earlier presets are not offered: the physics that they were set with is gone. A change is a new name.
+The history is not all clean: `street-2` was chosen among candidates after one look at a classifier's scores on
+simulated windows; what was kept of it (ambient octaves) is older than that look. And before this knob was set,
+the twin had been run on `street-4`, whose areas were too high and false alarms too few. Earlier presets are
+not offered: the physics that they were set with is gone. A change is a new name.
 """
 
 from dataclasses import dataclass
@@ -62,7 +65,7 @@ class Preset:
     wave_fluctuation_db : float
         Standard deviation of the slow wander of every single wave.
     far_rate : float
-        Mean number of distant vehicles per recording (at most two are drawn).
+        Mean number of distant vehicles in ten seconds.
     far_level_db : float
         Level of a distant vehicle at its loudest against the ambient level, dB.
     wind_100hz_db : float
@@ -99,9 +102,9 @@ class Preset:
     lobe_concentration: float = 2.0
     lobe_share: float = 0.1
     wave_fluctuation_db: float = 2.5
-    far_rate: float = 0.5
-    far_level_db: float = 4.0
-    wind_100hz_db: float = 57.0
+    far_rate: float = 0.6
+    far_level_db: float = 8.0
+    wind_100hz_db: float = 58.0
     self_noise_db: float = 38.0
     gain_mismatch_db: float = 0.5
     delay_mismatch_s: float = 1.05e-4
@@ -122,8 +125,8 @@ class Preset:
             in_range(name, getattr(self, name), low, high)
 
 
-PRESETS = {preset.name: preset for preset in (Preset("street-4"),)}
-DEFAULT_PRESET = "street-4"
+PRESETS = {preset.name: preset for preset in (Preset("street-5"),)}
+DEFAULT_PRESET = "street-5"
 
 
 def preset(name: str = DEFAULT_PRESET) -> Preset:
@@ -136,7 +139,7 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
 
     Examples
     --------
-    >>> preset("street-4").ambient_waves
+    >>> preset("street-5").ambient_waves
     72
     """
     if name not in PRESETS:

@@ -17,8 +17,9 @@ APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this 
 MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
 MAX_OTHERS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 64, 0.1
-# Narrow streets and a blind junction ahead: most drivers slow down before it.
-SPEEDS_MPS, BRAKING_SHARE, BRAKING_MPS2 = (5.0, 12.0), 0.75, (0.5, 3.0)
+# Narrow streets and a blind junction ahead: most drivers slow down before it, and a wall makes them slower.
+SPEEDS_MPS, WALLED_SPEEDS_MPS = (6.5, 14.0), (4.2, 5.6)
+BRAKING_SHARE, BRAKING_MPS2 = 0.85, (1.0, 3.5)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
 
 
@@ -172,7 +173,9 @@ def draw_settings(
     duration_s: float = 10.0,
     kind: str = "light",
 ) -> SimulationSettings:
-    """Draw how a vehicle drives: 18 to 43 km/h, three in four braking, in sight at 65 to 75 % of the time.
+    """Draw how a vehicle drives, in sight at 65 to 75 % of the time.
+
+    Most brake; before that they do 23 to 50 km/h, 15 to 20 where a wall stands opposite (type A).
 
     Parameters
     ----------
@@ -203,12 +206,13 @@ def draw_settings(
     if scene is not None:
         _one_of("approach", approach, (scene.approach, "none"))
     brakes = rng.random() < BRAKING_SHARE
+    place = site(site_name) if scene is None else scene.site
     return SimulationSettings(
-        site=site(site_name) if scene is None else scene.site,
+        site=place,
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
-        speed_mps=rng.uniform(*SPEEDS_MPS),
+        speed_mps=rng.uniform(*(SPEEDS_MPS if place.opposite_wall_m is None else WALLED_SPEEDS_MPS)),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
         parked_car=bool(rng.random() < 0.3) and scene is None,
         kind=kind,

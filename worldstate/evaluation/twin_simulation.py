@@ -18,7 +18,7 @@ from worldstate.evaluation.twin_hearing import hear
 from worldstate.evaluation.twin_recording import TwinRecording, load_twin, save_twin
 
 # What is heard of a recording depends on this code: a change of it is another number.
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)

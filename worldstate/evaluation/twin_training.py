@@ -16,7 +16,7 @@ from worldstate.abduction.signature import SignatureModel
 from worldstate.abduction.signature_training import PublishedClassifier
 from worldstate.adapters.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.simulation import SITES, Preset
-from worldstate.evaluation.simulated_windows import simulated_windows
+from worldstate.evaluation.simulated_windows import LAYOUT, simulated_windows
 from worldstate.evaluation.twin_simulation import VERSION
 
 # 170 windows of each class of left and right together, front and none: the released set has 170, 170 and 158
@@ -58,7 +58,7 @@ def train_on_twin(
     InputFileError
         If a kept table is damaged.
     """
-    made_of = [VERSION, asdict(levels), seed, per_approach]
+    made_of = [VERSION, LAYOUT, asdict(levels), seed, per_approach]
     origin = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:16]
     path = folder / f"training-{origin}.csv"
     if path.is_file():
