@@ -1,21 +1,22 @@
 """Levels and shapes of everything that is not geometry: named, versioned, frozen.
 
 `street-5` differs from `street-4` in this. Distant vehicles are a Poisson process that knows nothing of a
-recording's ends, so that a short recording hears as many as a long one. Wind is 1 dB louder. Drivers are slower
-where a wall stands opposite, faster where none does, and more of them brake (`settings.py`). Wind and drivers
-were set by hand, in a dozen tries, on medians of level, peak, width, prominence and change of the released
-windows of SA1, SB1 and SB2, beside simulated windows cut as those are; no classifier was involved. The rest
-comes from `street-4` and `street-3`, which were set on the same medians with windows cut too early.
+recording's ends, so that a short recording hears as many as a long one. Wind is 1 dB louder. Drivers are
+slower where a wall stands opposite, faster where none does, and more of them brake (`settings.py`). Wind
+and drivers were set by hand, in a dozen tries, on medians of level, peak, width, prominence and change of
+the released windows of SA1, SB1 and SB2, beside simulated windows cut as those are; no classifier was
+involved. The rest comes from `street-4` and `street-3`, which were set on the same medians with windows cut
+too early.
 
-Distant vehicles are the free knob of false alarms. The published rule, trained on the same simulated junctions
-as in the twin, made on 40 hazard-free recordings of another seed than the twin's: 158 false alarms an hour
-with 0.4 in ten seconds at +4 dB, 227 with 0.7, 208 with 1.2 (the classifier learns to live with them), and 336
-with 0.6 at +8 dB, which is nearest to the published 350 and was taken.
+Distant vehicles are the free knob of false alarms. The published rule, trained on the same simulated
+junctions as in the twin, made on 40 hazard-free recordings of another seed than the twin's: 158 false
+alarms an hour with 0.4 in ten seconds at +4 dB, 227 with 0.7, 208 with 1.2 (the classifier learns to live
+with them), and 336 with 0.6 at +8 dB, which is nearest to the published 350 and was taken.
 
-The history is not all clean: `street-2` was chosen among candidates after one look at a classifier's scores on
-simulated windows; what was kept of it (ambient octaves) is older than that look. And before this knob was set,
-the twin had been run on `street-4`, whose areas were too high and false alarms too few. Earlier presets are
-not offered: the physics that they were set with is gone. A change is a new name.
+The history is not all clean: `street-2` was chosen among candidates after one look at a classifier's scores
+on simulated windows; what was kept of it (ambient octaves) is older than that look. And before this knob
+was set, the twin had been run on `street-4`, whose areas were too high and false alarms too few. Earlier
+presets are not offered: the physics that they were set with is gone. A change is a new name.
 """
 
 from dataclasses import dataclass
