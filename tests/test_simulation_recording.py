@@ -32,6 +32,7 @@ from worldstate.adapters.simulation.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.detector import line_of_sight
 from worldstate.adapters.simulation.emission import Emission, MovingSource
 from worldstate.adapters.simulation.paths import trace_paths
+from worldstate.adapters.simulation.presets import DEFAULT_PRESET, PRESETS
 from worldstate.adapters.simulation.propagation import add_sources
 from worldstate.adapters.simulation.receiver import Receiver
 from worldstate.adapters.simulation.static_field import StaticSources
@@ -293,6 +294,19 @@ def test_the_command_writes_and_reports(tmp_path, capsys):
 def test_the_command_offers_what_the_simulation_has():
     assert sorted(cli.KINDS) == sorted(KINDS)
     assert sorted(cli.SCENES) == sorted(["junction", *OCCLUSIONS])
+    assert list(cli.PRESETS) == list(PRESETS)
+    assert cli.PRESETS[0] == DEFAULT_PRESET
+
+
+def test_a_calm_street_is_another_sound_of_the_same_drive(tmp_path, capsys):
+    truths = {}
+    for name in PRESETS:
+        arguments = ["simulate", "--out", str(tmp_path / name), "--static", "1", "--duration", "0.5"]
+        assert main([*arguments, "--preset", name]) == 0
+        truth = json.loads((tmp_path / name / "SA1/left/1_00_0000/truth.json").read_text())
+        assert truth["settings"]["preset"]["name"] == name
+        truths[name] = truth["frames"]
+    assert truths["street-5"] == truths["street-5-calm"]
 
 
 @pytest.mark.parametrize("duration_s", [2.0, 30.0])

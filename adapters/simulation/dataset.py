@@ -7,7 +7,7 @@ import multiprocessing
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from worldstate.errors import InputFileError
 from .detector import to_json
 from .occlusions import OCCLUSIONS, occluded_scene
 from .plan import DatasetSettings, Plan
+from .presets import preset
 from .recording import SimulatedRecording, simulate_recording
 from .scene import MOVING_SITES, SITES
 from .settings import APPROACHES, draw_settings
@@ -196,7 +197,8 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
 
 def _simulate_one(root: Path, wanted: DatasetSettings, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
-    settings = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
+    drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
+    settings = replace(drawn, preset=preset(wanted.preset))
     recording = simulate_recording(settings, rng)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = camera_frames(settings, recording, rng.spawn(1)[0]) if wanted.video else None

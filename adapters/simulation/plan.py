@@ -9,6 +9,7 @@ from worldstate.errors import InvalidArgumentError
 
 from .kinds import vehicle_kind
 from .occlusions import occluded_scene
+from .presets import DEFAULT_PRESET, preset
 from .scene import MOVING_SITES, SITES
 
 MAX_RECORDINGS = 10_000
@@ -46,6 +47,8 @@ class DatasetSettings:
     video : bool
         Write what the camera sees, too; sound, detections and truth are the same with and without. Only for
         a standing ego at a junction.
+    preset : str
+        Name of the levels of everything that is not geometry.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class DatasetSettings:
     kind: str = "light"
     duration_s: float = 10.0
     video: bool = False
+    preset: str = DEFAULT_PRESET
 
     def __post_init__(self) -> None:
         in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
@@ -68,6 +72,7 @@ class DatasetSettings:
         in_range("seed", self.seed, 0, 2**63)
         in_range("duration_s", self.duration_s, 0.5, 60.0)
         vehicle_kind(self.kind)
+        preset(self.preset)
         if self.scene != JUNCTION:
             occluded_scene(self.scene)
         if self.n_dynamic and self.scene != JUNCTION:

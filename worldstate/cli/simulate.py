@@ -8,6 +8,7 @@ from worldstate.cli.progress import progress_bar
 
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
+PRESETS = ("street-5", "street-5-calm")
 
 DESCRIPTION = """\
 Simulate recordings of a vehicle with a roof array at blind junctions, in the OVAD layout: D/DataLog.csv and
@@ -46,6 +47,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--scene", choices=SCENES, default=SCENES[0], help="what hides the vehicle (default: %(default)s)"
     )
     parser.add_argument("--kind", choices=KINDS, default=KINDS[0], help="vehicle (default: %(default)s)")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default=PRESETS[0], help="how busy the street is (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
@@ -67,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         kind=arguments.kind,
         duration_s=arguments.duration,
         video=arguments.video,
+        preset=arguments.preset,
     )
     with progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
         rows = write_dataset(arguments.out, settings, jobs=arguments.jobs, progress=lambda row: bar.advance())
@@ -76,6 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         "approaches": sum(row.approach != "none" for row in rows),
         "scene": arguments.scene,
         "kind": arguments.kind,
+        "preset": arguments.preset,
         "seed": arguments.seed,
         "folders": [row.folder.as_posix() for row in rows],
     }
