@@ -43,11 +43,9 @@ class Recording:
         Such as ``"SA1"``: standing ego, junction A1. None where no log is there and the folder does not tell.
     label : str or None
         Side that the vehicle comes from, or ``"none"``.
-    t0_frame : int or None
-        Frame, from the start of the recording, in which the vehicle enters line of sight; None where there is
-        no vehicle or it is not known.
     logged_frame : int or None
-        T0 of the log as it stands: recordings without a vehicle have one too, at which nothing happens.
+        T0 of the log, frame number from the start; None where it is not known. Recordings without a vehicle
+        have one too, at which nothing happens.
 
     Examples
     --------
@@ -60,7 +58,6 @@ class Recording:
     recording_id: str
     environment: str | None = None
     label: Label | None = None
-    t0_frame: int | None = None
     logged_frame: int | None = None
 
     @classmethod
@@ -106,6 +103,11 @@ class Recording:
     def moving_ego(self) -> bool | None:
         """Whether the ego vehicle moves, None where not known."""
         return self.environment.startswith("D") if self.environment else None
+
+    @property
+    def t0_frame(self) -> int | None:
+        """Frame in which the vehicle enters line of sight; None without one, or where it is not known."""
+        return None if self.label == "none" else self.logged_frame
 
     @property
     def t0_s(self) -> float | None:
@@ -238,9 +240,7 @@ def _recording(log: Path, line: int, row: dict[str, str]) -> Recording:
     if not _is_label(label):
         raise InputFileError(log, f"line {line}: expected Class left, none or right, got {label!r}")
     folder = log.parent / environment / label / identifier
-    logged = _logged_frame(log, line, label, row["T0"])
-    entry = None if label == "none" else logged
-    return Recording(folder, identifier, environment, label, entry, logged)
+    return Recording(folder, identifier, environment, label, _logged_frame(log, line, label, row["T0"]))
 
 
 def _identifier(path: Path, line: int, text: str) -> str:

@@ -73,7 +73,7 @@ def test_no_detections_is_no_error(tmp_path: Path) -> None:
 def test_a_bare_folder_finds_its_log(tmp_path: Path) -> None:
     write_log(tmp_path, *ROWS)
     folder = write_sound(tmp_path / "DB2" / "right" / "3_08_0119")
-    assert Recording.open(folder) == Recording(folder, "3_08_0119", "DB2", "right", 58, 58)
+    assert Recording.open(folder) == Recording(folder, "3_08_0119", "DB2", "right", 58)
     assert Recording.open(folder / ".." / "3_08_0119").t0_s == 5.8
 
 

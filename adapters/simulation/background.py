@@ -14,9 +14,9 @@ Signal = NDArray[np.float32]
 
 FLUCTUATION_STEP_S = 1.0
 LOBES = 3
-# A distant vehicle swells and fades with these standard deviations; two of them off it is 9 dB down.
+# A distant vehicle swells and fades with these standard deviations; two of them off it is 17 dB down.
 FAR_WIDTH_S, FAR_AUDIBLE_S = (1.5, 4.0), 8.0
-FAR_RATE_PER_S, MAX_FAR = 10.0, 16
+FAR_SPAN_S, MAX_FAR = 10.0, 16  # the rate is that in so many seconds
 WIND_SLOPE = -2.2
 WIND_FLOOR_HZ = 20.0  # below, wind stays as it is there
 
@@ -128,6 +128,20 @@ def _ambient_waves(
 def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> Array:
     """Draw when distant vehicles are loudest: a Poisson process that knows nothing of the recording's ends.
 
+    Parameters
+    ----------
+    preset : Preset
+        Its rate.
+    duration_s : float
+        Of the recording.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    ndarray
+        Seconds from the start; as far before it and behind the end as a vehicle is heard.
+
     Examples
     --------
     >>> busy = Preset("busy", far_rate=10.0)
@@ -135,7 +149,7 @@ def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) 
     >>> bool(times_s.min() < 0.0 and times_s.max() > 2.0)
     True
     """
-    expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_RATE_PER_S
+    expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_SPAN_S
     number = min(int(rng.poisson(expected)), MAX_FAR)
     return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, number)
 

@@ -16,7 +16,7 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.atomic import atomic_path, write_text
-from worldstate.adapters.ovad_layout import AUDIO_NAME, DETECTION_NAMES, LOG_NAME
+from worldstate.adapters.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, LOG_NAME
 from worldstate.adapters.video import VIDEO_NAME
 from worldstate.checks import in_range
 from worldstate.errors import InputFileError
@@ -190,7 +190,7 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["ID", "Environment", "Class", "T0"])
+    writer.writerow(COLUMNS)
     writer.writerows([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
     write_text(Path(root) / LOG_NAME, text.getvalue())
 

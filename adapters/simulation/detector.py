@@ -16,7 +16,6 @@ from .vehicle import LENGTH_M, WIDTH_M, Trajectory
 
 Array = NDArray[np.float64]
 
-FRAME_RATE_HZ = 10.0
 ARRAY_HEIGHT_M = 1.7  # origin of `base_link` above the road: the array's centre on the roof
 LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs
 # Miss rates measured in the paper: 4 % at boresight, 14 % at 20-30 deg.

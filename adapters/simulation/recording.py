@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
 from worldstate.checks import in_range
 from worldstate.frontend.array import MicrophoneArray, roof_array_56
 
 from .background import add_background
 from .delay import KNOT_SAMPLES
-from .detector import ARRAY_HEIGHT_M, FRAME_RATE_HZ, Frame, detect, line_of_sight, park
+from .detector import ARRAY_HEIGHT_M, Frame, detect, line_of_sight, park
 from .driving import trajectories
 from .ego import ego_noise
 from .emission import Emission, MovingSource

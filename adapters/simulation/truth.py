@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
 
-from .detector import FRAME_RATE_HZ, line_of_sight
+from .detector import line_of_sight
 from .settings import SimulationSettings
 from .vehicle import Trajectory
 

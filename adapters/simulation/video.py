@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.vision_extra import opencv
 from worldstate.errors import InputFileError, InvalidArgumentError
 
-from .detector import FRAME_RATE_HZ, Frame
+from .detector import Frame
 from .recording import SimulatedRecording
 from .scene import Site
 from .settings import SimulationSettings

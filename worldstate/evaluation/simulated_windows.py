@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from worldstate.adapters.feature_extraction import WINDOW_S
 from worldstate.adapters.feature_table import FeatureTable
+from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.sample_windows import window_ends_s
 from worldstate.adapters.simulation import (
     SITES,
@@ -27,8 +28,6 @@ from worldstate.adapters.simulation import (
     preset,
     simulate_recording,
 )
-from worldstate.adapters.simulation.detector import FRAME_RATE_HZ
-from worldstate.adapters.simulation.scene import MOVING_SITES
 from worldstate.checks import in_range
 from worldstate.frontend.array import roof_array_56
 from worldstate.frontend.bins import band_bins
@@ -138,7 +137,7 @@ def _windows(levels: Preset, plan: WindowPlan) -> list[Row]:
     scene = _scene(plan, levels, rng)
     first_frame_s = ENTRY_S + float(rng.uniform(0.0, FRAME_S))
     audio = simulate_recording(scene, rng).audio
-    ends = window_ends_s(plan.approach, first_frame_s, plan.environment in MOVING_SITES)
+    ends = window_ends_s(plan.approach, first_frame_s, not scene.ego.stands)
     about = (plan.environment, str(plan.number))
     return [(window_feature(_cut(audio, end - WINDOW_S)), label, *about) for label, end in ends.items()]
 

@@ -10,8 +10,8 @@ from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.listen import line_of_sight
+from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation import SimulatedRecording
-from worldstate.adapters.simulation.detector import FRAME_RATE_HZ
 from worldstate.adapters.simulation.vehicle import LENGTH_M
 from worldstate.adapters.vision import VisionQuery
 from worldstate.evaluation.hop_stream import hop_stream
