@@ -94,7 +94,9 @@ class MicrophoneArray:
         return float(nearest_spacings_m(self.positions_m).mean())
 
     def alias_hz(self, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S) -> float:
-        """Frequency c / (2 d) up to which the mean spacing d samples every direction without aliasing, Hz.
+        """Frequency up to which the mean spacing d samples every direction without aliasing, Hz.
+
+        .. math:: f = c / (2 d)
 
         Parameters
         ----------
@@ -105,6 +107,11 @@ class MicrophoneArray:
         -------
         float
             Hz.
+
+        References
+        ----------
+        H. L. Van Trees, *Optimum Array Processing*, 2002, chapter 2 (half a wavelength between sensors); with
+        the mean spacing as in section IV of the paper.
 
         Examples
         --------
@@ -124,7 +131,9 @@ class MicrophoneArray:
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> NDArray[np.float64]:
-        """Far-field arrival time at every microphone relative to the origin, seconds, shape (..., M).
+        r"""Far-field arrival time at every microphone relative to the origin, seconds, shape (..., M).
+
+        .. math:: \tau_m(\theta, \phi) = -p_m^T u(\theta, \phi) / c
 
         Parameters
         ----------
@@ -137,6 +146,10 @@ class MicrophoneArray:
         -------
         ndarray, shape (..., M)
             Seconds; negative at microphones nearer to the source than the origin.
+
+        References
+        ----------
+        H. L. Van Trees, *Optimum Array Processing*, 2002, section 2.2.
 
         Examples
         --------
@@ -168,6 +181,10 @@ class MicrophoneArray:
         -------
         ndarray of complex128, shape (F, M, D)
             Of modulus one.
+
+        References
+        ----------
+        H. L. Van Trees, *Optimum Array Processing*, 2002, section 2.2.
 
         Examples
         --------

@@ -10,7 +10,11 @@ SILENCE = 1e-20
 
 
 def band_edges(bins: range, n_bands: int) -> NDArray[np.int64]:
-    """Edges of bands that grow by an equal ratio, at least one bin wide each.
+    r"""Edges of bands that grow by an equal ratio, at least one bin wide each.
+
+    .. math:: e_{b+1} = \max\big(e_b + 1,\; \mathrm{round}(e_b\, (e_B / e_b)^{1 / (B - b)})\big)
+
+    with e_0 the first bin and e_B the end.
 
     Parameters
     ----------
@@ -28,6 +32,11 @@ def band_edges(bins: range, n_bands: int) -> NDArray[np.int64]:
     ------
     InvalidArgumentError
         If there are fewer bins than bands.
+
+    References
+    ----------
+    Derived here: the ratio is taken anew at every edge, so that bands which had to be a whole bin wide leave
+    an equal ratio for the rest.
 
     Examples
     --------
@@ -62,6 +71,11 @@ def mean_square_per_bin(powers: NDArray[np.float32], nfft: int) -> NDArray[np.fl
     -------
     ndarray of float64, shape (bins,), in squared units of the samples
 
+    References
+    ----------
+    P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans. AU 15,
+    1967.
+
     Examples
     --------
     >>> mean_square_per_bin(np.full((2, 1, 3), 48.0, np.float32), nfft=16)
@@ -74,7 +88,9 @@ def mean_square_per_bin(powers: NDArray[np.float32], nfft: int) -> NDArray[np.fl
 def log_band_energy(
     mean_square: NDArray[np.float64], edges: NDArray[np.int64], first: int
 ) -> NDArray[np.float64]:
-    """Natural logarithm of the mean square in each band; silence is floored at 1e-20.
+    r"""Natural logarithm of the mean square in each band; silence is floored at 1e-20.
+
+    .. math:: L_b = \ln \max\Big(\sum_{k = e_b}^{e_{b+1} - 1} \overline{x^2}[k],\; 10^{-20}\Big)
 
     Parameters
     ----------
@@ -88,6 +104,10 @@ def log_band_energy(
     Returns
     -------
     ndarray of float64, shape (bands,), nats re one squared unit of the samples
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

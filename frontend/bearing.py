@@ -64,6 +64,11 @@ def bearing_std_rad(
     float
         Radians, at most the span over sqrt(12).
 
+    References
+    ----------
+    Derived here: the cosine from eq. (crbtheta) of the paper, the last term from a uniform distribution; the
+    root between them is empirical.
+
     Examples
     --------
     >>> cases = ((0, 3.0), (60, 3.0), (0, 1.05))
@@ -82,7 +87,11 @@ def bearing_std_rad(
 def strongest_bearing(
     spectrum: NDArray[np.float64], azimuths_rad: NDArray[np.float64], broadside_std_rad: float
 ) -> AcousticBearing:
-    """Read the highest peak of a spatial spectrum; in silence the middle, with the span's uncertainty.
+    r"""Read the highest peak of a spatial spectrum; in silence the middle, with the span's uncertainty.
+
+    .. math:: \hat\theta = \arg\max_\theta P(\theta), \qquad \rho = P(\hat\theta) / \mathrm{median}_\theta P
+
+    with the standard deviation of `bearing_std_rad`.
 
     Parameters
     ----------
@@ -95,6 +104,10 @@ def strongest_bearing(
     -------
     AcousticBearing
         Interpolated between the points of the grid.
+
+    References
+    ----------
+    J. DiBiase, H. Silverman and M. Brandstein 2001 (the bearing): see `worldstate.frontend.srp`.
 
     Examples
     --------
@@ -112,6 +125,9 @@ def bearing_of(
 ) -> AcousticBearing:
     """Take the first of the peaks that were found on a grid, highest first, for a bearing.
 
+    ``theta = theta_1`` with ``sigma = bearing_std_rad(theta_1, rho_1)``; in silence ``theta = (first + last)
+    / 2`` with ``sigma = span / sqrt(12)``.
+
     Parameters
     ----------
     peaks : sequence of Peak
@@ -125,6 +141,10 @@ def bearing_of(
     -------
     AcousticBearing
         In silence the middle of the grid, with its span's uncertainty.
+
+    References
+    ----------
+    From the definition; in silence the mean and deviation of a uniform distribution over the grid.
 
     Examples
     --------

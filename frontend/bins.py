@@ -6,7 +6,7 @@ from worldstate.errors import InvalidArgumentError
 
 
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
-    """Bins of a band by pyroomacoustics' rule: round(f / fs * nfft), upper end excluded.
+    """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded.
 
     Parameters
     ----------
@@ -27,6 +27,10 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
     InvalidArgumentError
         If the band is empty at this resolution or reaches beyond half the sample rate.
 
+    References
+    ----------
+    From the definition of the DFT; which bins count as in pyroomacoustics.
+
     Examples
     --------
     >>> band_bins((50, 1500), 47_998, 512), band_bins((300, 1800), 47_998, 512)
@@ -45,7 +49,7 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
 
 
 def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
-    """Centre frequencies of the bins, Hz, shape (bins,).
+    """Centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,).
 
     Parameters
     ----------
@@ -60,6 +64,10 @@ def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndar
     -------
     ndarray, shape (bins,)
         Hz.
+
+    References
+    ----------
+    From the definition of the DFT.
 
     Examples
     --------

@@ -46,7 +46,11 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
     Notes
     -----
     Small-error bound: below a threshold SNR the peak jumps to another lobe and the variance is far larger.
-    Source: Knapp and Carter 1976; G. C. Carter, "Coherence and time delay estimation", Proc. IEEE 75, 1987.
+
+    References
+    ----------
+    Eq. (crbtau) of the paper, after C. Knapp and G. C. Carter 1976 (see `gcc`) and G. C. Carter, "Coherence
+    and time delay estimation", Proc. IEEE 75, 1987.
 
     Examples
     --------
@@ -119,11 +123,11 @@ def bearing_crb_rad2(
     InvalidArgumentError
         On wrong shapes or values out of range.
 
-    Notes
-    -----
-    Sources: H. L. Van Trees, *Optimum Array Processing*, 2002, section 8.4; P. Stoica and A. Nehorai,
-    "Performance study of conditional and unconditional direction-of-arrival estimation", IEEE Trans. ASSP 38,
-    1990.
+    References
+    ----------
+    Eq. (crbtheta) of the paper; H. L. Van Trees, *Optimum Array Processing*, 2002, section 8.4; P. Stoica and
+    A. Nehorai, "Performance study of conditional and unconditional direction-of-arrival estimation", IEEE
+    Trans. ASSP 38, 1990.
 
     Examples
     --------
@@ -174,6 +178,11 @@ def bearing_information(
     InvalidArgumentError
         On wrong shapes or values out of range.
 
+    References
+    ----------
+    Van Trees 2002, Stoica and Nehorai 1990: see `bearing_crb_rad2`. The first entry, for an array in the y-z
+    plane, is the inverse of eq. (crbtheta) of the paper.
+
     Examples
     --------
     >>> bearing_information(0.1 * np.eye(3), 0.0, 1000.0, 10.0, 1).round(1)
@@ -220,6 +229,10 @@ def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> NDAr
     InvalidArgumentError
         If the microphones have no horizontal extent.
 
+    References
+    ----------
+    Corollary (cor:endfire) of the paper.
+
     Examples
     --------
     >>> across = [[0, -0.4, 0], [0, 0.0, 0.1], [0, 0.4, 0]]
@@ -251,6 +264,11 @@ def broadside_rad(positions_m: ArrayLike) -> float:
     ------
     InvalidArgumentError
         If the microphones have no horizontal extent.
+
+    References
+    ----------
+    Derived here: the information of eq. (crbtheta) of the paper is greatest where the bearing turns the wave
+    along the array's longest horizontal axis.
 
     Examples
     --------
@@ -292,9 +310,12 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
 
     Notes
     -----
-    For a real tone it holds away from 0 and half the sample rate, by a few times 1 / (N_s T_s). Source: D. C.
-    Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations", IEEE Trans.
-    IT 20, 1974.
+    For a real tone it holds away from 0 and half the sample rate, by a few times 1 / (N_s T_s).
+
+    References
+    ----------
+    D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations", IEEE
+    Trans. IT 20, 1974.
 
     Examples
     --------
@@ -335,7 +356,11 @@ def radial_speed_crb_m2_s2(
 
     Notes
     -----
-    The tone's own stability, not this bound, limits what one sees in a street. Source: the paper, section IV.
+    The tone's own stability, not this bound, limits what one sees in a street.
+
+    References
+    ----------
+    Section IV of the paper.
 
     Examples
     --------

@@ -51,7 +51,9 @@ def feature_steering(
     nfft: int = FEATURE_NFFT,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> Steering:
-    """Beams at the thirty published azimuths.
+    r"""Beams at the thirty published azimuths.
+
+    .. math:: w_k(\theta_i) = \overline{a_k(\theta_i)}, \qquad \theta_i = 90^\circ - i\, 180^\circ / 29
 
     Parameters
     ----------
@@ -71,6 +73,10 @@ def feature_steering(
     Steering
         Thirty directions, from left to right.
 
+    References
+    ----------
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+
     Examples
     --------
     >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).n_directions
@@ -81,7 +87,10 @@ def feature_steering(
 
 
 def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
-    """Complex sum over frames, bins and microphone pairs i < j: what running sums are made of.
+    r"""Complex sum over frames, bins and microphone pairs i < j: what running sums are made of.
+
+    .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
+              \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta)
 
     Parameters
     ----------
@@ -92,6 +101,10 @@ def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.
     Returns
     -------
     ndarray of complex128, shape (directions,)
+
+    References
+    ----------
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
 
     Examples
     --------
@@ -104,7 +117,9 @@ def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.
 
 
 def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
-    """Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already.
+    r"""Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already.
+
+    .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
 
     Parameters
     ----------
@@ -117,6 +132,10 @@ def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[
     -------
     ndarray of complex128, shape (directions,)
         As `pair_sum`.
+
+    References
+    ----------
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
 
     Examples
     --------
@@ -132,7 +151,9 @@ def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[
 def segment_feature(
     sums: Sequence[NDArray[np.complex128]], n_frames: int, n_bins: int, n_microphones: int
 ) -> NDArray[np.float64]:
-    """Modulus of summed pair sums, per frame, bin and pair.
+    r"""Modulus of summed pair sums, per frame, bin and pair.
+
+    .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_s S_s(\theta) \Big|, \qquad P = M (M - 1) / 2
 
     Parameters
     ----------
@@ -146,6 +167,10 @@ def segment_feature(
     ndarray of float64, shape (directions,)
         0..1.
 
+    References
+    ----------
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+
     Examples
     --------
     >>> segment_feature([np.array([3.0 + 0j]), np.array([4j])], n_frames=2, n_bins=1, n_microphones=2)
@@ -158,7 +183,10 @@ def segment_feature(
 def published_feature(
     window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float
 ) -> NDArray[np.float64]:
-    """Compute the feature of one whole window in the published way, its zero-padded edge frames included.
+    r"""Compute the feature of one whole window in the published way, its zero-padded edge frames included.
+
+    .. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
+              \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta) \Big|
 
     Parameters
     ----------
@@ -178,6 +206,10 @@ def published_feature(
     ------
     InvalidArgumentError
         On another shape, a window shorter than a frame, NaN or infinity.
+
+    References
+    ----------
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
 
     Examples
     --------

@@ -33,6 +33,11 @@ def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
     InvalidArgumentError
         If there are fewer than two bands or a value is not finite.
 
+    References
+    ----------
+    J. Aitchison, "The statistical analysis of compositional data", J. Roy. Statist. Soc. B 44, 1982 (centred
+    log-ratio).
+
     Examples
     --------
     >>> level_invariant_shape([1.0, 2.0, 6.0])
@@ -69,6 +74,10 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
     -----
     Sampling lifts it: without any difference its mean is about 1/(2n) + 1/(2m).
 
+    References
+    ----------
+    R. A. Fisher 1936, one band at a time: see `worldstate.frontend.fisher_profile`; section IV of the paper.
+
     Examples
     --------
     >>> fisher_profile([[3.0, 0.0], [5.0, 2.0]], [[0.0, 0.0], [2.0, 2.0]])
@@ -87,7 +96,9 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
 def discriminative_range_hz(
     profile: ArrayLike, edges_hz: ArrayLike, share: float = 0.5
 ) -> tuple[float, float]:
-    """Find the contiguous range of bands around the best one whose ratio is at least a share of it.
+    r"""Find the contiguous range of bands around the best one whose ratio is at least a share of it.
+
+    .. math:: F_b \ge s\, \max_{b'} F_{b'} \quad \text{for all bands } b \text{ of the range}
 
     Parameters
     ----------
@@ -107,6 +118,10 @@ def discriminative_range_hz(
     ------
     InvalidArgumentError
         On wrong shapes or values.
+
+    References
+    ----------
+    Derived here: section IV of the paper names such a range without a rule; a share of the peak is one.
 
     Examples
     --------

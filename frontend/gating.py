@@ -42,7 +42,9 @@ class GatingCurve:
     median_error_rad: NDArray[np.float64]
 
     def threshold_for(self, median_error_rad: float) -> float | NotUsable:
-        """Return the lowest threshold from which on the median error stays within the given one.
+        r"""Return the lowest threshold from which on the median error stays within the given one.
+
+        .. math:: \rho^* = \min\{\rho_0 : e(\rho) \le e_{max} \text{ for all } \rho \ge \rho_0\}
 
         Parameters
         ----------
@@ -53,6 +55,10 @@ class GatingCurve:
         -------
         float or NotUsable
             A prominence.
+
+        References
+        ----------
+        From the definition.
 
         Examples
         --------
@@ -67,7 +73,9 @@ class GatingCurve:
         return float(self.threshold[first])
 
     def at_coverage(self, share: float) -> tuple[float, float]:
-        """Return the highest threshold that keeps at least a share of the bearings, and the error there.
+        r"""Return the highest threshold that keeps at least a share of the bearings, and the error there.
+
+        .. math:: \rho^* = \max\{\rho_0 : c(\rho_0) \ge s\}
 
         Parameters
         ----------
@@ -84,6 +92,10 @@ class GatingCurve:
         InvalidArgumentError
             If the share is out of range.
 
+        References
+        ----------
+        From the definition.
+
         Examples
         --------
         >>> gating_curve([1.1, 1.2, 2.0, 3.0], [0.5, 0.25, 0.125, 0.125]).at_coverage(0.5)
@@ -95,7 +107,10 @@ class GatingCurve:
 
 
 def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int = 200) -> GatingCurve:
-    """Trade coverage for accuracy on bearings whose errors are known.
+    r"""Trade coverage for accuracy on bearings whose errors are known.
+
+    .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
+              e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
 
     Parameters
     ----------
@@ -115,6 +130,11 @@ def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int
     ------
     InvalidArgumentError
         On another shape, no bearings, NaN or infinity.
+
+    References
+    ----------
+    The results of the paper (gating by the peak-to-median ratio); C. K. Chow, "On optimum recognition error
+    and reject tradeoff", IEEE Trans. IT 16, 1970 (the curve).
 
     Examples
     --------

@@ -110,6 +110,10 @@ def pair_coherence(spectra: ArrayLike, pairs: ArrayLike) -> NDArray[np.float64]:
     InvalidArgumentError
         On a wrong shape, non-finite spectra or an index out of range.
 
+    References
+    ----------
+    G. C. Carter, "Coherence and time delay estimation", Proc. IEEE 75, 1987.
+
     Examples
     --------
     >>> x = np.exp(1j * np.arange(12)).reshape(3, 4, 1)
@@ -130,6 +134,9 @@ def gcc_delays(
     weighting: Weighting = "phat",
 ) -> PairDelays:
     r"""Estimate the delay of every pair, sub-sample, over the bins given.
+
+    .. math:: \hat\tau_{ij} = \arg\max_{|\tau| \le \tau_{max}}
+              \mathrm{Re} \sum_f \Psi(f)\, G_{ij}(f)\, e^{j 2\pi f \tau}
 
     Cross-spectra are averaged over frames first and weighted afterwards:
 
@@ -163,9 +170,9 @@ def gcc_delays(
         On wrong shapes or values, an unknown weighting, ``ml`` with a single frame, or a search range in
         which equally spaced bins repeat themselves (max_delay_s >= 1 / (2 bin spacing)).
 
-    Notes
-    -----
-    Source: Knapp and Carter 1976, eq. (7) and table I.
+    References
+    ----------
+    C. Knapp and G. C. Carter 1976, table I (the weightings): see `worldstate.frontend.gcc`.
 
     Examples
     --------

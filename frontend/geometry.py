@@ -30,6 +30,10 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
     -------
     ndarray, shape (..., 3)
 
+    References
+    ----------
+    From the definition: spherical coordinates on the axes of REP-103, 2010.
+
     Examples
     --------
     >>> direction_vectors([0.0, np.pi / 2]).round(6) + 0.0
@@ -44,7 +48,9 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
 
 
 def nearest_spacings_m(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance from every microphone to its nearest neighbour, metres.
+    r"""Distance from every microphone to its nearest neighbour, metres.
+
+    .. math:: d_m = \min_{j \ne m} \|p_m - p_j\|
 
     Parameters
     ----------
@@ -53,6 +59,10 @@ def nearest_spacings_m(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, shape (M,)
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------
@@ -65,7 +75,11 @@ def nearest_spacings_m(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def ambiguity(positions_m: NDArray[np.float64]) -> Ambiguity:
-    """Directions that an array of this shape cannot tell apart, whatever the algorithm.
+    r"""Directions that an array of this shape cannot tell apart, whatever the algorithm.
+
+    With the singular values :math:`s_1 \ge s_2 \ge s_3` of the centred positions and n the direction of the
+    last, an array is linear for :math:`s_2 < 10^{-3} s_1` and else planar for :math:`s_3 < 10^{-3} s_1`,
+    across the road for :math:`|n_x| > 0.985` and flat for :math:`|n_z| > 0.985`.
 
     A linear array knows only the angle to its axis (``cone``). A planar one cannot tell a direction from its
     mirror image in its own plane: ``front-back`` if it stands across the road, ``up-down`` if it lies flat,
@@ -79,6 +93,11 @@ def ambiguity(positions_m: NDArray[np.float64]) -> Ambiguity:
     -------
     str
         ``cone``, ``front-back``, ``up-down``, ``mirror`` or ``none``.
+
+    References
+    ----------
+    Derived here: delays hold u in the products p . u only, so that its part across a line or a plane shows
+    nowhere, or with either sign.
 
     Examples
     --------

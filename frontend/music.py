@@ -63,6 +63,10 @@ def covariance(spectra: ArrayLike) -> ComplexArray:
     InvalidArgumentError
         On a wrong shape, no frames or non-finite values.
 
+    References
+    ----------
+    R. O. Schmidt 1986: see `worldstate.frontend.music`.
+
     Examples
     --------
     >>> covariance([[[1, 1j]], [[1, 1j]]]).tolist()
@@ -97,6 +101,11 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
     InvalidArgumentError
         On a wrong shape, non-finite values or a dimension out of range.
 
+    References
+    ----------
+    R. O. Schmidt 1986: see `worldstate.frontend.music`; L. Sirovich, "Turbulence and the dynamics of coherent
+    structures", Quart. Appl. Math. 45, 1987 (the smaller eigenproblem).
+
     Examples
     --------
     >>> subspace = signal_subspace([[[2, 2j]], [[2, 2j]]], sources=1)
@@ -121,7 +130,9 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
 
 
 def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
-    """Signal subspace of given covariances by a full eigendecomposition.
+    r"""Signal subspace of given covariances by a full eigendecomposition.
+
+    .. math:: R\, e_i = \lambda_i e_i, \quad \lambda_i \le \lambda_{i+1}, \qquad E_s = [e_{M-k+1} \dots e_M]
 
     Parameters
     ----------
@@ -139,6 +150,10 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
     ------
     InvalidArgumentError
         On a wrong shape, non-finite values or a dimension out of range.
+
+    References
+    ----------
+    R. O. Schmidt 1986: see `worldstate.frontend.music`.
 
     Examples
     --------
@@ -176,6 +191,10 @@ def music_spectrum(
     ------
     InvalidArgumentError
         If the steering set does not fit the subspace or is not finite.
+
+    References
+    ----------
+    R. O. Schmidt 1986: see `worldstate.frontend.music`.
 
     Examples
     --------

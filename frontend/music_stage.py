@@ -94,7 +94,9 @@ class MusicStage:
         self._tracker = SubspaceTracker(sources)
 
     def push(self, spectra: NDArray[np.complex64], beams: Steering | None = None) -> None:
-        """Take the frames of a hop (frames, K, M), and their beams if they are whitened.
+        r"""Take the frames of a hop (frames, K, M), and their beams if they are whitened.
+
+        .. math:: R_k = \sum_{t \in window} x_{t,k}\, x_{t,k}^H
 
         Parameters
         ----------
@@ -102,6 +104,10 @@ class MusicStage:
             One hop.
         beams : Steering or None
             Where the spectra are whitened, the beams whitened alike.
+
+        References
+        ----------
+        R. O. Schmidt 1986: see `worldstate.frontend.music`.
         """
         by_bin = spectra.transpose(1, 0, 2)
         np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.open_slot())
@@ -109,7 +115,10 @@ class MusicStage:
         self._whitened = beams
 
     def read(self, mask: ChannelMask) -> MusicReading | NotUsable:
-        """Score the grid by the window so far, with the microphones of a mask.
+        r"""Score the grid by the window so far, with the microphones of a mask.
+
+        .. math:: P(\theta) = \frac1K \sum_k \frac{\min_{\theta'} D_k(\theta')}{D_k(\theta)}, \qquad
+                  D_k = \|a_k\|^2 - \|E_k^H a_k\|^2
 
         Parameters
         ----------
@@ -120,6 +129,10 @@ class MusicStage:
         -------
         MusicReading or NotUsable
             Not usable before the window is full.
+
+        References
+        ----------
+        R. O. Schmidt 1986: see `worldstate.frontend.music`.
         """
         if mask.n_kept <= self._sources:
             return NotUsable(f"{mask.n_kept} microphones left for {self._sources} sources")

@@ -51,7 +51,11 @@ class Nodes:
 
     @classmethod
     def of(cls, vectors: NDArray[np.complex128]) -> "Nodes | None":
-        """Choose for steering vectors (bins, M, directions); None where more than half would be needed.
+        r"""Choose for steering vectors (bins, M, directions); None where more than half would be needed.
+
+        .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta), \qquad s = G_{NN}^{-1} G_{N\theta}
+
+        with the kernel G of the module's head and N the directions chosen.
 
         Parameters
         ----------
@@ -62,6 +66,10 @@ class Nodes:
         -------
         Nodes or None
             None where more than half of the directions would be needed.
+
+        References
+        ----------
+        N. J. Higham 1990 (the pivoting): see `worldstate.frontend.nodes`.
         """
         count = vectors.shape[2]
         rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)

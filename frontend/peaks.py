@@ -36,7 +36,13 @@ class Peak:
 def find_peaks(
     spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int = 4, min_prominence: float = 1.0
 ) -> tuple[Peak, ...]:
-    """Find the highest local maxima, interpolated by a parabola through three grid points.
+    r"""Find the highest local maxima, interpolated by a parabola through three grid points.
+
+    With P at the grid point i of a maximum and at its neighbours,
+
+    .. math:: \delta = \frac{P_{i-1} - P_{i+1}}{2 (P_{i-1} - 2 P_i + P_{i+1})}, \qquad
+              \hat\theta = \theta_i + \delta\, \Delta\theta, \qquad
+              \hat P = P_i - \tfrac14 (P_{i-1} - P_{i+1})\, \delta.
 
     A spectrum without any height (silence) has no peak. A maximum at an end of the grid stays there.
 
@@ -60,6 +66,10 @@ def find_peaks(
     ------
     InvalidArgumentError
         On another shape, fewer than three points, NaN or infinity.
+
+    References
+    ----------
+    From the definition: the vertex of the parabola through three points.
 
     Examples
     --------

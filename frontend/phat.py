@@ -9,7 +9,7 @@ _POWER_FLOOR = np.float32(1e-30)
 
 
 def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Squared magnitude without the square root, same shape.
+    """Squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, without a square root, same shape.
 
     Parameters
     ----------
@@ -20,6 +20,10 @@ def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
     -------
     ndarray of float32, same shape
         |X|^2.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------
@@ -34,7 +38,7 @@ def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
 def whiten(
     spectra: NDArray[np.complex64], powers: NDArray[np.float32] | None = None
 ) -> NDArray[np.complex64]:
-    r"""Phase transform :math:`X / |X|`; bins without sound stay zero.
+    r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
 
     Parameters
     ----------
@@ -47,15 +51,15 @@ def whiten(
     ndarray of complex64, same shape
         Of modulus one or zero.
 
+    References
+    ----------
+    C. Knapp and G. C. Carter, "The generalized correlation method for estimation of time delay", IEEE Trans.
+    ASSP 24, 1976.
+
     Examples
     --------
     >>> whiten(np.array([3 + 4j, 0], np.complex64))
     array([0.6+0.8j, 0. +0.j ], dtype=complex64)
-
-    References
-    ----------
-    C. Knapp and G. Carter, The generalized correlation method for estimation of time delay, IEEE Trans.
-    ASSP, 1976.
     """
     squared = power(spectra) if powers is None else powers
     weights = np.maximum(squared, _POWER_FLOOR)

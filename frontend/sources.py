@@ -66,6 +66,11 @@ def count_sources(
     InvalidArgumentError
         On wrong shapes, negative eigenvalues, an unknown criterion, or MDL or AIC with T <= M.
 
+    References
+    ----------
+    M. Wax and T. Kailath 1985 (AIC, MDL), R. R. Nadakuditi and A. Edelman 2008 (few): see
+    `worldstate.frontend.sources`.
+
     Examples
     --------
     >>> count_sources([9.0, 1.1, 1.0, 0.9], frames=200)

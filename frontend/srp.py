@@ -22,7 +22,9 @@ from .steering import Steering
 
 
 def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
-    """Sum of beam powers over frames and bins: what running sums are made of.
+    r"""Sum of beam powers over frames and bins: what running sums are made of.
+
+    .. math:: S(\theta) = \sum_{t,k} \Big| \sum_m \overline{a_{k,m}(\theta)}\, Z_{t,k,m} \Big|^2
 
     Parameters
     ----------
@@ -33,6 +35,10 @@ def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArra
     Returns
     -------
     ndarray of float64, shape (directions,)
+
+    References
+    ----------
+    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.srp`.
 
     Examples
     --------
@@ -47,7 +53,9 @@ def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArra
 def normalised(
     total: NDArray[np.float64], n_frames: int, n_bins: int, n_microphones: int
 ) -> NDArray[np.float64]:
-    """Scale a sum of beam powers to 0..1; rounding below zero is cut.
+    r"""Scale a sum of beam powers to 0..1; rounding below zero is cut.
+
+    .. math:: P(\theta) = \frac{\max(S(\theta), 0)}{T K M^2}
 
     Parameters
     ----------
@@ -61,6 +69,10 @@ def normalised(
     ndarray of float64, shape (directions,)
         0..1.
 
+    References
+    ----------
+    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.srp`.
+
     Examples
     --------
     >>> normalised(np.array([8.0, 4.0]), n_frames=1, n_bins=2, n_microphones=2)
@@ -70,7 +82,10 @@ def normalised(
 
 
 def srp_phat(spectra: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
-    """SRP-PHAT of a set of frames, on the scale above.
+    r"""SRP-PHAT of a set of frames: 1 for a lone plane wave, 1/M for independent noise.
+
+    .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}
+              \Big| \sum_m \overline{a_{k,m}(\theta)}\, \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2
 
     Parameters
     ----------
@@ -87,6 +102,10 @@ def srp_phat(spectra: NDArray[np.complex64], steering: Steering) -> NDArray[np.f
     ------
     InvalidArgumentError
         If the spectra have other axes or another number of bins.
+
+    References
+    ----------
+    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.srp`.
 
     Examples
     --------

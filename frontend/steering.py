@@ -56,7 +56,9 @@ class Steering:
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> "Steering":
-        """Build the beams of an array at the given frequencies and directions.
+        r"""Build the beams of an array at the given frequencies and directions.
+
+        .. math:: W_k = \overline{A_k}, \qquad W_k \approx B_k C_k, \quad C_k = B_k^H W_k
 
         Parameters
         ----------
@@ -73,6 +75,11 @@ class Steering:
         -------
         Steering
             In coordinates centred on the array.
+
+        References
+        ----------
+        H. L. Van Trees, *Optimum Array Processing*, 2002, section 2.2 (steering vectors); the factors by
+        Gram-Schmidt with pivoting, cut at the precision of complex64.
         """
         centred = MicrophoneArray(array.centred_m)
         weights = centred.steering(frequencies_hz, azimuths_rad, elevations_rad, speed_of_sound_m_s).conj()
@@ -91,7 +98,9 @@ class Steering:
         return int(self.weights.shape[2])
 
     def covariance(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
+        r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
+
+        .. math:: Q_k = \sum_t (B_k^T x_{t,k}) (B_k^T x_{t,k})^H
 
         Parameters
         ----------
@@ -102,13 +111,17 @@ class Steering:
         -------
         ndarray of complex64, shape (bins, r, r)
             Hermitian.
+
+        References
+        ----------
+        From the definition.
         """
         by_bin = spectra.transpose(1, 0, 2)
         projected = by_bin if self.basis is None else by_bin @ self.basis
         return cross_spectra(projected)
 
     def compress(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        r"""Write R as :math:`B^T R \overline{B}` in the basis: (bins, M, M) -> (bins, r, r).
+        r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r).
 
         Parameters
         ----------
@@ -119,13 +132,19 @@ class Steering:
         -------
         ndarray of complex64, shape (bins, r, r)
             The same where there is no basis.
+
+        References
+        ----------
+        Derived here: W = B C turns a form in W into one in C.
         """
         if self.basis is None:
             return matrices
         return np.asarray(self.basis.transpose(0, 2, 1) @ (matrices @ self.basis.conj()))
 
     def quadratic_form(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex128]:
-        r"""Sum :math:`C_k(\theta)^T Q_k \overline{C_k(\theta)}` over bins, (bins, r, r) -> (directions,).
+        r"""Sum quadratic forms of the beams over bins, (bins, r, r) -> (directions,).
+
+        .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
 
         Parameters
         ----------
@@ -136,6 +155,10 @@ class Steering:
         -------
         ndarray of complex128, shape (directions,)
             Real for Hermitian matrices.
+
+        References
+        ----------
+        From the definition of beam power; at most directions by the `nodes`, exact to single precision.
         """
         beams = self if self.nodes is None else self.nodes
         products = matrices @ beams.conjugate
@@ -144,7 +167,9 @@ class Steering:
         return total if self.nodes is None else total @ self.nodes.spread
 
     def power_within(self, vectors: NDArray[np.complex64]) -> NDArray[np.float64]:
-        r"""Power :math:`\|E_k^H a_k(\theta)\|^2` within columns (bins, M, k), -> (bins, directions).
+        r"""Power within columns (bins, M, k), -> (bins, directions).
+
+        .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
 
         Parameters
         ----------
@@ -155,6 +180,10 @@ class Steering:
         -------
         ndarray of float64, shape (bins, directions)
             From 0 to M.
+
+        References
+        ----------
+        From the definition of a projection; R. O. Schmidt 1986 for its use.
         """
         beams = self if self.nodes is None else self.nodes
         rows = vectors.transpose(0, 2, 1)
@@ -163,7 +192,9 @@ class Steering:
         return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
 
     def squared_lengths(self, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
-        r"""Length :math:`\|a_k(\theta)\|^2` over the microphones kept (M,), (bins, directions).
+        r"""Squared length of steering vectors over the microphones kept (M,), (bins, directions).
+
+        .. math:: \|a_k(\theta)\|^2 = \sum_{m \in kept} |a_{k,m}(\theta)|^2
 
         Parameters
         ----------
@@ -174,6 +205,10 @@ class Steering:
         -------
         ndarray of float64, shape (bins, directions)
             Their number, where beams are not whitened.
+
+        References
+        ----------
+        From the definition.
         """
         if self.basis is None:
             kept = self.weights[:, keep]
@@ -208,7 +243,9 @@ class NodeBeams:
 
     @classmethod
     def of(cls, weights: NDArray[np.complex128]) -> "NodeBeams | None":
-        """Choose them for all directions (bins, r or M, directions).
+        r"""Choose them for all directions (bins, r or M, directions).
+
+        .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta)
 
         Parameters
         ----------
@@ -219,6 +256,10 @@ class NodeBeams:
         -------
         NodeBeams or None
             None where too many would be needed.
+
+        References
+        ----------
+        N. J. Higham 1990: see `worldstate.frontend.nodes`.
         """
         nodes = Nodes.of(weights)
         if nodes is None:
@@ -251,7 +292,7 @@ def _thin_basis(weights: NDArray[np.complex128], max_rank: int) -> NDArray[np.co
 
 
 def cross_spectra(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    r"""Sum over frames of :math:`x_i \overline{x_j}`, (bins, frames, M) -> (bins, M, M).
+    r"""Sum over frames :math:`R_{ij} = \sum_t x_{t,i} \overline{x_{t,j}}`, (bins, frames, M) -> (bins, M, M).
 
     Parameters
     ----------
@@ -262,6 +303,10 @@ def cross_spectra(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
     -------
     ndarray of complex64, shape (bins, M, M)
         Hermitian.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

@@ -54,7 +54,9 @@ class StreamingStft:
         self._previous: NDArray[np.float32] | None = None
 
     def push(self, samples: NDArray[np.float32]) -> NDArray[np.complex64]:
-        """Take the next samples, give the frames that they complete.
+        r"""Take the next samples, give the frames that they complete.
+
+        .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N}
 
         Parameters
         ----------
@@ -64,6 +66,11 @@ class StreamingStft:
         Returns
         -------
         ndarray of complex64, shape (frames, bins, M)
+
+        References
+        ----------
+        J. B. Allen and L. R. Rabiner, "A unified approach to short-time Fourier analysis and synthesis",
+        Proc. IEEE 65, 1977; the window as three taps: F. J. Harris, Proc. IEEE 66, 1978.
         """
         halves = self._halves(samples)
         if halves is None:

@@ -80,7 +80,12 @@ class SubspaceTracker:
         self.full_decompositions = 0
 
     def update(self, covariance: ArrayLike) -> Subspace:
-        """Return the signal subspace of this covariance, starting from the last one.
+        r"""Return the signal subspace of this covariance, starting from the last one.
+
+        .. math:: V \leftarrow \mathrm{Ritz}\big(T_m(2 R / c - I)\, [V, r]\big), \qquad
+                  \sin\angle(e, E_s) \le \frac{\|R e - \lambda e\|}{\lambda_k - \lambda_{k+1}}
+
+        with the Chebyshev polynomial T_m, the edge of the noise c and the probe r.
 
         Parameters
         ----------
@@ -96,11 +101,17 @@ class SubspaceTracker:
         ------
         InvalidArgumentError
             On a wrong shape or non-finite values.
+
+        References
+        ----------
+        Y. Zhou et al. 2006 (the filter), C. Davis and W. Kahan 1970 (the bound): see `SubspaceTracker`.
         """
         return self.follow(checked_covariance(covariance, self._sources))
 
     def follow(self, R: ComplexArray) -> Subspace:
-        """Do what `update` does, unchecked.
+        r"""Do what `update` does, unchecked.
+
+        .. math:: V \leftarrow \mathrm{Ritz}\big(T_m(2 R / c - I)\, [V, r]\big)
 
         Parameters
         ----------
@@ -111,6 +122,10 @@ class SubspaceTracker:
         -------
         Subspace
             As `update`.
+
+        References
+        ----------
+        Y. Zhou et al. 2006 (the filter), C. Davis and W. Kahan 1970 (the bound): see `SubspaceTracker`.
         """
         width = min(self._sources + self._guard, R.shape[1] - 1)
         if self._basis is None or self._values is None or self._basis.shape != (len(R), width, R.shape[1]):
