@@ -83,7 +83,10 @@ class HarmonicSettings:
 def spectrum_and_floor(
     frames: FloatArray, rate: float, settings: HarmonicSettings
 ) -> tuple[FloatArray, FloatArray]:
-    """Powers of zero-padded windows and the noise under them, both (K, bins), up to the highest tooth.
+    r"""Powers of zero-padded windows and the noise under them, both (K, bins), up to the highest tooth.
+
+    .. math:: P_k[b] = \Big| \sum_n x_k[n]\, e^{-j 2\pi b n / 4N} \Big|^2, \qquad
+              \nu_k[b] = \frac{1}{\ln 2}\, \mathrm{median}_{b'}\, P_k[b'] \text{ around } b
 
     Parameters
     ----------
@@ -98,6 +101,11 @@ def spectrum_and_floor(
     -------
     powers, floor : ndarray, shape (K, bins)
         Squared magnitudes, in the units of the windows squared.
+
+    References
+    ----------
+    H. Rohling, "Radar CFAR thresholding in clutter and multiple target situations", IEEE Trans. AES 19, 1983
+    (ordered statistics as a floor); ln 2 is the median of an exponential variable of mean one.
 
     Examples
     --------
@@ -119,7 +127,12 @@ def spectrum_and_floor(
 
 
 def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> FloatArray:
-    """Most evident track of the fundamental on a logarithmic grid, (K,) in Hz.
+    r"""Most evident track of the fundamental on a logarithmic grid, (K,) in Hz.
+
+    .. math:: \hat f = \arg\max_{f_1 .. f_K} \sum_k \Big[ Q_k(f_k) - \frac{(i_k - i_{k-1})^2}{r^2} \Big],
+              \qquad |i_k - i_{k-1}| \le r
+
+    with Q of the module's head, i_k the place of f_k on the grid, and r the largest change in a hop.
 
     Parameters
     ----------
@@ -134,6 +147,10 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
     -------
     ndarray, shape (K,)
         Hz.
+
+    References
+    ----------
+    A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the path): see `worldstate.frontend.comb`.
 
     Examples
     --------

@@ -62,7 +62,9 @@ class Decimator:
         self._waiting: NDArray[np.float64] = np.empty(0)
 
     def push(self, samples: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Take the next samples (n,), give the outputs that they complete.
+        r"""Take the next samples (n,), give the outputs that they complete.
+
+        .. math:: y[m] = \sum_n h[n]\, x[m D + n]
 
         Parameters
         ----------
@@ -73,6 +75,10 @@ class Decimator:
         -------
         ndarray of float64
             At the lower rate; empty where none is complete.
+
+        References
+        ----------
+        From the definition; h by J. F. Kaiser 1974: see `Decimator`.
         """
         waiting = np.concatenate([self._waiting, samples])
         n_out = max((len(waiting) - self.n_taps) // self.factor + 1, 0)

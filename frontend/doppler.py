@@ -171,7 +171,11 @@ def radial_speed(
     An engine whose speed falls along an S-curve while its vehicle passes reads as a faster vehicle: line and
     level alone cannot tell the two apart (5 of 100 simulated run-downs by 10 % within a passage, none of 100
     at the kerb).
-    Source: section IV of the paper; BIC by G. Schwarz, Ann. Statist. 6, 1978.
+
+    References
+    ----------
+    Section IV of the paper; the S-curve: see `worldstate.frontend.scurve`; BIC: G. Schwarz, "Estimating the
+    dimension of a model", Ann. Statist. 6, 1978.
 
     Examples
     --------
@@ -236,6 +240,11 @@ def radial_speed_from_rest(
     ------
     InvalidArgumentError
         On values out of range.
+
+    References
+    ----------
+    P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.2 (the shift of a moving source,
+    solved for its speed); the variance to first order in the errors.
 
     Examples
     --------

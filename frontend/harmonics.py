@@ -68,7 +68,12 @@ class HarmonicTrack:
 def track_fundamental(
     samples: ArrayLike, sample_rate_hz: float, settings: HarmonicSettings | None = None
 ) -> HarmonicTrack:
-    """Track the fundamental of the strongest harmonic comb in one channel.
+    r"""Track the fundamental of the strongest harmonic comb in one channel.
+
+    .. math:: f^{(0)} = \arg\max_{f_1 .. f_K} \sum_k Q_k(f_k), \qquad
+              f_k = \frac{\sum_h h f_{k,h} / \sigma_{k,h}^2}{\sum_h h^2 / \sigma_{k,h}^2}
+
+    with the evidence Q of `comb.best_path` and the teeth f_h of `lines.measure_fundamental`.
 
     Parameters
     ----------
@@ -89,9 +94,10 @@ def track_fundamental(
     InvalidArgumentError
         On a wrong shape, too few samples, non-finite values or too low a sample rate.
 
-    Notes
-    -----
-    Equations and sources: at the head of `comb` and `lines`.
+    References
+    ----------
+    A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the track), D. C. Rife and R. R. Boorstyn 1974 (the
+    teeth): see `worldstate.frontend.comb` and `worldstate.frontend.lines`.
 
     Examples
     --------

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
-    """Sample at which hop `index` (from 1) ends: floor(index * rate / hops a second + 1/2).
+    """Sample at which hop k, `index`, ends: ``n_k = floor(k fs / r + 1/2)`` with r hops a second.
 
     Parameters
     ----------
@@ -22,6 +22,10 @@ def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
     -------
     int
         Number of samples up to there.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

@@ -46,7 +46,9 @@ class LevelMeter:
     def push(
         self, samples: NDArray[np.float32], keep: NDArray[np.bool_] | None = None
     ) -> NDArray[np.float64]:
-        """Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame.
+        r"""Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame.
+
+        .. math:: L_b = \ln \sum_{k \in b} \overline{x^2}[k]
 
         Of the picked microphones those count that are to be kept (M,), all if none of them is.
 
@@ -61,6 +63,10 @@ class LevelMeter:
         -------
         ndarray of float64, shape (bands,)
             ln mean square per band.
+
+        References
+        ----------
+        P. D. Welch 1967: see `worldstate.frontend.bands.mean_square_per_bin`.
         """
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         kept = None if keep is None else keep[self._channels]

@@ -90,7 +90,10 @@ class Windows:
 def measure_fundamental(
     windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray, settings: HarmonicSettings
 ) -> Fundamental:
-    """Refine a track of the fundamental from all its teeth.
+    r"""Refine a track of the fundamental from all its teeth.
+
+    .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
+              \mathrm{var}(\hat f) = \frac{\max(\chi^2, 1)}{\sum_h h^2 / \sigma_h^2}
 
     Parameters
     ----------
@@ -105,6 +108,11 @@ def measure_fundamental(
     -------
     Fundamental
         One value a window.
+
+    References
+    ----------
+    Weighted least squares, from the definition; sigma_h is the first-order error of the maximum of D. C. Rife
+    and R. R. Boorstyn 1974: see `worldstate.frontend.lines`.
 
     Examples
     --------

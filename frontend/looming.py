@@ -71,8 +71,12 @@ class Looming:
 def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Looming | NotUsable:
     r"""Fit both readings to one window of band energies.
 
-    The line d(t) = a + b t through :math:`E^{-1/2}` is weighted by the square of the exponential fit, for
-    log E scatters evenly and E^(-1/2) in proportion to itself; then 1/TTA = -b/a at t = 0.
+    .. math:: E^{-1/2}(t) \propto a + b\, t, \quad
+              \frac{1}{\mathrm{TTA}} = -\frac{b}{a} \text{ at } t = 0, \qquad
+              \frac{d}{dt} \log E = \frac{2}{\mathrm{TTA}}
+
+    The line through :math:`E^{-1/2}` is weighted by the square of the exponential fit, for log E scatters
+    evenly and E^(-1/2) in proportion to itself.
 
     Parameters
     ----------
@@ -94,6 +98,11 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
     ------
     InvalidArgumentError
         On fewer than four points, another shape, unsorted times or numbers that are not finite.
+
+    References
+    ----------
+    Eq. (looming) of the paper, after D. Lee 1976: see `worldstate.frontend.looming`. The line is derived
+    here: E goes as the inverse square of the range, which changes evenly at constant speed.
 
     Examples
     --------

@@ -59,7 +59,9 @@ class RateEstimate:
 def rate_from_duration(
     n_samples: int, duration_s: float, duration_std_s: float, nominal_hz: float
 ) -> RateEstimate:
-    """Sample rate from the length of a recording by another clock, such as a camera's.
+    r"""Sample rate from the length of a recording by another clock, such as a camera's.
+
+    .. math:: \hat f_s = n / T, \qquad \sigma_{\hat f} = \hat f_s\, \sigma_T / T
 
     Parameters
     ----------
@@ -79,6 +81,10 @@ def rate_from_duration(
     ------
     InvalidArgumentError
         If a duration is not positive.
+
+    References
+    ----------
+    From the definition; the deviation to first order in the error of T.
 
     Examples
     --------
@@ -117,7 +123,10 @@ class SampleClock:
         self._tt = self._te = self._ee = 0.0
 
     def read(self, n_samples: int, captured_ns: int) -> None:
-        """Take the time at which sample number `n_samples` was captured.
+        r"""Take the time at which sample number `n_samples` was captured.
+
+        .. math:: \bar t \leftarrow \bar t + \frac{t - \bar t}{n}, \qquad
+                  S_{te} \leftarrow S_{te} + (t - \bar t_{old}) (e - \bar e_{new}), \qquad e = n_t - f_{nom} t
 
         Parameters
         ----------
@@ -130,6 +139,11 @@ class SampleClock:
         ------
         InvalidArgumentError
             If either clock runs backwards.
+
+        References
+        ----------
+        B. P. Welford, "Note on a method for calculating corrected sums of squares and products",
+        Technometrics 4, 1962.
         """
         if self._origin is None:
             self._origin = n_samples, captured_ns
@@ -153,12 +167,19 @@ class SampleClock:
         self._ee += de * (e - self._mean_e)
 
     def estimate(self) -> RateEstimate | NotUsable:
-        """Return the rate so far; at least ten readings at different times.
+        r"""Return the rate so far; at least ten readings at different times.
+
+        .. math:: \hat f_s = f_{nom} + \frac{S_{te}}{S_{tt}}, \qquad
+                  \sigma^2 = \frac{S_{ee} - S_{te}^2 / S_{tt}}{(n - 2)\, S_{tt}}
 
         Returns
         -------
         RateEstimate or NotUsable
             Hz, with its standard deviation.
+
+        References
+        ----------
+        N. Draper and H. Smith, *Applied Regression Analysis*, 1966, chapter 1 (the straight line).
         """
         if self._n < _MIN_READINGS or self._tt <= 0.0:
             return NotUsable(f"needs {_MIN_READINGS} readings of a clock, got {self._n}")

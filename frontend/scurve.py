@@ -56,7 +56,10 @@ class PassBy:
 def radial_speed_m_s(
     time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float, sound_m_s: float
 ) -> FloatArray:
-    """Radial speed at emission of what is heard at each time, positive while receding, shape of `time_s`.
+    r"""Radial speed at emission of what is heard at each time, positive while receding, shape of `time_s`.
+
+    .. math:: v_r = \frac{v^2 s}{\sqrt{d^2 + v^2 s^2}}, \qquad
+              s = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}, \quad T = t - \tau_0
 
     Parameters
     ----------
@@ -71,6 +74,10 @@ def radial_speed_m_s(
     -------
     ndarray, shape of `time_s`
         m/s.
+
+    References
+    ----------
+    P. M. Morse and K. U. Ingard 1968, section 11.2: see `worldstate.frontend.scurve`.
 
     Examples
     --------
@@ -90,7 +97,11 @@ def fit_pass_by(
     max_speed_m_s: float,
     sound_m_s: float,
 ) -> PassBy:
-    """Fit the four parameters by weighted least squares from several starting points.
+    r"""Fit the four parameters by weighted least squares from several starting points.
+
+    .. math:: \chi^2 = \min_{f_0, v, \tau_0, d} \sum_k
+              \frac{\big[f_0 / (1 + v_r(t_k) / c) - f_k\big]^2}{\sigma_k^2}, \qquad
+              \mathrm{cov} = (J^T J)^{-1}
 
     Parameters
     ----------
@@ -105,6 +116,11 @@ def fit_pass_by(
     -------
     PassBy
         The best of all starting points.
+
+    References
+    ----------
+    S. M. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*, 1993, chapter 8 (least
+    squares).
 
     Examples
     --------
@@ -136,7 +152,10 @@ def fit_pass_by(
 
 
 def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: float) -> FloatArray:
-    """Differentiate the radial speed by (f_0, v, tau_0, d), (K, 4), centrally.
+    r"""Differentiate the radial speed by (f_0, v, tau_0, d), (K, 4), centrally.
+
+    .. math:: \frac{\partial v_r}{\partial p_i} \approx \frac{v_r(p + h_i) - v_r(p - h_i)}{2 h_i}, \qquad
+              h_i = 10^{-5} \max(1, |p_i|)
 
     Parameters
     ----------
@@ -151,6 +170,10 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: flo
     -------
     ndarray, shape (K, 4)
         m/s per unit of each parameter.
+
+    References
+    ----------
+    From the definition: central differences; f_0 does not enter.
 
     Examples
     --------

@@ -138,20 +138,32 @@ class FrontEndSettings:
     def azimuths_rad(self) -> NDArray[np.float64]:
         """Grid of azimuths, ascending from right to left, radians, shape (A,).
 
+        ``theta_i = first + i step``
+
         Returns
         -------
         ndarray, shape (A,)
             Radians.
+
+        References
+        ----------
+        From the definition.
         """
         return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
 
     def elevations_rad(self) -> NDArray[np.float64]:
         """Grid of elevations, ascending, radians, shape (E,).
 
+        ``phi_i = first + i step``
+
         Returns
         -------
         ndarray, shape (E,)
             Radians.
+
+        References
+        ----------
+        From the definition.
 
         Examples
         --------
@@ -163,10 +175,16 @@ class FrontEndSettings:
     def directions_rad(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Azimuth and elevation of every direction, row by row of elevations, shape (E * A,) each.
 
+        ``(theta, phi)_i = (theta_(i mod A), phi_(i div A))``
+
         Returns
         -------
         azimuths, elevations : ndarray, shape (E * A,)
             Radians.
+
+        References
+        ----------
+        From the definition.
         """
         azimuths, elevations = np.meshgrid(self.azimuths_rad(), self.elevations_rad())
         return azimuths.ravel(), elevations.ravel()

@@ -126,7 +126,11 @@ class ToneStage:
         self._spectrum = _Spectrum(len(self._heard), self._rate, band_hz)
 
     def push(self, samples: NDArray[np.float32], mask: ChannelMask) -> None:
-        """Take the samples of a hop (n, M), of which the microphones of a mask count.
+        r"""Take the samples of a hop (n, M), of which the microphones of a mask count.
+
+        .. math:: y[m] = \sum_n h[n]\, \frac1{|C|} \sum_{i \in C} x_i[m D + n]
+
+        over the microphones C next to the middle.
 
         Parameters
         ----------
@@ -134,6 +138,10 @@ class ToneStage:
             One hop.
         mask : ChannelMask
             Microphones that count.
+
+        References
+        ----------
+        From the definition; h and D as in `Decimator`, after J. F. Kaiser 1974.
         """
         if not np.array_equal(mask.keep, self._keep):
             self._weights, self._keep = self._mean_of(mask.keep)
@@ -143,12 +151,22 @@ class ToneStage:
         self._heard = np.concatenate([self._heard, new])[len(new) :]
 
     def read(self) -> ToneReading | NotUsable:
-        """Fit the line of the window that ends with the last hop.
+        r"""Fit the line of the window that ends with the last hop.
+
+        .. math:: \hat f = \arg\max_f \; y^H H (H^H H)^{-1} H^H y, \qquad
+                  \eta = \frac{|\hat A|^2}{2 \hat\sigma^2}, \qquad
+                  \sigma_f^2 = \frac{12\, f_s^2}{(2\pi)^2\, \eta\, N (N^2 - 1)}
+
+        where :math:`\eta N / 2 > 18`.
 
         Returns
         -------
         ToneReading or NotUsable
             Not usable before the window is full, and where no line stands out.
+
+        References
+        ----------
+        D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.tone`.
         """
         if self._n_out < len(self._heard):
             return NotUsable(f"needs {len(self._heard) / self._rate:.2f} s of sound")
