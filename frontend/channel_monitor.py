@@ -79,7 +79,15 @@ class ChannelMonitor:
         energies: NDArray[np.float64],
         matrices: NDArray[np.complex64],
     ) -> ArrayHealth:
-        """Take one hop, say which channels count in it and why.
+        r"""Take one hop, say which channels count in it and why.
+
+        A channel counts unless it has one of `MASKED_FAULTS` or is silent, breaks off or crackles in this
+        hop: with its mean squares E over those of the median living channel and its peak-to-peak s over the
+        usual one,
+
+        .. math:: \langle E_{tm} / \tilde E_t \rangle_t < 10^{-3}, \qquad
+                  \min_t E_{tm} / \tilde E_t < 10^{-5}, \qquad
+                  s_m / \bar s_m > 4\, \mathrm{median}_j\, (s_j / \bar s_j).
 
         Parameters
         ----------
@@ -93,6 +101,11 @@ class ChannelMonitor:
         -------
         ArrayHealth
             As of the end of this hop.
+
+        References
+        ----------
+        Derived here: all microphones hear the same sound, so that each is held against the median of the
+        others.
         """
         lowest, highest = _extremes(samples)
         span = highest - lowest

@@ -180,7 +180,12 @@ class EgoNoise:
         return self._covariance.n_frames
 
     def process(self, spectra: NDArray[np.complex64]) -> list[tuple[NDArray[np.complex64], Steering]]:
-        """Cancel, learn and whiten the frames of a hop (frames, bins, M), phase transform included.
+        r"""Cancel, learn and whiten the frames of a hop (frames, bins, M), phase transform included.
+
+        .. math:: y = \hat R^{-1/2}\, (x - \ell), \qquad Z_m = y_m / |y_m|
+
+        with the lines l of the engine and the covariance R learned so far, shrunk as far as it is the
+        street's.
 
         Parameters
         ----------
@@ -191,6 +196,11 @@ class EgoNoise:
         -------
         list of (ndarray of complex64, shape (frames, its bins, M), Steering)
             For each set of beams.
+
+        References
+        ----------
+        K. Nakamura et al. 2009 (whitening), B. Widrow et al. 1975 (cancelling), Y. Chen et al. 2010
+        (shrinkage): see `worldstate.frontend.prewhitening` and `worldstate.frontend.harmonic_cancellation`.
         """
         heard = spectra[:, self._bins]
         if self.engine is not None:
@@ -203,7 +213,12 @@ class EgoNoise:
         return [(whitened[:, bins], beams.steering if used else beams.plain) for bins, beams in both]
 
     def levelled(self, power: NDArray[np.float64], n_frames: int) -> NDArray[np.float64]:
-        """Divide a hop's steered power by the level that whitened noise had while it was learned.
+        r"""Divide a hop's steered power by the level that whitened noise had while it was learned.
+
+        .. math:: P'(\theta) = P(\theta) / c^{\,u}, \qquad
+                  c = \Big\langle \frac{\langle P \rangle_\theta}{T K M} \Big\rangle_{\text{learned hops}}
+
+        with u in [0, 1], how far what was learned is used.
 
         Parameters
         ----------
@@ -216,6 +231,11 @@ class EgoNoise:
         -------
         ndarray of float64, shape (directions,)
             White noise of unit modulus has M in every frame and bin. As it was where nothing is whitened.
+
+        References
+        ----------
+        H. M. Finn and R. S. Johnson, "Adaptive detection mode with threshold control as a function of
+        spatially sampled clutter-level estimates", RCA Review 29, 1968 (constant false-alarm rate).
         """
         if not self._aim_frames or not self.from_below:
             return power

@@ -64,7 +64,13 @@ class FromBelow:
         frequencies_hz: ArrayLike,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> "FromBelow":
-        """Make the model fields of an array at the frequencies of its bins.
+        r"""Make the model fields of an array at the frequencies of its bins.
+
+        .. math:: \Gamma = \langle a a^H \rangle \text{ off the diagonal}, \qquad
+                  w_b = G_{ss} \Gamma^b - G_{bs} \Gamma^s, \quad w_s = G_{bb} \Gamma^s - G_{bs} \Gamma^b
+
+        over the directions of each field, with G their inner products: w of R is the power times the
+        determinant.
 
         Parameters
         ----------
@@ -79,6 +85,11 @@ class FromBelow:
         -------
         FromBelow
             For covariances of these bins.
+
+        References
+        ----------
+        B. F. Cron and C. H. Sherman 1962 (model fields): see `worldstate.frontend.from_below`; the normal
+        equations of least squares, by Cramer's rule.
         """
         b, s = (_field(array, frequencies_hz, el, speed_of_sound_m_s) for el in (_BELOW_DEG, _STREET_DEG))
         bb, ss, bs = (np.einsum("kn,kn->k", x, y)[:, None] for x, y in ((b, b), (s, s), (b, s)))
@@ -89,7 +100,9 @@ class FromBelow:
         return cls(below, street, can_tell=contrast >= _LEAST_CONTRAST)
 
     def powers(self, covariance: NDArray[np.complex64]) -> NDArray[np.float64]:
-        """Return the two sums of q, from below and from the street; an array that cannot tell says below.
+        r"""Return the two sums of q, from below and from the street; an array that cannot tell says below.
+
+        .. math:: P_b = \sum_k \Delta_k\, \hat p_{b,k}, \qquad P_s = \sum_k \Delta_k\, \hat p_{s,k}
 
         Parameters
         ----------
@@ -100,6 +113,11 @@ class FromBelow:
         -------
         ndarray of float64, shape (2,)
             By chance they may be negative.
+
+        References
+        ----------
+        Least squares from the definition, over the fields of B. F. Cron and C. H. Sherman 1962; weighting by
+        the determinant derived here: a bin in which the fields look alike says nothing.
         """
         if not self.can_tell:
             return np.array([1.0, 0.0])
@@ -108,6 +126,8 @@ class FromBelow:
 
     def share(self, covariance: NDArray[np.complex64]) -> float:
         """Return q, near 0 for a street and near 1 for what comes from below.
+
+        .. math:: q = P_b / (P_b + P_s)
 
         Parameters
         ----------
@@ -118,12 +138,18 @@ class FromBelow:
         -------
         float
             In [0, 1]; 1 for an array that cannot tell.
+
+        References
+        ----------
+        As for `FromBelow.powers`, after B. F. Cron and C. H. Sherman 1962.
         """
         return share_of(*self.powers(covariance))
 
 
 def share_of(below: float, street: float) -> float:
-    """Return the share of the first power, negative ones counted as none.
+    r"""Return the share of the first power, negative ones counted as none.
+
+    .. math:: q = \frac{\max(P_b, 0)}{\max(P_b, 0) + \max(P_s, 0)}
 
     Parameters
     ----------
@@ -134,6 +160,10 @@ def share_of(below: float, street: float) -> float:
     -------
     float
         In [0, 1].
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

@@ -134,7 +134,11 @@ class StillRuns:
         self._n_still, self._n_moving = 0, 0
 
     def push(self, still: NDArray[np.bool_], end: int) -> list[Gap]:
-        """Take one flag per sample, the last being sample `end` - 1; give the runs that end here.
+        r"""Take one flag per sample, the last being sample `end` - 1; give the runs that end here.
+
+        A run is a gap from the length L that still samples by chance, a share q of all, hardly make:
+
+        .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
 
         Parameters
         ----------
@@ -147,6 +151,10 @@ class StillRuns:
         -------
         list of Gap
             In order of time.
+
+        References
+        ----------
+        Derived here: L independent samples stand still with probability q^L.
         """
         if not (still.any() or self._length):
             self._heard = True
@@ -176,7 +184,15 @@ class StillRuns:
 
 
 def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool_]) -> list[Gap]:
-    """Find samples at which the sound of all channels at once is not what its last samples foretell.
+    r"""Find samples at which the sound of all channels at once is not what its last samples foretell.
+
+    With d the differences, e their prediction errors and J the jump of two samples,
+
+    .. math:: e[n] = d[n] - \rho\, d[n-1], \quad \rho = \frac{\sum d[n]\, d[n-1]}{\sum d[n]^2}, \qquad
+              J[n] = \Big\langle \min\Big(\frac{\max(e[n]^2, e[n+1]^2)}{\langle e^2 \rangle}, 25\Big)
+              \Big\rangle_{channels},
+
+    a splice is where J is above 12, and above three times the fifth largest of the hop.
 
     Parameters
     ----------
@@ -191,6 +207,11 @@ def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool
     -------
     list of Gap
         In order of time.
+
+    References
+    ----------
+    J. Makhoul, "Linear prediction: a tutorial review", Proc. IEEE 63, 1975 (the error). Derived here: the
+    mean over channels, as a splice is at the same sample in all of them and no sound is.
 
     Examples
     --------
@@ -248,7 +269,12 @@ class RepeatFinder:
         self._end = 0
 
     def push(self, sound: NDArray[np.float32], end: int) -> list[Gap]:
-        """Take a hop of a few channels (channels, n); `end` is the number of samples so far.
+        r"""Take a hop of a few channels (channels, n); `end` is the number of samples so far.
+
+        .. math:: h[n] = \sum_c a_c\, b_c[n] \bmod 2^{64}, \qquad
+                  \hat\ell = \mathrm{mode}\{n - n' : h[n] = h[n']\}
+
+        with the bits b of a sample, odd random factors a, and only those n at which five bits of h are zero.
 
         Parameters
         ----------
@@ -261,6 +287,11 @@ class RepeatFinder:
         -------
         list of Gap
             At most one.
+
+        References
+        ----------
+        U. Manber, "Finding similar files in a large file system", USENIX Winter Conference, 1994
+        (fingerprints kept where some of their bits are zero).
         """
         if len(sound) < 2:
             return []

@@ -28,7 +28,9 @@ class Guard(Generic[Item]):
         self._weights: deque[float] = deque(maxlen=hops + 1)
 
     def push(self, item: Item, weight: float) -> tuple[Item, float] | None:
-        """Take a hop with its weight; return the one that has waited long enough.
+        r"""Take a hop with its weight; return the one that has waited long enough.
+
+        .. math:: w'_n = \min(w_n, w_{n+1}, \dots, w_{n + hops})
 
         Parameters
         ----------
@@ -41,6 +43,10 @@ class Guard(Generic[Item]):
         -------
         (Item, float) or None
             With the least weight since; None while none has waited long enough.
+
+        References
+        ----------
+        Derived here: a hop is learned by whoever trusts it least, before and after it was heard.
         """
         self._waiting.append(item)
         self._weights.append(weight)

@@ -68,7 +68,9 @@ class EngineState:
     hops: int = 0
 
     def phases(self, time_s: FloatArray) -> FloatArray:
-        """Continue the phase to later times, radians.
+        r"""Continue the phase to later times, radians.
+
+        .. math:: \varphi(t) = \varphi + 2\pi \big(f t + \tfrac12 \dot f t^2\big)
 
         Parameters
         ----------
@@ -79,12 +81,18 @@ class EngineState:
         -------
         ndarray, shape (n,)
             Radians.
+
+        References
+        ----------
+        From the definition.
         """
         cycles = self.frequency_hz * time_s + 0.5 * self.rate_hz_per_s * time_s**2
         return np.asarray(self.phase_rad + 2.0 * np.pi * cycles)
 
     def frequencies(self, time_s: FloatArray) -> FloatArray:
-        """Continue the frequency to later times, Hz.
+        r"""Continue the frequency to later times, Hz.
+
+        .. math:: f(t) = f + \dot f t
 
         Parameters
         ----------
@@ -95,11 +103,20 @@ class EngineState:
         -------
         ndarray, shape (n,)
             Hz.
+
+        References
+        ----------
+        From the definition.
         """
         return np.asarray(self.frequency_hz + self.rate_hz_per_s * time_s)
 
     def after(self, time_s: float, phase_error_rad: float) -> "EngineState":
-        """Move on by a hop of this length, in whose middle the phase was found ahead by so much.
+        r"""Move on by a hop of this length, in whose middle the phase was found ahead by so much.
+
+        .. math:: \varphi' = \varphi(T) + \epsilon, \qquad f' = f(T) + g\, \frac{\epsilon}{2\pi T}, \qquad
+                  \dot f' = \dot f + 0.1\, \frac{\epsilon}{2\pi T^2}
+
+        with g falling from 1 to 1/2; the rate waits until the frequency has settled.
 
         Parameters
         ----------
@@ -112,6 +129,10 @@ class EngineState:
         -------
         EngineState
             At the end of the hop.
+
+        References
+        ----------
+        F. M. Gardner, *Phaselock Techniques*, 1966 (loops of this kind); the gains are ours.
         """
         frequency_error = phase_error_rad / (2.0 * np.pi * time_s)
         gain = max(_FREQUENCY_GAIN, 1.0 / max(self.hops, 1))
@@ -125,7 +146,9 @@ class EngineState:
         )
 
     def within(self, low_hz: float, high_hz: float) -> "EngineState":
-        """Keep the frequency between two limits; one that has to be moved keeps no rate.
+        r"""Keep the frequency between two limits; one that has to be moved keeps no rate.
+
+        .. math:: f' = \min(\max(f, f_{low}), f_{high})
 
         Parameters
         ----------
@@ -136,6 +159,10 @@ class EngineState:
         -------
         EngineState
             The same where it is inside.
+
+        References
+        ----------
+        From the definition.
         """
         if low_hz <= self.frequency_hz <= high_hz:
             return self
@@ -225,7 +252,13 @@ class HarmonicCanceller:
         self._engine = self._engine.within(*self._limits_hz)
 
     def cancel(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
+        r"""Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
+
+        .. math:: X'_{t,k,m} = X_{t,k,m} - \sum_h \kappa_h \hat c_{h,m}\, g_{t,k,h}, \qquad
+                  \hat c = (G^H W G)^{-1} G^H W X, \qquad \kappa_h = \max(1 - 2 / e_h,\, 0)
+
+        with the sums over the memory and a ridge of a thousandth, W the inverse power of the bins, and e_h
+        the power of a line over that which noise alone would give it.
 
         Parameters
         ----------
@@ -241,6 +274,11 @@ class HarmonicCanceller:
         ------
         InvalidArgumentError
             If the spectra have another number of bins.
+
+        References
+        ----------
+        B. Widrow et al. 1975, H. Vold and J. Leuridan 1993: see `worldstate.frontend.harmonic_cancellation`.
+        Derived here: kappa takes off what noise adds to the power of an amplitude, once more for safety.
         """
         if self._engine is None or not len(spectra):
             return spectra

@@ -70,16 +70,24 @@ class ChannelMask:
     def silence(self, spectra: NDArray[np.complex64]) -> None:
         """Set the channels left out to zero in place, (..., M).
 
+        ``X_m = 0`` where microphone m does not count.
+
         Parameters
         ----------
         spectra : ndarray of complex64, shape (..., M)
             Changed in place.
+
+        References
+        ----------
+        From the definition.
         """
         if not self.is_whole:
             spectra[..., ~self.keep] = 0.0
 
     def cross(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return cross-spectra (..., M, M) without the channels left out; the same array if there are none.
+
+        ``R'_ij = k_i k_j R_ij`` with k one for the channels kept and else zero.
 
         Parameters
         ----------
@@ -90,6 +98,10 @@ class ChannelMask:
         -------
         ndarray of complex64, shape (..., M, M)
             Rows and columns of the channels left out are zero.
+
+        References
+        ----------
+        From the definition.
 
         Examples
         --------

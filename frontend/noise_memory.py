@@ -35,7 +35,9 @@ class NoiseCovariance:
         self._forgetting = forgetting_frames
 
     def learn(self, total: NDArray[np.complex64], n_frames: int, weight: float) -> None:
-        """Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
+        r"""Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
+
+        .. math:: S \leftarrow e^{-w T / F} S + w \sum_t x_t x_t^H, \qquad n \leftarrow e^{-w T / F} n + w T
 
         Parameters
         ----------
@@ -45,6 +47,11 @@ class NoiseCovariance:
             How many frames it sums.
         weight : float
             In (0, 1].
+
+        References
+        ----------
+        An exponential mean, from the definition; unit-length snapshots by D. E. Tyler 1987: see
+        `worldstate.frontend.ego_noise`.
         """
         kept = math.exp(-weight * n_frames / self._forgetting)
         total *= np.float32(weight)
@@ -53,7 +60,9 @@ class NoiseCovariance:
         self.n_frames = kept * self.n_frames + weight * n_frames
 
     def mean(self, bin_index: int) -> NDArray[np.complex64]:
-        """Covariance of one bin; the mean of its diagonal is one.
+        r"""Covariance of one bin; the mean of its diagonal is one.
+
+        .. math:: \hat R = S / n
 
         Parameters
         ----------
@@ -64,6 +73,10 @@ class NoiseCovariance:
         -------
         ndarray of complex64, shape (M, M)
             Hermitian.
+
+        References
+        ----------
+        As for `NoiseCovariance.learn`, after D. E. Tyler 1987.
         """
         return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
 
@@ -93,7 +106,11 @@ class NoiseLevel:
         self._sum = self._weights = 0.0
 
     def push(self, level: float, weight: float) -> float:
-        """Take a hop's level with the weight of the gate; return the level learned, 1 before there is any.
+        r"""Take a hop's level with the weight of the gate; return the level learned, 1 before there is any.
+
+        .. math:: c = \frac{\sum_i w_i l_i e^{-W_i / 10}}{\sum_i w_i e^{-W_i / 10}}
+
+        over the levels l with the weights w, W being the weight learned since.
 
         Parameters
         ----------
@@ -106,6 +123,11 @@ class NoiseLevel:
         -------
         float
             Mean with a memory of a second of learning.
+
+        References
+        ----------
+        H. M. Finn and R. S. Johnson 1968 (constant false-alarm rate): see
+        `worldstate.frontend.ego_noise.EgoNoise.levelled`.
         """
         ripe = self._guard.push(level, weight)
         if ripe is not None and ripe[1] > 0.0:

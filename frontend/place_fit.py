@@ -40,7 +40,10 @@ def place_weights(
     usable: NDArray[np.bool_],
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> NDArray[np.float32]:
-    """Weights of all other microphones in the guess at every place.
+    r"""Weights of all other microphones in the guess at every place.
+
+    .. math:: w_{pj} = -\frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}, \qquad
+              \Gamma_{ij} = \frac{\sin(k d_{ij})}{k d_{ij}}
 
     Parameters
     ----------
@@ -57,6 +60,11 @@ def place_weights(
     -------
     ndarray of float32, shape (K, M, M)
         Row p holds the weights for place p; zero on the diagonal.
+
+    References
+    ----------
+    C. Rasmussen and C. Williams 2006, section 5.4.2; R. Cook et al. 1955 (Gamma): see
+    `worldstate.frontend.place_fit`.
 
     Examples
     --------
@@ -75,7 +83,10 @@ def place_weights(
 
 
 def place_scores(coherence: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Score every channel at every place, between -1 and 1.
+    r"""Score every channel at every place, between -1 and 1.
+
+    .. math:: S_{mp} = \frac{\sum_k \sum_{j \ne m} w_{k,pj} R_{k,jm}}
+              {\sqrt{K \sum_k w_{k,p}^T R_k\, w_{k,p}}}
 
     Parameters
     ----------
@@ -88,6 +99,11 @@ def place_scores(coherence: NDArray[np.float32], weights: NDArray[np.float32]) -
     -------
     ndarray of float64, shape (M, M)
         S[m, p]: channel m at place p; 0 where nothing is guessed.
+
+    References
+    ----------
+    Derived here: the correlation of a whitened channel with the guess for a place, by C. Rasmussen and C.
+    Williams 2006 (see `place_weights`), its own share left out.
 
     Examples
     --------

@@ -56,10 +56,16 @@ class Presence:
     def all_silent(self) -> NDArray[np.bool_]:
         """Take a hop in which all are silent, which for a second is held against nobody.
 
+        ``bad = (n >= 10)`` for all channels, n being the hops of silence in a row.
+
         Returns
         -------
         ndarray of bool, shape (M,)
             Which channels are held to be bad.
+
+        References
+        ----------
+        Derived here: a gap of the transport silences all channels for a moment, a dead array for good.
         """
         self._n_silent += 1
         silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
@@ -89,12 +95,20 @@ class Presence:
         return np.asarray(self._dead | self._intermittent)
 
     def faults(self) -> list[ChannelFault]:
-        """Say which channels are dead or intermittent.
+        r"""Say which channels are dead or intermittent.
+
+        .. math:: q_m = \frac1n \sum_{i=1}^{n} b_{i,m}, \qquad n \le 50
+
+        with b the bad hops: dead where they are one stretch that lasts until now, else intermittent.
 
         Returns
         -------
         list of ChannelFault
             By channel.
+
+        References
+        ----------
+        Derived here: a share of time says how bad a channel is, in whatever order its hops came.
         """
         if not self._share.any():
             return []

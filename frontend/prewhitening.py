@@ -56,7 +56,9 @@ class Prewhitener:
 
     @classmethod
     def of(cls, noise_covariance: ArrayLike, shrinkage: float = 0.03) -> "Prewhitener":
-        """Make it from a covariance (bins, M, M); see `inverse_root` for the arguments and errors.
+        r"""Make it from a covariance (bins, M, M); see `inverse_root` for the arguments and errors.
+
+        .. math:: \mathrm{roots} = \big[(1 - s) R / p + s I\big]^{-1/2}, \qquad p = \operatorname{tr} R / M
 
         Parameters
         ----------
@@ -69,11 +71,17 @@ class Prewhitener:
         -------
         Prewhitener
             One root a bin.
+
+        References
+        ----------
+        As for `inverse_root`: O. Ledoit and M. Wolf 2004, A. Kessy et al. 2018.
         """
         return cls(inverse_root(noise_covariance, shrinkage))
 
     def spectra(self, spectra: ArrayLike) -> ComplexArray:
         """Whiten frames, (frames, bins, M) -> the same shape.
+
+        .. math:: y = R^{-1/2} x
 
         Parameters
         ----------
@@ -89,6 +97,10 @@ class Prewhitener:
         ------
         InvalidArgumentError
             On another number of bins or microphones, or values that are not finite.
+
+        References
+        ----------
+        K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`.
         """
         X = finite_complex("spectra", spectra, (None, *self.roots.shape[:2]))
         # y_i = sum_j root_ij x_j, with x as rows: the transpose.
@@ -96,6 +108,8 @@ class Prewhitener:
 
     def covariance(self, covariance: ArrayLike) -> ComplexArray:
         """Whiten covariances, R -> root R root, (bins, M, M).
+
+        .. math:: R_y = R^{-1/2} R_x R^{-1/2}
 
         Parameters
         ----------
@@ -111,12 +125,18 @@ class Prewhitener:
         ------
         InvalidArgumentError
             On another shape or values that are not finite.
+
+        References
+        ----------
+        R. Roy and T. Kailath 1989, K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`.
         """
         R = finite_complex("covariance", covariance, self.roots.shape)
         return np.asarray(self.roots @ R @ self.roots)
 
     def steering(self, steering: ArrayLike) -> ComplexArray:
-        """Whiten steering vectors and give them their length back, (bins, M, directions).
+        r"""Whiten steering vectors and give them their length back, (bins, M, directions).
+
+        .. math:: b = \|a\|\, \frac{R^{-1/2} a}{\|R^{-1/2} a\|}
 
         Parameters
         ----------
@@ -132,6 +152,11 @@ class Prewhitener:
         ------
         InvalidArgumentError
             On another number of bins or microphones, or values that are not finite.
+
+        References
+        ----------
+        K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`. The length is derived here: what
+        whitening takes from the sound it takes from a.
         """
         A = finite_complex("steering", steering, (*self.roots.shape[:2], None))
         whitened = self.roots @ A
@@ -165,6 +190,12 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
     ------
     InvalidArgumentError
         On another shape, values that are not finite, or a number out of range.
+
+    References
+    ----------
+    O. Ledoit and M. Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", J.
+    Multivariate Anal. 88, 2004 (shrinkage); A. Kessy, A. Lewin and K. Strimmer, "Optimal whitening and
+    decorrelation", Amer. Statist. 72, 2018 (which root).
 
     Examples
     --------
@@ -201,6 +232,10 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
     float
         In [0, 1].
 
+    References
+    ----------
+    Y. Chen, A. Wiesel, Y. Eldar and A. Hero 2010: see `worldstate.frontend.prewhitening`.
+
     Examples
     --------
     >>> white_share(np.eye(4), 100), round(white_share(np.ones((4, 4)), 100), 3)
@@ -215,7 +250,10 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
 
 
 def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
-    """Invert one matrix (M, M) as `inverse_root` does, unchecked.
+    r"""Invert one matrix (M, M) as `inverse_root` does, unchecked.
+
+    .. math:: \big[(1 - s) R / p + s I\big]^{-1/2} =
+              V \operatorname{diag}\big[(1 - s) \lambda / p + s\big]^{-1/2} V^H
 
     Parameters
     ----------
@@ -228,6 +266,10 @@ def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
     -------
     ndarray of complex, shape (M, M)
         Hermitian.
+
+    References
+    ----------
+    As for `inverse_root`: O. Ledoit and M. Wolf 2004, A. Kessy et al. 2018.
 
     Examples
     --------

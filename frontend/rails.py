@@ -43,7 +43,12 @@ class RailCounter:
     def push(
         self, samples: NDArray[np.float32], lowest: NDArray[np.float32], highest: NDArray[np.float32]
     ) -> None:
-        """Take the samples (n, M) of a hop and their extremes (M,).
+        r"""Take the samples (n, M) of a hop and their extremes (M,).
+
+        .. math:: n_{at} = \#\{x = x_{max}\}, \qquad
+                  n_{below} = \#\{x_{max} - \tfrac1{20} s \le x < x_{max}\}
+
+        and likewise of -x, s being the span of the hop.
 
         Parameters
         ----------
@@ -51,6 +56,10 @@ class RailCounter:
             One hop.
         lowest, highest : ndarray of float32, shape (M,)
             Their extremes.
+
+        References
+        ----------
+        Derived here: an unclipped density falls towards its extreme, a clipped one has an atom there.
         """
         self._n_samples += len(samples)
         span = highest - lowest
@@ -81,12 +90,18 @@ class RailCounter:
             below[reached] += n_below * fine
 
     def clipped_share(self) -> NDArray[np.float64]:
-        """Share of all samples that stand at a rail, (M,); 0 for channels without one.
+        r"""Share of all samples that stand at a rail, (M,); 0 for channels without one.
+
+        .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
 
         Returns
         -------
         ndarray of float64, shape (M,)
             0..1.
+
+        References
+        ----------
+        Derived here: what an extreme holds more often than the values below it are clipped samples.
         """
         clipped = np.where((self._at >= _MIN_COUNT) & (self._at > self._below), self._at, 0)
         return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))

@@ -36,7 +36,9 @@ class SlowMean:
         self.count = np.zeros(shape[1], np.int64)
 
     def add(self, values: ArrayLike, good: NDArray[np.bool_]) -> None:
-        """Take the values of a hop, of this shape, and the channels that are good (M,).
+        r"""Take the values of a hop, of this shape, and the channels that are good (M,).
+
+        .. math:: \mu \leftarrow \mu + \frac{x - \mu}{\min(n, 30)}
 
         Parameters
         ----------
@@ -44,6 +46,10 @@ class SlowMean:
             Of one hop.
         good : ndarray of bool, shape (M,)
             Channels whose values count.
+
+        References
+        ----------
+        From the definition: an ordinary mean that turns into an exponential one.
         """
         self.count += good
         weight = good / np.clip(self.count, 1, _HOPS)

@@ -19,7 +19,9 @@ _LEVEL = 1e-6
 
 
 def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
-    """Matrix that turns a horizontal direction into its twin, shape (3, 3).
+    r"""Matrix that turns a horizontal direction into its twin, shape (3, 3).
+
+    .. math:: T = I - 2 n n^T \text{ (planar)}, \qquad T = 2 a a^T - I \text{ (linear, level)}
 
     Not usable where there is none in another azimuth, or where every azimuth is one.
 
@@ -32,6 +34,11 @@ def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
     -------
     ndarray, shape (3, 3), or NotUsable
         Its own inverse.
+
+    References
+    ----------
+    A. S. Householder, "Unitary triangularization of a nonsymmetric matrix", J. ACM 5, 1958 (the reflection).
+    Derived here: delays hold u in the products p . u only, which T leaves alone.
 
     Examples
     --------
@@ -56,7 +63,9 @@ def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
 
 
 def twin_azimuth_rad(reflection: NDArray[np.float64] | NotUsable, azimuth_rad: float) -> float | NotUsable:
-    """Azimuth that sounds the same as this one, in (-pi, pi].
+    r"""Azimuth that sounds the same as this one, in (-pi, pi].
+
+    .. math:: \theta' = \mathrm{atan2}(u'_y, u'_x), \qquad u' = T\, (\cos\theta, \sin\theta, 0)^T
 
     Parameters
     ----------
@@ -69,6 +78,10 @@ def twin_azimuth_rad(reflection: NDArray[np.float64] | NotUsable, azimuth_rad: f
     -------
     float or NotUsable
         Radians.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

@@ -36,7 +36,10 @@ class WhitenedBeams:
         self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
 
     def update(self, bin_index: int, root: NDArray[np.complex64]) -> None:
-        """Use another inverse root (M, M) in one bin.
+        r"""Use another inverse root (M, M) in one bin.
+
+        .. math:: w(\theta) = \sqrt M\, \frac{\overline{R^{-1/2}}\, \overline{a(\theta)}}
+                  {\|R^{-1/2}\, a(\theta)\|}
 
         Parameters
         ----------
@@ -44,6 +47,10 @@ class WhitenedBeams:
             From 0.
         root : ndarray of complex64, shape (M, M)
             Inverse root of the noise covariance.
+
+        References
+        ----------
+        K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`.
         """
         plain, ours = self.plain, self.steering
         weights = plain.weights[bin_index]

@@ -46,12 +46,18 @@ class WindowSum:
         self._slot = 0
 
     def open_slot(self) -> NDArray[np.complex64]:
-        """Take the oldest set out and give its place, for the newest to be written to.
+        r"""Take the oldest set out and give its place, for the newest to be written to.
+
+        .. math:: S \leftarrow S - A_{n - L}
 
         Returns
         -------
         ndarray of complex64, shape of one set
             To be written to in place.
+
+        References
+        ----------
+        From the definition of a running sum.
         """
         oldest = self._parts[self._slot]
         self._debt += _EPS * self._traces[self._slot]
@@ -59,7 +65,17 @@ class WindowSum:
         return np.asarray(oldest)
 
     def close_slot(self) -> None:
-        """Take in what was written there."""
+        r"""Take in what was written there.
+
+        .. math:: S \leftarrow S + A_n, \qquad
+                  S \leftarrow \sum_i A_i \text{ where } \epsilon \sum_j t_j > 10^{-5} \sum_i t_i
+
+        with the traces t of what is there, i, and of all that came and went since it was last summed anew, j.
+
+        References
+        ----------
+        From the definition; derived here: each pass rounds by at most the machine's epsilon of what it adds.
+        """
         newest = self._parts[self._slot]
         self.total += newest
         self._traces[self._slot] = np.einsum("bmm->bm", newest).real.sum(axis=1)
