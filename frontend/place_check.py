@@ -71,7 +71,10 @@ class PlaceCheck:
         self._faults: list[ChannelFault] = []
 
     def push(self, matrices: NDArray[np.complex64], n_frames: int, there: NDArray[np.bool_]) -> None:
-        """Take the cross-spectra (K, M, M) of one hop, sums over its frames, and who is there (M,).
+        r"""Take the cross-spectra (K, M, M) of one hop, sums over its frames, and who is there (M,).
+
+        .. math:: S_{ij} \leftarrow 0.95\, S_{ij} + \mathrm{Re} \sum_t Z_i \overline{Z_j}, \qquad
+                  n \leftarrow 0.95\, n + T
 
         Parameters
         ----------
@@ -81,6 +84,10 @@ class PlaceCheck:
             How many frames.
         there : ndarray of bool, shape (M,)
             Microphones that are neither dead nor intermittent.
+
+        References
+        ----------
+        An exponential mean over two seconds, from the definition.
         """
         self._sum *= np.float32(_FORGET)
         self._sum += matrices.real
@@ -144,7 +151,12 @@ class PlaceCheck:
 
 
 def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> list[ChannelFault]:
-    """Seat channels where they fit best together, a place for each, and list those that gain by it.
+    r"""Seat channels where they fit best together, a place for each, and list those that gain by it.
+
+    .. math:: \hat\pi = \arg\max_\pi \sum_m S_{m, \pi(m)}, \qquad g_m = S_{m, \hat\pi(m)} - S_{mm}
+
+    over the candidates that fit elsewhere better; one is listed where g is large and whoever owns the place
+    leaves it.
 
     Parameters
     ----------
@@ -157,6 +169,10 @@ def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> lis
     -------
     list of ChannelFault
         Ascending; empty where all sit where they fit best.
+
+    References
+    ----------
+    H. W. Kuhn, "The Hungarian method for the assignment problem", Naval Res. Logist. Quart. 2, 1955.
 
     Examples
     --------

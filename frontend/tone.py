@@ -99,6 +99,10 @@ def estimate_tone(
     -----
     Bound: `worldstate.frontend.bounds.tone_crb_hz2`.
 
+    References
+    ----------
+    D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.tone`.
+
     Examples
     --------
     >>> t = np.arange(480) / 4800.0
@@ -139,7 +143,12 @@ def climb(
     tolerance: float = 1e-7,
     steps: int = STEPS,
 ) -> tuple[float, complex]:
-    """Fit one tone by Gauss-Newton from a coarse peak, unchecked; steps are held within the main lobe.
+    r"""Fit one tone by Gauss-Newton from a coarse peak, unchecked; steps are held within the main lobe.
+
+    .. math:: \omega \leftarrow \omega + \frac{\mathrm{Re}\, g^H r}{g^H g}, \qquad
+              r = P^\perp y, \quad g = P^\perp \frac{\partial H}{\partial \omega} \hat a, \quad \hat a = H^+ y
+
+    with P the projection off the columns of H, as in `estimate_tone`.
 
     Parameters
     ----------
@@ -160,6 +169,11 @@ def climb(
     float, complex
         Radians a sample, and A exp(j phase) at the centre of the samples.
 
+    References
+    ----------
+    G. Golub and V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems
+    whose variables separate", SIAM J. Numer. Anal. 10, 1973 (variable projection).
+
     Examples
     --------
     >>> omega, amplitude = climb(np.cos(1.0 * np.arange(101)), omega=1.01)
@@ -178,7 +192,9 @@ def climb(
 
 
 def tone_wave(omega: float, count: int) -> ComplexArray:
-    """Give e^(j omega n), n counted from the centre, as a product of two short ones: few exponentials.
+    r"""Give a complex wave, n counted from the centre, as a product of two short ones: few exponentials.
+
+    .. math:: z_n = e^{j \omega (n - (N - 1) / 2)}
 
     Parameters
     ----------
@@ -191,6 +207,10 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
     -------
     ndarray of complex128, shape (count,)
         Of modulus one.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

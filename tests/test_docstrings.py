@@ -21,6 +21,33 @@ PARTS = (*FULL, "adapters", "worldstate")
 ARRAYS = r"ArrayLike|NDArray|Numbers|FloatArray|ComplexArray|Matrix"
 # "(n, 2) float", "shape (n,)", "float or (bins,) float", "any shape", "same shape as ...".
 SHAPES = r"\([^()]*,[^()]*\)|\(\.\.\.\)|shape|any number|broadcast|[Aa]s for|array_like of float|scalar"
+# An equation is written as one and relates two sides; a source is a year, the paper, or says what it is.
+MATHS = r"\.\. math::.*(?:\n(?: .*)?)*|:math:`[^`]*`|``[^`]*``"
+RELATION = r"=|<|>|\\(?:ge|le|approx|leftarrow)\b"
+PAPER = r"(?:\b[Ee]q\. \((?:looming|crbtau|crbtheta)\)|\(cor:endfire\)|[Ss]ection [IVX]+) of the paper"
+SOURCE = rf"\b(?:19|20)\d\d\b|{PAPER}|\b[Ff]rom the definition\b|\b[Dd]erived here: \w"
+# Of `frontend`: what computes no quantity, and what it does instead.
+WITHOUT_EQUATION = {
+    "array.py:roof_array_56": "constant",
+    "channel_health.py:ArrayHealth.unknown": "container",
+    "channel_health.py:ArrayHealth.with_fault": "look-up",
+    "channel_health.py:faults_where": "container",
+    "ego_noise.py:spanned": "indices",
+    "gaps.py:GapFinder.push": "delegates",
+    "gcc.py:all_pairs": "indices",
+    "harmonic_cancellation.py:HarmonicCanceller.follow": "setter",
+    "hops.py:HopCutter.cut": "container",
+    "listener.py:Listener.push": "delegates",
+    "masking.py:ChannelMask.all_of": "container",
+    "music.py:checked_covariance": "validation",
+    "place_check.py:PlaceCheck.faults": "look-up",
+    "presence.py:Presence.push": "container",
+    "spectra.py:finite_complex": "validation",
+    "stream.py:FrontEnd.follow_engine": "setter",
+    "stream.py:FrontEnd.learn_ego_noise": "setter",
+    "stream.py:FrontEnd.process": "delegates",
+    "threads.py:one_blas_thread": "threads",
+}
 PLAIN_BASES = {"Protocol", "Enum", "StrEnum", "Exception", "ValueError", "NamedTuple"}
 
 
@@ -166,6 +193,47 @@ def test_what_is_raised_is_listed(part: str) -> None:
 def test_functions_and_classes_show_themselves_at_work() -> None:
     every = [one for one in functions(FULL) if one.owner is None] + classes(FULL)
     assert [one.where for one in every if ">>>" not in one.sections.get("Examples", "")] == []
+
+
+def test_everything_computed_has_an_equation() -> None:
+    """In the function's own docstring: whoever asks for help on it does not see the module's head."""
+    assert [name for name, one in _computing().items() if not _equations(one)] == []
+
+
+def test_everything_computed_has_a_source() -> None:
+    missing = [
+        name
+        for name, one in _computing().items()
+        if not re.search(SOURCE, one.sections.get("References", ""))
+    ]
+    assert missing == []
+
+
+def test_nothing_is_excused_without_need() -> None:
+    """Neither what is no longer there nor what has both."""
+    there = {_short(one): one for one in functions(("frontend",))}
+    needless = [
+        name
+        for name in WITHOUT_EQUATION
+        if name not in there or (_equations(there[name]) and "References" in there[name].sections)
+    ]
+    assert needless == []
+
+
+def _short(one: Public) -> str:
+    return one.where.removeprefix("frontend/")
+
+
+def _computing() -> dict[str, Public]:
+    """Functions and methods of `frontend` that are not excused."""
+    every = {_short(one): one for one in functions(("frontend",))}
+    return {name: one for name, one in every.items() if name not in WITHOUT_EQUATION}
+
+
+def _equations(one: Public) -> list[str]:
+    """Whatever is set as mathematics and relates two sides, outside of arguments and examples."""
+    prose = one.sections[""] + "\n\n" + one.sections.get("Notes", "")
+    return [found for found in re.findall(MATHS, prose) if re.search(RELATION, found)]
 
 
 def _entry(parameters: str, name: str) -> str:
