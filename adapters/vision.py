@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
@@ -223,6 +224,38 @@ class VisionQuery:
         seen = float(np.mean([self.miss_rate(angle, d, label) for label in labels for angle in angles]))
         share = in_view.half_width_rad / sector.half_width_rad
         return share * seen + (1.0 - share)
+
+
+def moving_boxes(
+    log: DetectionLog, stamps_ns: Collection[int], settings: VisionSettings | None = None
+) -> list[NDArray[np.float64]]:
+    """Return the moving boxes that count, of the frame at each stamp.
+
+    Parameters
+    ----------
+    log : DetectionLog
+        Of a standing camera.
+    stamps_ns : collection of int
+        On the stream's clock.
+    settings : VisionSettings, optional
+        Which boxes count, which are parked, and how old a frame may be.
+
+    Returns
+    -------
+    list of ndarray
+        One a stamp, shape (boxes, 4); without boxes where there is no frame.
+    """
+    chosen = settings or VisionSettings()
+    found = []
+    for stamp_ns in stamps_ns:
+        number = log.latest(stamp_ns, nanoseconds(chosen.max_frame_age_s))
+        boxes_px = np.empty((0, 4))
+        if number is not None:
+            frame = log.frames[number]
+            boxes_px = frame.boxes_px[frame.select(chosen.keep)]
+            boxes_px = boxes_px[~parked(log, number, boxes_px, chosen.still)]
+        found.append(boxes_px)
+    return found
 
 
 def _explains(sighting: Sighting, sector: Sector, labels: Collection[str]) -> bool:

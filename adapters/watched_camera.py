@@ -1,6 +1,6 @@
 """A camera with a detector and a measured miss rate, whose health is read from its own frames."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +39,7 @@ class Watched:
     """
 
     detections: DetectionLog
-    degradation: Callable[[int], float]
+    degradation: DegradationLog
     rates: MissRates
 
     def query(

@@ -8,13 +8,13 @@ import pytest
 
 from worldstate.adapters.degradation import LEVELS
 from worldstate.cli.main import main
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.errors import InvalidArgumentError
 from worldstate.evaluation.degradation_report import sweep_report, sweep_table, write_sweep_figure
 from worldstate.evaluation.degradation_sweep import SweepSettings, degradation_sweep
 from worldstate.evaluation.folds import recording_folds
 from worldstate.evaluation.hop_stream import ABSENT, PRESENT, UNQUERIED
-from worldstate.evaluation.staged_degradation import camera_states
-from worldstate.evaluation.staged_recording import CLEAN, OFF, StagedRecording, load_staged, save_staged
+from worldstate.evaluation.staged_looks import CLEAN, OFF, camera_states
+from worldstate.evaluation.staged_recording import StagedRecording
 
 PRIOR = (0.25,) * 4
 HOPS, T0_S = 60, 4.0
@@ -51,6 +51,7 @@ def staged(number, approach, rng, hearing=3.0):
         miss_rate=np.broadcast_to(np.clip(beta, 0.02, 0.98), seen.shape),
         clutter_rate=np.full(seen.shape, 0.01),
         seen=seen,
+        found=seen,
         degradation=np.broadcast_to(beta, seen.shape),
         presence=np.broadcast_to(1.0 / (1.0 + np.exp(-heard)), seen.shape),
     )
@@ -124,19 +125,13 @@ def test_report_table_and_figure(rows, tmp_path):
     assert (tmp_path / "sweep.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_recordings_come_back_for_their_origin_alone_and_damage_is_named(corpus, tmp_path):
-    path = tmp_path / "r.npz"
-    save_staged(path, corpus[0], "one")
-    back = load_staged(path, "one")
-    for name in StagedRecording.__slots__:
-        assert np.array_equal(getattr(back, name), getattr(corpus[0], name), equal_nan=name == "approach")
-    assert load_staged(path, "another") is None
-    assert load_staged(tmp_path / "nothing.npz", "one") is None
-    whole = path.read_bytes()
-    for size in range(0, len(whole) - 1, len(whole) // 15):
-        path.write_bytes(whole[:size])
-        with pytest.raises(InputFileError, match=r"r\.npz"):
-            load_staged(path, "one")
+def test_a_detection_of_something_else_is_no_awareness_of_the_vehicle(corpus):
+    raving = [replace(one, seen=np.ones_like(one.seen)) for one in corpus]
+    before = degradation_sweep(corpus, SweepSettings(PRIOR), np.random.default_rng(0))
+    after = degradation_sweep(raving, SweepSettings(PRIOR), np.random.default_rng(0))
+    assert [row.vision_only for row in after] == [row.vision_only for row in before]
+    assert [row.awareness for row in after] == [row.awareness for row in before]
+    assert {row.any_detection for row in after} == {row.false_awareness for row in after} == {1.0}
 
 
 def test_what_does_not_fit_is_refused(corpus):
@@ -174,6 +169,7 @@ def test_the_command_end_to_end_and_again_from_what_it_kept(tmp_path, capsys):
     beta = tmp_path / "beta.json"
     assert main(["measure-absence", str(sim), "--out", str(beta)]) == 0
     command = ["evaluate-degradation", str(sim), "--miss-rates", str(beta), "--out", str(out), "--json"]
+    command += ["--jobs", "2"]
     capsys.readouterr()
     assert main(command) == 0
     first = json.loads(capsys.readouterr().out)

@@ -20,8 +20,9 @@ from worldstate.adapters.ovad import Recording
 from worldstate.adapters.video import VIDEO_NAME, open_video
 from worldstate.adapters.vision import VisionSettings
 from worldstate.adapters.watched_camera import any_motion, watch
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.staged_degradation import CameraState, Staging, stage_recording
+from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.evaluation.staged_degradation import hear_staged
+from worldstate.evaluation.staged_looks import CameraState, Staging, load_looks, save_looks, stage_looks
 from worldstate.filter import WorldFilter
 
 CAMERA = PinholeCamera()
@@ -65,9 +66,8 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, 
     source, recording = open_source(approach.folder), Recording.open(approach.folder)
     staging = Staging(MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
     states = (CameraState("all", 0.0), CameraState("noise", 1.0))
-    staged = stage_recording(
-        source, video, staging, states, np.random.default_rng(0), name="a", label=recording.label
-    )
+    looks = stage_looks(video, staging, states, np.random.default_rng(0))
+    staged = hear_staged(source, looks, staging, name="a", label=recording.label)
     assert staged.states == ("clean", "noise 1", "off")
     clean, blind, off = (staged.stream(state) for state in staged.states)
     after = staged.after_sight
@@ -75,6 +75,10 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, 
     assert not after[staged.time_s < source.t0_s].any()
     assert clean.seen[after].mean() > 0.7
     assert blind.seen[after].mean() <= 0.05
+    found = dict(zip(staged.states, staged.found, strict=True))
+    assert found["clean"][after].mean() > 0.7
+    assert not (found["clean"] & ~(clean.seen & clean.there)).any()
+    assert not found["off"].any()
     assert (off.answer == 0).all()
     asked = (clean.answer > 0) & (blind.answer > 0)
     assert asked.mean() > 0.5
@@ -82,6 +86,31 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, 
     assert np.median(blind.miss_rate[asked]) > 0.9
     assert np.median(staged.degradation, axis=1) == pytest.approx([0.0, 1.0, 1.0], abs=0.1)
     assert_the_sound_says_the_same(source, staged)
+
+
+@pytest.mark.xdist_group("approach")
+def test_what_was_seen_comes_back_for_its_origin_alone_and_damage_is_named(video, rates, tmp_path):
+    staging = Staging(MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
+    states = (CameraState("all", 0.0), CameraState("noise", 1.0))
+    looks = stage_looks(video, staging, states, np.random.default_rng(0))
+    assert sum(map(len, looks.watched[0].detections.frames)) > 10
+    path = tmp_path / "r.npz"
+    save_looks(path, looks, "one")
+    back = load_looks(path, "one", rates)
+    assert back.states == looks.states
+    for one, other in zip(back.watched, looks.watched, strict=True):
+        assert np.array_equal(one.degradation.degradation, other.degradation.degradation)
+        assert np.array_equal(one.detections.stamps_ns, other.detections.stamps_ns)
+        for frame, same in zip(one.detections.frames, other.detections.frames, strict=True):
+            assert np.array_equal(frame.boxes_px, same.boxes_px)
+            assert (frame.labels, frame.scores.tolist()) == (same.labels, same.scores.tolist())
+    assert load_looks(path, "another", rates) is None
+    assert load_looks(tmp_path / "nothing.npz", "one", rates) is None
+    whole = path.read_bytes()
+    for size in range(0, len(whole) - 1, len(whole) // 15):
+        path.write_bytes(whole[:size])
+        with pytest.raises(InputFileError, match=r"r\.npz"):
+            load_looks(path, "one", rates)
 
 
 def assert_the_sound_says_the_same(source, staged):

@@ -3,10 +3,8 @@
 import csv
 import io
 import json
-import multiprocessing
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +15,7 @@ import soundfile
 
 from worldstate.adapters.atomic import atomic_path, write_text
 from worldstate.adapters.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, LOG_NAME
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.video import VIDEO_NAME
 from worldstate.checks import in_range
 from worldstate.errors import InputFileError
@@ -111,7 +110,7 @@ def write_dataset(
     folder = Path(root)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in _each(partial(_simulate_one, folder, wanted), wanted.plans(), jobs):
+    for row in in_processes(partial(_simulate_one, folder, wanted), wanted.plans(), jobs):
         rows.append(row)
         if progress is not None:
             progress(row)
@@ -203,15 +202,6 @@ def _simulate_one(root: Path, wanted: DatasetSettings, plan: Plan) -> LogRow:
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = camera_frames(settings, recording, rng.spawn(1)[0]) if wanted.video else None
     return write_recording(root, recording, plan.number, frames)
-
-
-def _each(work: Callable[[Plan], LogRow], plans: list[Plan], jobs: int) -> Iterator[LogRow]:
-    if jobs == 1 or len(plans) == 1:
-        yield from map(work, plans)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(plans)), mp_context=context) as pool:
-        yield from pool.map(work, plans)
 
 
 def _log_row(recording: SimulatedRecording, number: int) -> LogRow:

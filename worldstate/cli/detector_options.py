@@ -1,11 +1,13 @@
 """Options that name a camera's detector, shared by the commands that look at video."""
 
 import argparse
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from worldstate.adapters.detections import DetectionFilter
+    from worldstate.adapters.onnx_detector import OnnxDetector, OnnxSettings
     from worldstate.evaluation.absence import MakeDetector
 
 
@@ -20,7 +22,7 @@ def add_detector_options(parser: argparse.ArgumentParser) -> None:
 
 
 def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
-    """Return what makes a detector; a model is opened once.
+    """Return what makes a detector, in any process; a model is opened once in each.
 
     Raises
     ------
@@ -28,16 +30,25 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
         If a model is wanted and none given.
     """
     from worldstate.adapters.motion_detector import MotionDetector, MotionSettings
-    from worldstate.adapters.onnx_detector import OnnxSettings, open_onnx
+    from worldstate.adapters.onnx_detector import OnnxSettings
     from worldstate.errors import InvalidArgumentError
 
     if arguments.detector == "onnx":
         if arguments.onnx_model is None:
             raise InvalidArgumentError("--onnx-model: expected a model for --detector onnx")
-        model = open_onnx(arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
-        return lambda: model
+        make = partial(_opened, arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
+        make()  # what is wrong with a model is said before the work begins
+        return make
     settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
-    return lambda: MotionDetector(settings)
+    return partial(MotionDetector, settings)
+
+
+@cache
+def _opened(path: Path, settings: "OnnxSettings") -> "OnnxDetector":
+    """Open a model once a process."""
+    from worldstate.adapters.onnx_detector import open_onnx
+
+    return open_onnx(path, settings)
 
 
 def detector_filter(arguments: argparse.Namespace) -> "DetectionFilter":

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Stage blur, darkness and sensor noise, four levels each, on the video of every recording of a data set, and
 print for every state of the camera: hazard awareness, the share of hops after line-of-sight entry, vehicle in
-view, in which a detection is there or P(hidden) + P(visible) is above its threshold; vision alone; and false
-alarms per hour of the hazard-free recordings, whose camera is degraded alike. Nobody is told the degradation:
-d is read from the frames, and beta from the table that measure-absence wrote on other recordings.
+view, in which it is detected or P(hidden) + P(visible) is above its threshold; vision alone, one minus the
+share of misses: a detection of the vehicle and not of anything else; any detection at all; and false alarms
+per hour of the hazard-free recordings, whose camera is degraded alike. Nobody is told the degradation: d is
+read from the frames, and beta from the table that measure-absence wrote on other recordings.
 
 Thresholds are gamma(alpha) on the hazard-free recordings of other folds. A last row, "off", has no camera.
 
@@ -62,6 +63,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
     )
     parser.add_argument("--most", type=int, metavar="N", help="use the first N recordings")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="noise, folds, intervals (default: %(default)s)")
     parser.add_argument(
         "--out", type=Path, default=Path("degradation"), metavar="DIR", help="(default: %(default)s)"
@@ -86,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = filmed_recordings(arguments.dataset, arguments.most)
     policy = load_model(arguments.model)[1].policies[0]
     judged_by = SweepSettings(policy.reference_prior, arguments.alpha, policy.sustain_hops)
-    recordings = _stage(arguments.out / "staged", found, settings)
+    recordings = _stage(arguments.out / "staged", found, settings, arguments.jobs)
     rows = degradation_sweep(recordings, judged_by, np.random.default_rng(arguments.seed))
     report = _origin(arguments, recordings) | sweep_report(rows)
     write_text(arguments.out / "degradation.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
@@ -100,7 +102,7 @@ def _settings(arguments: argparse.Namespace) -> "StagedDataset":
     from worldstate.adapters.miss_rates import load_miss_rates
     from worldstate.adapters.vision import VisionSettings
     from worldstate.evaluation.staged_dataset import StagedDataset
-    from worldstate.evaluation.staged_degradation import Staging, camera_states
+    from worldstate.evaluation.staged_looks import Staging, camera_states
 
     staging = Staging(
         detector_maker(arguments),
@@ -111,14 +113,18 @@ def _settings(arguments: argparse.Namespace) -> "StagedDataset":
     return StagedDataset(staging, detector_name(arguments), camera_states(), arguments.seed, arguments.model)
 
 
-def _stage(folder: Path, found: "list[Recording]", settings: "StagedDataset") -> "list[StagedRecording]":
-    from worldstate.adapters.video import VIDEO_NAME, open_video
+def _stage(
+    folder: Path, found: "list[Recording]", settings: "StagedDataset", jobs: int
+) -> "list[StagedRecording]":
     from worldstate.evaluation.staged_dataset import stage_dataset
 
     folder.mkdir(parents=True, exist_ok=True)
-    frames = sum(open_video(recording.path / VIDEO_NAME).count for recording in found)
-    with progress_bar("staging the camera", frames) as bar:
-        return list(stage_dataset(folder, found, settings, bar.advance))
+    done = []
+    with progress_bar("staging the camera", len(found)) as bar:
+        for recording in stage_dataset(folder, found, settings, jobs):
+            done.append(recording)
+            bar.advance()
+    return done
 
 
 def _origin(arguments: argparse.Namespace, recordings: "list[StagedRecording]") -> dict[str, object]:

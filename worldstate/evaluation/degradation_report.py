@@ -5,10 +5,11 @@ from pathlib import Path
 
 from worldstate.adapters.atomic import atomic_path
 from worldstate.evaluation.degradation_sweep import SweepRow
-from worldstate.evaluation.staged_recording import CLEAN, OFF
+from worldstate.evaluation.staged_looks import CLEAN, OFF
 
 COLUMNS = (
-    ("d", "degradation"), ("beta", "miss_rate"), ("vision", "vision_only"), ("aware", "awareness"),
+    ("d", "degradation"), ("beta", "miss_rate"), ("vision", "vision_only"), ("any", "any_detection"),
+    ("aware", "awareness"),
     ("unseen", "unseen_awareness"), ("detected", "detected"), ("lead s", "lead_time_s"),
     ("FA/h", "false_alarms_per_hour"), ("false aware/h", "false_awareness_per_hour"),
     ("share", "false_awareness"),

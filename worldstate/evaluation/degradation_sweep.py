@@ -13,7 +13,8 @@ from worldstate.errors import InvalidArgumentError
 from worldstate.evaluation.advisories import detection, false_alarms_per_hour, rising_edges
 from worldstate.evaluation.folds import recording_folds
 from worldstate.evaluation.hop_stream import HOP_S, UNQUERIED
-from worldstate.evaluation.staged_recording import CLEAN, OFF, StagedRecording
+from worldstate.evaluation.staged_looks import CLEAN, OFF
+from worldstate.evaluation.staged_recording import StagedRecording
 from worldstate.evaluation.stream_statistic import stream_statistic
 
 DRAWS = 1000
@@ -72,13 +73,15 @@ class SweepRow:
     miss_rate : float or None
         Mean beta of the channel where it was asked after T0.
     vision_only : float
-        Share of the hops after T0, vehicle in view, in which a detection is there.
+        Share of the hops after T0, vehicle in view, in which it is detected, as 1 - beta counts it.
+    any_detection : float
+        Share of them in which anything that moves is detected.
     awareness : float
-        Share of them in which a detection is there or P(hidden) + P(visible) is above its threshold.
+        Share of them in which it is detected or P(hidden) + P(visible) is above its threshold.
     awareness_interval : tuple of float
         Its middle 95 % over recordings drawn again.
     unseen_awareness : float or None
-        Awareness in the hops without a detection: what the sound holds by itself.
+        Awareness in the hops in which it is not detected: what the sound holds by itself.
     detected, lead_time_s : float or None
         Share of approaches with an advisory in the 5 s before T0, and by how much in the mean.
     false_alarms_per_hour : float
@@ -93,6 +96,7 @@ class SweepRow:
     degradation: float
     miss_rate: float | None
     vision_only: float
+    any_detection: float
     awareness: float
     awareness_interval: Interval
     unseen_awareness: float | None
@@ -164,7 +168,17 @@ class _Judged:
         return np.asarray(self.recording.seen[self.row])
 
     @property
+    def found(self) -> Flags:
+        return np.asarray(self.recording.found[self.row])
+
+    @property
     def aware(self) -> Flags:
+        """Of a vehicle that is there: a detection of something else is no awareness of it."""
+        return self.found | self.heard
+
+    @property
+    def raised(self) -> Flags:
+        """Where nothing is there, any detection raises awareness."""
         return self.seen | self.heard
 
     def in_sight(self, flags: Flags) -> Flags:
@@ -197,7 +211,8 @@ def _row(state: str, judged: Sequence[_Judged], draws: Sequence[NDArray[np.intp]
     approaches = [one for one in judged if not one.recording.hazard_free]
     aware = [one.in_sight(one.aware) for one in judged]
     seen = np.concatenate([one.in_sight(one.seen) for one in judged])
-    unseen = np.concatenate([one.in_sight(one.heard) for one in judged])[~seen]
+    found_again = np.concatenate([one.in_sight(one.found) for one in judged])
+    unseen = np.concatenate([one.in_sight(one.heard) for one in judged])[~found_again]
     found = [detection(_onsets_s(one), one.recording.t0_s) for one in approaches]
     leads = [one.lead_time_s for one in found if one.lead_time_s is not None]
     drawn = [np.concatenate([aware[i] for i in chosen]).mean() for chosen in draws]
@@ -205,15 +220,16 @@ def _row(state: str, judged: Sequence[_Judged], draws: Sequence[NDArray[np.intp]
         state=state,
         degradation=float(np.mean([one.recording.degradation[one.row].mean() for one in judged])),
         miss_rate=_mean(np.concatenate([_asked_miss_rates(one) for one in judged])),
-        vision_only=float(seen.mean()),
+        vision_only=float(found_again.mean()),
+        any_detection=float(seen.mean()),
         awareness=float(np.concatenate(aware).mean()),
         awareness_interval=(float(np.quantile(drawn, 0.025)), float(np.quantile(drawn, 0.975))),
         unseen_awareness=_mean(unseen),
         detected=float(np.mean([one.detected for one in found])),
         lead_time_s=_mean(np.array(leads)),
         false_alarms_per_hour=false_alarms_per_hour([one.alarm for one in free], HOP_S),
-        false_awareness_per_hour=false_alarms_per_hour([one.aware for one in free], HOP_S),
-        false_awareness=float(np.concatenate([one.aware for one in free]).mean()),
+        false_awareness_per_hour=false_alarms_per_hour([one.raised for one in free], HOP_S),
+        false_awareness=float(np.concatenate([one.raised for one in free]).mean()),
     )
 
 

@@ -6,11 +6,9 @@ moving ego they end 0.5 s later. The front window ends 1.5 s after the first. Re
 array's rate with a quarter of the frame length, which leaves the feature's bins (50-1500 Hz) where they are.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 import scipy.signal
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 from worldstate.adapters.feature_extraction import WINDOW_S
 from worldstate.adapters.feature_table import FeatureTable
 from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.sample_windows import window_ends_s
 from worldstate.adapters.simulation import (
     SITES,
@@ -104,7 +103,7 @@ def simulated_windows(
     in_range("jobs", jobs, 1, 256)
     rows = []
     work = partial(_windows, preset() if levels is None else levels)
-    for found in _each(work, _plans(per_approach, seed, sites), jobs):
+    for found in in_processes(work, _plans(per_approach, seed, sites), jobs):
         rows += found
         progress()
     features, labels, environments, recordings = zip(*rows, strict=True)
@@ -122,14 +121,6 @@ def _plans(per_approach: int, seed: int, sites: Sequence[str]) -> list[WindowPla
     wanted = [(name, approach) for name in sites for approach in approaches]
     seeds = np.random.SeedSequence(seed).spawn(len(wanted))
     return [WindowPlan(i, *what, child) for i, (what, child) in enumerate(zip(wanted, seeds, strict=True))]
-
-
-def _each(work: Callable[[WindowPlan], list[Row]], plans: list[WindowPlan], jobs: int) -> Iterator[list[Row]]:
-    if jobs == 1:
-        yield from map(work, plans)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(work, plans)
 
 
 def _windows(levels: Preset, plan: WindowPlan) -> list[Row]:

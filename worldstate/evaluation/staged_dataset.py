@@ -1,24 +1,33 @@
-"""Stage the camera of every recording of a data set, and remember those done."""
+"""Stage the camera of every recording of a data set, remember what it saw, and listen."""
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.listen import open_source
-from worldstate.adapters.model_file import model_to_dict, read_model
 from worldstate.adapters.ovad import OvadDataset, Recording
-from worldstate.adapters.video import VIDEO_NAME, open_video
+from worldstate.adapters.parallel import in_processes
+from worldstate.adapters.video import VIDEO_NAME, Video, open_video
 from worldstate.errors import InputFileError
-from worldstate.evaluation.staged_degradation import CameraState, Staging, stage_recording
-from worldstate.evaluation.staged_recording import StagedRecording, load_staged, save_staged
+from worldstate.evaluation.staged_degradation import hear_staged
+from worldstate.evaluation.staged_looks import (
+    CameraState,
+    StagedLooks,
+    Staging,
+    load_looks,
+    save_looks,
+    stage_looks,
+)
+from worldstate.evaluation.staged_recording import StagedRecording
 
-# What is kept of a recording depends on this code: a change of it is another number.
-VERSION = 1
+# What a camera sees depends on this code: a change of it is another number.
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +55,16 @@ class StagedDataset:
     model: Path | None = None
 
     def origin(self, recording: Recording) -> str:
-        """Name everything that the result for a recording depends on, in a few characters."""
-        files = [recording.audio_path, recording.path / VIDEO_NAME, recording.detections_path]
+        """Name everything that the looks at a recording depend on, in a few characters."""
+        video = (recording.path / VIDEO_NAME).stat()
         made_of = {
             "version": VERSION,
             "recording": recording.recording_id,
-            "files": [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files if f is not None],
+            "video": (video.st_size, video.st_mtime_ns),
             "rates": self.staging.rates.to_dict(),
             "detector": self.detector,
             "states": [str(state) for state in self.states],
             "seed": self.seed,
-            "model": model_to_dict(read_model(self.model)),
         }
         return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -84,52 +92,46 @@ def filmed_recordings(root: Path, most: int | None = None) -> list[Recording]:
 
 
 def stage_dataset(
-    folder: Path,
-    recordings: Sequence[Recording],
-    settings: StagedDataset,
-    on_frame: Callable[[float], None] = lambda frames: None,
+    folder: Path, recordings: Sequence[Recording], settings: StagedDataset, jobs: int = 1
 ) -> Iterator[StagedRecording]:
-    """Yield the recordings in their order; those in `folder` are not staged again.
+    """Yield the recordings in their order; what the camera saw lies in `folder` and is not staged again.
 
     Parameters
     ----------
     folder : Path
-        Existing; one small file a recording.
+        Existing; one file a recording.
     recordings : sequence of Recording
         With video and detections.
     settings : StagedDataset
-        What to stage.
-    on_frame : callable
-        Called with the number of frames that were done.
+        What to stage, and who listens.
+    jobs : int
+        Processes; the result does not depend on it.
 
     Raises
     ------
     InputFileError
         If a file is damaged.
     """
-    for recording in recordings:
-        path, origin = folder / f"{recording.recording_id}.npz", settings.origin(recording)
-        kept = load_staged(path, origin)
-        if kept is None:
-            kept = _stage(recording, settings, lambda: on_frame(1))
-            save_staged(path, kept, origin)
-        else:
-            on_frame(open_video(recording.path / VIDEO_NAME).count)
-        yield kept
+    yield from in_processes(partial(_stage, folder, settings), recordings, jobs)
 
 
-def _stage(recording: Recording, settings: StagedDataset, on_frame: Callable[[], None]) -> StagedRecording:
+def _stage(folder: Path, settings: StagedDataset, recording: Recording) -> StagedRecording:
     video = open_video(recording.path / VIDEO_NAME)
     camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
-    # A generator of its own: no recording depends on which others were staged before.
-    key = int.from_bytes(hashlib.sha256(recording.recording_id.encode()).digest()[:8], "big")
-    return stage_recording(
-        open_source(recording.path, model=settings.model),
-        video,
-        replace(settings.staging, camera=camera),
-        settings.states,
-        np.random.default_rng((settings.seed, key)),
-        name=recording.recording_id,
-        label=recording.label or "none",
-        on_frame=on_frame,
-    )
+    staging = replace(settings.staging, camera=camera)
+    looks = _looks(folder, replace(settings, staging=staging), recording, video)
+    source = open_source(recording.path, model=settings.model)
+    label = recording.label or "none"
+    return hear_staged(source, looks, staging, name=recording.recording_id, label=label)
+
+
+def _looks(folder: Path, settings: StagedDataset, recording: Recording, video: Video) -> StagedLooks:
+    path, origin = folder / f"{recording.recording_id}.npz", settings.origin(recording)
+    kept = load_looks(path, origin, settings.staging.rates)
+    if kept is None:
+        # A generator of its own: no recording depends on which others were staged before.
+        key = int.from_bytes(hashlib.sha256(recording.recording_id.encode()).digest()[:8], "big")
+        rng = np.random.default_rng((settings.seed, key))
+        kept = stage_looks(video, settings.staging, settings.states, rng)
+        save_looks(path, kept, origin)
+    return kept

@@ -1,20 +1,14 @@
 """What is kept of a recording whose camera was staged in several states: a few numbers a hop and state."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.atomic import atomic_path
 from worldstate.checks import check_shape, finite_array
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.errors import InvalidArgumentError
 from worldstate.evaluation.hop_stream import HopStream
-
-MAX_BYTES = 64 << 20
-# States that every sweep has: the camera as it is, and no camera at all.
-CLEAN, OFF = "clean", "off"
 
 Numbers = NDArray[np.float64]
 
@@ -45,6 +39,8 @@ class StagedRecording:
         d as it was estimated.
     presence : ndarray, shape (S, n)
         P(hidden) + P(visible) of the filter.
+    found : ndarray of bool, shape (S, n)
+        Whether a moving object that is in view, by the reference, was detected; `seen` takes any detection.
 
     Raises
     ------
@@ -66,6 +62,7 @@ class StagedRecording:
     seen: NDArray[np.bool_]
     degradation: Numbers
     presence: Numbers
+    found: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
         shape = len(self.states), np.size(self.time_s)
@@ -78,7 +75,13 @@ class StagedRecording:
 
     @classmethod
     def of(
-        cls, streams: Sequence[HopStream], states: Sequence[str], degradation: Numbers, presence: Numbers
+        cls,
+        streams: Sequence[HopStream],
+        states: Sequence[str],
+        *,
+        degradation: Numbers,
+        presence: Numbers,
+        found: NDArray[np.bool_],
     ) -> "StagedRecording":
         """Return the streams of one recording, one a state, in one piece.
 
@@ -99,6 +102,7 @@ class StagedRecording:
             **{name: np.stack([getattr(stream, name) for stream in streams]) for name in _STACKED},
             degradation=degradation,
             presence=presence,
+            found=found,
         )
 
     @property
@@ -138,65 +142,6 @@ class StagedRecording:
         )
 
 
-_TEXTS = ("name", "label")
 _SHARED = ("time_s", "there", "approach", "log_likelihoods")
 _STACKED = ("answer", "miss_rate", "clutter_rate", "seen")
-_BY_STATE = (*_STACKED, "degradation", "presence")
-_ARRAYS = tuple(
-    field.name for field in fields(StagedRecording) if field.name not in (*_TEXTS, "t0_s", "states")
-)
-
-
-def save_staged(path: str | Path, recording: StagedRecording, origin: str) -> None:
-    """Write a recording as npz without objects, whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        In an existing folder.
-    recording : StagedRecording
-        What to keep.
-    origin : str
-        What it was made by; `load_staged` takes it back for the same origin only.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
-    values = {name: np.array(getattr(recording, name)) for name in (*_TEXTS, "t0_s", "states", *_ARRAYS)}
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, origin=np.array(origin), **values)  # type: ignore[arg-type]
-
-
-def load_staged(path: str | Path, origin: str) -> StagedRecording | None:
-    """Return what `save_staged` wrote; None where nothing of this origin stands there.
-
-    Raises
-    ------
-    InputFileError
-        If the file is too large or damaged.
-    """
-    source = Path(path)
-    if not source.is_file():
-        return None
-    if source.stat().st_size > MAX_BYTES:
-        raise InputFileError(path, f"expected a staged recording of at most {MAX_BYTES >> 20} MiB")
-    try:
-        with np.load(source, allow_pickle=False) as file:
-            values = {name: file[name] for name in file.files}
-        return _read(values) if str(values["origin"]) == origin else None
-    except (OSError, InvalidArgumentError) as error:
-        raise InputFileError(path, f"expected a staged recording ({error})") from error
-    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
-        raise InputFileError(path, f"expected a staged recording, it does not read: {error}") from error
-
-
-def _read(values: dict[str, np.ndarray]) -> StagedRecording:
-    return StagedRecording(
-        name=str(values["name"]),
-        label=str(values["label"]),
-        t0_s=float(values["t0_s"]),
-        states=tuple(values["states"].tolist()),
-        **{name: values[name] for name in _ARRAYS},
-    )
+_BY_STATE = (*_STACKED, "degradation", "presence", "found")

@@ -2,15 +2,14 @@
 
 import hashlib
 import json
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
 from worldstate.adapters.simulation.plan import Plan
 from worldstate.adapters.simulation.presets import Preset
@@ -74,12 +73,7 @@ def listen_twins(
         If a file in `folder` is damaged.
     """
     work = partial(_recall_or_listen, folder, settings)
-    if jobs == 1 or len(plans) == 1:
-        yield from map(work, plans)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(plans)), mp_context=context) as pool:
-        yield from pool.map(work, plans)
+    yield from in_processes(work, plans, jobs)
 
 
 def _recall_or_listen(folder: Path, settings: TwinSettings, plan: Plan) -> TwinRecording:
