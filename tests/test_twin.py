@@ -8,6 +8,7 @@ import pytest
 from sklearn.metrics import roc_auc_score
 from sklearn.metrics import roc_curve as sklearn_roc
 
+from worldstate.abduction.ensemble import EnsembleModel
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.simulation import SimulationSettings, preset, simulate_recording, site
 from worldstate.adapters.simulation.plan import plan_static
@@ -226,6 +227,9 @@ def test_training_on_the_twin_is_kept_and_apart_from_the_test(tmp_path, monkeypa
     assert first.to_dict() == again.to_dict()
     assert len(made) == 1
     assert made != [1]
+    ensemble = train_on_twin(tmp_path, preset(), 1, per_approach=1, method="worldstate")
+    assert isinstance(ensemble, EnsembleModel)
+    assert len(made) == 1
     train_on_twin(tmp_path, replace(preset(), far_rate=0.0), 1, per_approach=1)
     assert len(made) == 2
 

@@ -1,4 +1,4 @@
-"""The published classifier, trained on the twin's own junctions as the paper's was on its own.
+"""A classifier trained on the twin's own junctions, as the paper's was on its own.
 
 The paper's classifier has heard other recordings of the very sites that it is tested at. One that was trained
 on the real sites meets the simulated ones as strangers, which is the leave-one-junction-out case instead.
@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.signature import SignatureModel
+from worldstate.abduction.any_signature import AnySignature
+from worldstate.abduction.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature_training import PublishedClassifier
 from worldstate.adapters.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.simulation import SITES, Preset
 from worldstate.evaluation.simulated_windows import LAYOUT, simulated_windows
+from worldstate.evaluation.site_references import with_site_references
+from worldstate.evaluation.training import TrainingMethod
 from worldstate.evaluation.twin_simulation import VERSION
 
 # 170 windows of each class of left and right together, front and none: the released set has 170, 170 and 158
@@ -30,11 +33,12 @@ def train_on_twin(
     levels: Preset,
     seed: int,
     *,
+    method: TrainingMethod = "baseline",
     jobs: int = 1,
     per_approach: int = PER_APPROACH,
     progress: Callable[[], None] = lambda: None,
-) -> SignatureModel:
-    """Simulate training windows at the twin's sites and fit the published classifier to them.
+) -> AnySignature:
+    """Simulate training windows at the twin's sites and fit a classifier to them.
 
     Parameters
     ----------
@@ -44,6 +48,8 @@ def train_on_twin(
         Levels of the simulation.
     seed : int
         Of the twin. Its training recordings are drawn from another stream than its test recordings.
+    method : {"baseline", "worldstate"}
+        The published classifier, or the ensemble on windows compared with their site.
     jobs : int
         Processes.
     per_approach : int
@@ -66,6 +72,9 @@ def train_on_twin(
     else:
         table = _simulate(levels, seed, jobs, per_approach, progress)
         write_features(path, table)
+    if method == "worldstate":
+        inputs = with_site_references(table)
+        return SiteEnsembleClassifier().fit(inputs.features, inputs.labels).model_
     return PublishedClassifier(np.random.default_rng(seed)).fit(table.features, table.labels).model_
 
 
