@@ -81,7 +81,10 @@ class AdaptiveBudget:
         in_range("longest_alarm_s", self.longest_alarm_s, 0.0, 1e6, open_low=True)
 
     def gamma(self, calibrated: float, shift_nats: float) -> float:
-        """Return the threshold at a shift; never above `highest` unless it was calibrated there.
+        r"""Return the threshold at a shift; never above `highest` unless it was calibrated there.
+
+        .. math:: \mathrm{logit}\, \gamma_t = \mathrm{logit}\, \gamma + x_t, \qquad
+                  \gamma_t \le \max(\gamma, highest)
 
         Parameters
         ----------
@@ -89,6 +92,10 @@ class AdaptiveBudget:
             Threshold of the policy.
         shift_nats : float
             How far it has moved, on the log-odds of the statistic.
+
+        References
+        ----------
+        Derived here: on log-odds a shift means the same evidence wherever the threshold stands.
 
         Examples
         --------
@@ -156,7 +163,12 @@ class AdaptiveThreshold:
     def advance(
         self, budget: AdaptiveBudget, *, visible: float, none: float, alarm: bool, elapsed_s: float
     ) -> "AdaptiveThreshold":
-        """Return the state after one more hop.
+        r"""Return the state after one more hop.
+
+        .. math:: x \leftarrow \min(\max(x + \eta\, (N - \lambda\, \Delta t), -x_{down}), x_{up})
+
+        with N one where an alarm has turned out false in this hop, and the time counted while the street is
+        empty.
 
         Parameters
         ----------
@@ -168,6 +180,11 @@ class AdaptiveThreshold:
             Whether the sustained rule is in alarm now.
         elapsed_s : float
             Time since the last hop.
+
+        References
+        ----------
+        I. Gibbs and E. Candès, "Adaptive conformal inference under distribution shift", 2021 (updates of this
+        kind).
         """
         onset = alarm and not self.alarm
         pending_s = 0.0 if onset and self.pending_s is None else self.pending_s

@@ -37,7 +37,10 @@ class ReliabilityCurve:
 
 
 def reliability_curve(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> ReliabilityCurve:
-    """Return the reliability curve over bins of equal width on [0, 1].
+    r"""Return the reliability curve over bins of equal width on [0, 1].
+
+    .. math:: \overline r_b = \frac1{n_b} \sum_{i \in b} r_i, \qquad
+              \overline y_b = \frac1{n_b} \sum_{i \in b} y_i
 
     Parameters
     ----------
@@ -57,6 +60,10 @@ def reliability_curve(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> 
     ------
     InvalidArgumentError
         If the sample is empty, the shapes differ or a risk is no probability.
+
+    References
+    ----------
+    M. DeGroot and S. Fienberg, "The comparison and evaluation of forecasters", The Statistician 32, 1983.
 
     Examples
     --------
@@ -108,7 +115,9 @@ def expected_calibration_error(risk: ArrayLike, hazards: ArrayLike, bins: int = 
 def calibration_error_floor(
     risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
 ) -> float:
-    """Return the mean ECE that labels drawn from these very risks would score: the sampling floor at this n.
+    r"""Return the mean ECE that labels drawn from these very risks would score: the sampling floor at this n.
+
+    .. math:: E[ECE(r, y)], \qquad P(y_i = 1) = r_i
 
     Parameters
     ----------
@@ -129,6 +138,11 @@ def calibration_error_floor(
     InvalidArgumentError
         As `reliability_curve`.
 
+    References
+    ----------
+    J. Bröcker and L. A. Smith, "Increasing the reliability of reliability diagrams", Weather and Forecasting
+    22, 2007 (resampling under calibration).
+
     Examples
     --------
     >>> round(calibration_error_floor(np.full(400, 0.5), np.random.default_rng(0)), 2)
@@ -140,7 +154,9 @@ def calibration_error_floor(
 def calibration_error_sampling(
     risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
 ) -> tuple[float, float]:
-    """Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
+    r"""Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
+
+    .. math:: ECE = \frac1n \sum_b \Big| \sum_{i \in b} (y_i - r_i) \Big|, \qquad P(y_i = 1) = r_i
 
     Errors are those of `calibration_error_floor`, which is the mean.
 
@@ -158,6 +174,11 @@ def calibration_error_sampling(
     mean, std : float
         Of the ECE.
 
+    References
+    ----------
+    J. Bröcker and L. A. Smith, "Increasing the reliability of reliability diagrams", Weather and Forecasting
+    22, 2007.
+
     Examples
     --------
     >>> mean, deviation = calibration_error_sampling(np.full(400, 0.5), np.random.default_rng(0))
@@ -173,7 +194,9 @@ def calibration_error_sampling(
 
 
 def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
-    """Return the mean squared difference between risk and what came true.
+    r"""Return the mean squared difference between risk and what came true.
+
+    .. math:: B = \frac1n \sum_i (r_i - y_i)^2
 
     Errors are those of `reliability_curve`.
 
@@ -186,6 +209,11 @@ def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
     -------
     float
         In [0, 1].
+
+    References
+    ----------
+    G. W. Brier, "Verification of forecasts expressed in terms of probability", Monthly Weather Review 78,
+    1950.
 
     Examples
     --------

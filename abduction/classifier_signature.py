@@ -81,7 +81,9 @@ class ClassifierSignature:
         return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
 
     def predict_proba(self, X: ArrayLike) -> Numbers:
-        """Return the posteriors of front, left, none, right, shape (n, 4).
+        r"""Return the posteriors of front, left, none, right, shape (n, 4).
+
+        .. math:: P_c = \frac{\max(p_c, 10^{-7})}{\sum_{c'} \max(p_{c'}, 10^{-7})}
 
         Parameters
         ----------
@@ -92,6 +94,10 @@ class ClassifierSignature:
         ------
         InvalidArgumentError
             If X is not finite or the classifier answers with something that is no distribution.
+
+        References
+        ----------
+        From the definition.
         """
         inputs = finite_array("X", X, (None, None))
         answer = finite_array(
@@ -103,7 +109,9 @@ class ClassifierSignature:
         return np.asarray(posteriors / posteriors.sum(axis=1, keepdims=True))
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
-        """Return the log-likelihoods of one window.
+        r"""Return the log-likelihoods of one window.
+
+        .. math:: \log \ell_c = \log P_c - \log \pi_c
 
         Parameters
         ----------
@@ -114,6 +122,10 @@ class ClassifierSignature:
         ------
         InvalidArgumentError
             As `predict_proba`.
+
+        References
+        ----------
+        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         ratios = np.log(self.predict_proba(np.atleast_2d(feature))[0]) - np.log(self.class_prior)
         left, right, visible, none = ratios[list(EXPLANATION_COLUMNS)].tolist()

@@ -36,12 +36,20 @@ class Absent:
         in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_high=True)
 
     def log_likelihoods(self) -> np.ndarray:
-        """Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible.
+        r"""Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible.
+
+        .. math:: p = \big(1 - \kappa,\; \beta\, (1 - \kappa),\; 1 - \kappa\big)
+
+        with beta the miss rate and kappa the clutter rate.
 
         Returns
         -------
         ndarray, shape (3,)
             Nats.
+
+        References
+        ----------
+        Eq. (post) of the paper. Derived here: an empty sector needs that nothing is found by mistake either.
         """
         spurious = np.log1p(-self.clutter_rate)
         with np.errstate(divide="ignore"):
@@ -75,12 +83,20 @@ class Present:
         in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
 
     def log_likelihoods(self) -> np.ndarray:
-        """Log p(present | hidden, visible, none), shape (3,), nats.
+        r"""Log p(present | hidden, visible, none), shape (3,), nats.
+
+        .. math:: p = \big(\kappa,\; 1 - \beta\, (1 - \kappa),\; \kappa\big)
+
+        with beta the miss rate and kappa the clutter rate.
 
         Returns
         -------
         ndarray, shape (3,)
             Nats.
+
+        References
+        ----------
+        Derived here: the complement of `Absent`.
         """
         spurious = np.log(self.clutter_rate)
         found = np.log1p(-self.miss_rate * (1.0 - self.clutter_rate))
@@ -107,10 +123,16 @@ class Unqueried:
     def log_likelihoods(self) -> np.ndarray:
         """Zero for every explanation, shape (3,): beta = 1, it moves nothing.
 
+        ``log p = 0`` for all.
+
         Returns
         -------
         ndarray, shape (3,)
             Zeros.
+
+        References
+        ----------
+        Eq. (post) of the paper with beta = 1.
         """
         return np.zeros(3)
 

@@ -86,7 +86,10 @@ def conformal_threshold(
 
 
 def recordings_needed(alpha: float, confidence: float | None = None) -> int:
-    """Return the fewest hazard-free recordings from which a conformal threshold is finite.
+    r"""Return the fewest hazard-free recordings from which a conformal threshold is finite.
+
+    .. math:: n = \lceil 1 / \alpha \rceil - 1, \qquad
+              n_c = \Big\lceil \frac{\ln (1 - c)}{\ln (1 - \alpha)} \Big\rceil
 
     Parameters
     ----------
@@ -99,6 +102,11 @@ def recordings_needed(alpha: float, confidence: float | None = None) -> int:
     -------
     int
         Number of recordings.
+
+    References
+    ----------
+    Angelopoulos et al. 2022 with no loss at all: see `conformal_threshold`; S. S. Wilks, "Determination of
+    sample sizes for setting tolerance limits", Ann. Math. Statist. 12, 1941.
 
     Examples
     --------

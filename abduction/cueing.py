@@ -50,10 +50,16 @@ class SustainedRule:
     def advance(self, held: bool) -> "SustainedRule":
         """Return the state after one more hop.
 
+        ``run' = min(run + 1, k)`` if the hop held, else ``run' = 0``.
+
         Parameters
         ----------
         held : bool
             Whether the statistic is at or above the threshold.
+
+        References
+        ----------
+        Section VII of the paper.
         """
         return replace(self, run=min(self.run + 1, self.sustain_hops) if held else 0)
 
@@ -112,7 +118,7 @@ class CueingPolicy:
             raise InvalidArgumentError("reference_prior: expected 3 or more positive numbers, sum one")
 
     def exceeded(self, statistic: float) -> bool:
-        """Whether a statistic is at or above the threshold.
+        """Whether a statistic is at or above the threshold, ``s >= gamma``.
 
         Parameters
         ----------
@@ -123,16 +129,26 @@ class CueingPolicy:
         -------
         bool
             True at the threshold itself.
+
+        References
+        ----------
+        Section VII of the paper.
         """
         return statistic >= self.gamma
 
     def gamma_at(self, shift_nats: float) -> float:
-        """Return the threshold once it has moved by so much; gamma itself where nothing moves it.
+        r"""Return the threshold once it has moved by so much; gamma itself where nothing moves it.
+
+        .. math:: \mathrm{logit}\, \gamma_t = \mathrm{logit}\, \gamma + x_t
 
         Parameters
         ----------
         shift_nats : float
             On the log-odds of the statistic.
+
+        References
+        ----------
+        Derived here: see `AdaptiveBudget.gamma`.
         """
         return self.gamma if self.adaptive is None else self.adaptive.gamma(self.gamma, shift_nats)
 
@@ -231,7 +247,9 @@ class CueingPolicies:
 
 
 def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.float64]:
-    """Return the smallest statistic of the last k hops; -inf where there are fewer.
+    r"""Return the smallest statistic of the last k hops; -inf where there are fewer.
+
+    .. math:: h_t = \min(s_{t-k+1}, \dots, s_t)
 
     The sustained rule is in alarm exactly where this is at or above the threshold.
 
@@ -246,6 +264,10 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.f
     -------
     ndarray, shape (windows,)
         Of the statistic's own scale.
+
+    References
+    ----------
+    Section VII of the paper. Derived here: k values are all above gamma where their least is.
 
     Examples
     --------
@@ -263,6 +285,8 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.f
 def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
     """Return where the last k hops all held, shape (windows,): `SustainedRule` over a whole recording.
 
+    ``alarm_t = held_(t-k+1) and .. and held_t``
+
     Parameters
     ----------
     held : array_like of bool, shape (windows,)
@@ -275,6 +299,10 @@ def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
     ndarray of bool, shape (windows,)
         False in the first k - 1 windows.
 
+    References
+    ----------
+    Section VII of the paper.
+
     Examples
     --------
     >>> sustained_alarm([True, True, False, True], sustain_hops=2)
@@ -284,7 +312,9 @@ def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
 
 
 def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1, 3)) -> NDArray[np.bool_]:
-    """Return where the most probable class is a hazard: the published rule's decision, shape (windows,).
+    r"""Return where the most probable class is a hazard: the published rule's decision, shape (windows,).
+
+    .. math:: \hat c = \arg\max_c P_c, \qquad \hat c \in \{left, right\}
 
     Parameters
     ----------
@@ -297,6 +327,10 @@ def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1
     -------
     ndarray of bool, shape (windows,)
         Ties go to the first class.
+
+    References
+    ----------
+    Y. Schulz et al., "Hearing what you cannot see: acoustic vehicle detection around corners", 2021.
 
     Examples
     --------

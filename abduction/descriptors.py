@@ -71,12 +71,19 @@ class Coupling:
         in_range("std", self.std, 0.0, np.inf, open_low=True, open_high=True)
 
     def expected(self, radial_speed_m_s: ArrayLike) -> Numbers:
-        """Return the value on every curve, shape (curves, n).
+        r"""Return the value on every curve, shape (curves, n).
+
+        .. math:: f_g(v) = f_{g,i} + (f_{g,i+1} - f_{g,i})\, \frac{v - v_i}{v_{i+1} - v_i}, \qquad
+                  v_i \le v \le v_{i+1}
 
         Parameters
         ----------
         radial_speed_m_s : array_like, shape (n,)
             v_r, m/s, positive while receding.
+
+        References
+        ----------
+        From the definition.
         """
         speed = np.asarray(radial_speed_m_s, dtype=np.float64)
         return np.stack([np.interp(speed, self.speed_m_s, curve) for curve in self.curves])
@@ -92,6 +99,10 @@ class Coupling:
             Measured value and its standard deviation, in the unit of the curve.
         radial_speed_m_s : array_like, shape (n,)
             v_r, m/s.
+
+        References
+        ----------
+        Eq. (lik) of the paper, one factor of its first; the gears mixed alike.
         """
         expected = self.expected(radial_speed_m_s)
         variance = self.std**2 + value_std**2
@@ -143,12 +154,18 @@ class Descriptor:
             raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
 
     def log_speed_prior(self, radial_speed_m_s: Numbers) -> Numbers:
-        """Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
+        r"""Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
+
+        .. math:: P(v_i) \propto \exp\big(-\tfrac12 (v_i - \mu)^2 / \sigma^2\big), \qquad \sum_i P(v_i) = 1
 
         Parameters
         ----------
         radial_speed_m_s : ndarray, shape (n,)
             Grid of v_r, m/s.
+
+        References
+        ----------
+        From the definition: a normal law on a grid.
         """
         log_weight = -0.5 * ((radial_speed_m_s - self.speed_mean_m_s) / self.speed_std_m_s) ** 2
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
@@ -171,6 +188,10 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
     Coupling
         Hz over m/s.
 
+    References
+    ----------
+    From the definition: wheels and gears that do not slip. Numbers of ordinary cars.
+
     Examples
     --------
     >>> engine_line().expected([10.0]).round(0).ravel()
@@ -185,6 +206,9 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
 def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     r"""Level of the 1 kHz octave above that of 125 Hz: rolling noise takes over from the engine with speed.
 
+    .. math:: \Delta L = L_{1000} - L_{125}, \qquad
+              L = 10 \log_{10} \big(10^{L_R / 10} + 10^{L_P / 10}\big)
+
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
 
@@ -197,6 +221,11 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     -------
     Coupling
         dB over m/s.
+
+    References
+    ----------
+    European Commission, Directive 2015/996 (CNOSSOS-EU), annex, category 1: see
+    `worldstate.abduction.descriptors`.
 
     Examples
     --------
@@ -211,7 +240,9 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
 
 
 def doppler_trajectory(std: float = 0.01) -> Coupling:
-    """Ratio of the frequencies heard before and after a pass-by: (c + v) / (c - v).
+    """Ratio of the frequencies heard before and after a pass-by.
+
+    .. math:: f_{before} / f_{after} = (c + v) / (c - v)
 
     Parameters
     ----------
@@ -222,6 +253,10 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
     -------
     Coupling
         A ratio over m/s.
+
+    References
+    ----------
+    P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.2 (the shift of a moving source).
 
     Examples
     --------

@@ -123,7 +123,10 @@ class EnsembleModel:
         return replace(self, home=reference)
 
     def predict_proba(self, X: ArrayLike) -> Numbers:
-        """Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+        r"""Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+
+        .. math:: P(c \mid x) \propto \exp \tfrac{1}{2 E} \sum_e
+                  \big[ \ell_e(c, x) + \ell_e(\bar c, \bar x) \big], \qquad \sum_c P = 1
 
         Parameters
         ----------
@@ -134,13 +137,20 @@ class EnsembleModel:
         ------
         InvalidArgumentError
             On another shape, NaN or infinity.
+
+        References
+        ----------
+        C. Genest and J. V. Zidek, "Combining probability distributions: a critique and an annotated
+        bibliography", Statist. Sci. 1, 1986 (the logarithmic pool).
         """
         levels, reference = self._split(X)
         posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
         return np.asarray(posteriors / total(posteriors))
 
     def log_likelihoods(self, X: ArrayLike) -> Numbers:
-        r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
+        r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
+
+        .. math:: \log \ell_c = \log P_c - \log \pi_c
 
         Errors are those of `predict_proba`.
 
@@ -148,11 +158,17 @@ class EnsembleModel:
         ----------
         X : array_like, shape (n, features) or (n, 4 * features)
             As for `predict_proba`.
+
+        References
+        ----------
+        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return explanation_ratios(self.predict_proba(X), self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
-        """Return the log-likelihoods of one window, shape (features,) or (4 * features,).
+        r"""Return the log-likelihoods of one window, shape (features,) or (4 * features,).
+
+        .. math:: \log \ell_c = \log P_c - \log \pi_c
 
         Parameters
         ----------
@@ -163,6 +179,10 @@ class EnsembleModel:
         ------
         InvalidArgumentError
             On another shape, NaN or infinity.
+
+        References
+        ----------
+        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
 

@@ -84,7 +84,10 @@ class SiteEnsembleClassifier:
         self.recipes = recipes
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Fit on windows with the references of their sites behind them, and class names.
+        r"""Fit on windows with the references of their sites behind them, and class names.
+
+        .. math:: \hat W_e, \hat b_e = \arg\min_{W, b} \Big[ \frac{\lambda_e}{2} \|W\|^2
+                  - \frac1n \sum_i \ell_e(c_i, x_i) \Big]
 
         Parameters
         ----------
@@ -102,6 +105,11 @@ class SiteEnsembleClassifier:
         ------
         InvalidArgumentError
             If X has another shape or is not finite, or a class is missing or unknown.
+
+        References
+        ----------
+        S. le Cessie and J. C. van Houwelingen, "Ridge estimators in logistic regression", Appl. Statist. 41,
+        1992.
         """
         inputs = finite_array("X", X, (None, None))
         if inputs.shape[1] % (SEGMENTS * (1 + len(KINDS))):

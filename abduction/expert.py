@@ -67,12 +67,18 @@ class Expert:
             raise InvalidArgumentError("scale: expected positive numbers")
 
     def log_posteriors(self, seen: Numbers) -> Numbers:
-        """Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4).
+        r"""Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4).
+
+        .. math:: \ell = \log \mathrm{softmax}\, \big( W (v - \mu) / \sigma + b \big)
 
         Parameters
         ----------
         seen : ndarray, shape (n, inputs)
             Its view of the windows.
+
+        References
+        ----------
+        From the definition of logistic regression.
         """
         return log_softmax((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
@@ -105,7 +111,12 @@ class Expert:
 
 
 def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -> dict[str, Numbers]:
-    """Return what experts look at, each of shape (n, inputs); what several share is computed once.
+    r"""Return what experts look at, each of shape (n, inputs); what several share is computed once.
+
+    .. math:: v = x - r \text{ (mean, median, quiet)}, \qquad v = \phi(x) \text{ (shape)}, \qquad
+              v = \phi(x) - \phi(r_{median}) \text{ (change)}
+
+    with phi by `shape_features`.
 
     Parameters
     ----------
@@ -120,6 +131,10 @@ def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -
     -------
     dict of str to ndarray, shape (n, inputs)
         By name.
+
+    References
+    ----------
+    Derived here: a difference of logarithms takes out what every window of a site shares.
 
     Examples
     --------
@@ -136,7 +151,9 @@ def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -
 
 
 def log_softmax(sums: Numbers) -> Numbers:
-    """Return the rows less the log of their summed exponentials.
+    r"""Return the rows less the log of their summed exponentials.
+
+    .. math:: \ell_c = a_c - \log \sum_{c'} e^{a_{c'}}
 
     Parameters
     ----------
@@ -148,6 +165,10 @@ def log_softmax(sums: Numbers) -> Numbers:
     ndarray, shape (n, classes)
         Logarithms of rows that sum to one.
 
+    References
+    ----------
+    From the definition.
+
     Examples
     --------
     >>> log_softmax(np.zeros((1, 4))).round(3)
@@ -158,7 +179,9 @@ def log_softmax(sums: Numbers) -> Numbers:
 
 
 def total(values: Numbers) -> Numbers:
-    """Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand.
+    r"""Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand.
+
+    .. math:: s_i = \sum_j x_{ij}
 
     Parameters
     ----------
@@ -170,6 +193,10 @@ def total(values: Numbers) -> Numbers:
     ndarray, shape (n, 1)
         Sums of rows.
 
+    References
+    ----------
+    From the definition; summed in rising order, because rounding depends on the order.
+
     Examples
     --------
     >>> total(np.array([[1.0, 2.0, 3.0]]))
@@ -179,7 +206,9 @@ def total(values: Numbers) -> Numbers:
 
 
 def split_reference(X: Numbers) -> tuple[Numbers, Numbers]:
-    """Part windows with a reference behind them into log-levels and references.
+    r"""Part windows with a reference behind them into log-levels and references.
+
+    .. math:: x = \ln \max(X, 10^{-4})
 
     Parameters
     ----------
@@ -190,6 +219,10 @@ def split_reference(X: Numbers) -> tuple[Numbers, Numbers]:
     -------
     levels, reference : ndarray, shape (n, features) and (n, 3 * features)
         Natural logarithms.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

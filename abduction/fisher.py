@@ -30,6 +30,10 @@ def combined_information(parts: Sequence[ArrayLike]) -> Matrix:
     InvalidArgumentError
         If there is none, shapes differ or one is no information matrix.
 
+    References
+    ----------
+    Proposition (prop:recover) of the paper, part (ii).
+
     Examples
     --------
     >>> combined_information([[[4.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [0.0, 9.0]]])
@@ -63,6 +67,10 @@ def gaussian_information(slope: ArrayLike, covariance: ArrayLike) -> Matrix:
     ------
     InvalidArgumentError
         If shapes do not fit or R is not positive definite.
+
+    References
+    ----------
+    S. M. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*, 1993, chapter 3.
 
     Examples
     --------
@@ -112,6 +120,11 @@ def common_cause_information(
     InvalidArgumentError
         If lengths or shapes do not fit.
 
+    References
+    ----------
+    Derived here: a common disturbance is noise of rank one across modalities; it fails assumption (A1) of
+    section VI of the paper.
+
     Examples
     --------
     >>> one = ([[1.0]], [[1.0]])
@@ -152,6 +165,11 @@ def claimed_covariance(
     InvalidArgumentError
         As `common_cause_information`, and if the state cannot be told even if (A1) held.
 
+    References
+    ----------
+    P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967 (the
+    covariance under a wrong model).
+
     Examples
     --------
     >>> claimed, true = claimed_covariance([[[1.0]]] * 2, [[[1.0]]] * 2, [[1.0]] * 2)
@@ -174,7 +192,9 @@ def claimed_covariance(
 
 
 def at_least(larger: ArrayLike, smaller: ArrayLike) -> bool:
-    """Tell whether one information matrix is at least the other in the Loewner order.
+    r"""Tell whether one information matrix is at least the other in the Loewner order.
+
+    .. math:: \lambda_{min}(J_1 - J_2) \ge 0
 
     Parameters
     ----------
@@ -185,6 +205,10 @@ def at_least(larger: ArrayLike, smaller: ArrayLike) -> bool:
     -------
     bool
         Whether the difference has no negative eigenvalue beyond rounding.
+
+    References
+    ----------
+    From the definition of the Loewner order.
 
     Examples
     --------

@@ -51,12 +51,18 @@ class Background:
     std: float
 
     def log_density(self, value: float) -> float:
-        """Return the log density at a value, nats.
+        r"""Return the log density at a value, nats.
+
+        .. math:: \log p = -\tfrac12 (x - \mu)^2 / \sigma^2 - \log(\sigma \sqrt{2 \pi})
 
         Parameters
         ----------
         value : float
             In the unit of the background.
+
+        References
+        ----------
+        From the definition of the normal law.
         """
         return float(-0.5 * ((value - self.mean) / self.std) ** 2 - np.log(self.std * np.sqrt(2 * pi)))
 
@@ -89,12 +95,19 @@ class Sector:
     std_rad: float
 
     def log_prior(self, azimuths_rad: Numbers) -> Numbers:
-        """Return log P(theta) on a grid, normalised over it, shape (n,), nats.
+        r"""Return log P(theta) on a grid, normalised over it, shape (n,), nats.
+
+        .. math:: P(\theta_i) \propto \exp\big(-\tfrac12 (\theta_i - \theta_0)^2 / \sigma^2\big), \qquad
+                  \sum_i P(\theta_i) = 1
 
         Parameters
         ----------
         azimuths_rad : ndarray, shape (n,)
             Grid, radians.
+
+        References
+        ----------
+        From the definition: a normal law on a grid.
         """
         log_weight = -0.5 * ((azimuths_rad - self.azimuth_rad) / self.std_rad) ** 2
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
@@ -191,7 +204,13 @@ def ground(
     descriptors: Sequence[Descriptor],
     settings: GroundedSettings | None = None,
 ) -> GroundedAnswer:
-    """Weigh the classifier's evidence with what physics says of the other measurements.
+    r"""Weigh the classifier's evidence with what physics says of the other measurements.
+
+    .. math:: \log \ell'_h = \log \ell_h + \log \sum_{c, v} P(c)\, P(v \mid c)\,
+              \frac{p(o \mid c, v)\, p(\hat v \mid v)}{p_0}
+              + \log \sum_\theta P(\theta \mid h)\, \frac{p(\hat\theta \mid \theta)}{p_0}
+
+    for h hidden or visible, with p_0 the density without a source; that of none is left as it is.
 
     Parameters
     ----------
@@ -213,6 +232,10 @@ def ground(
     ------
     InvalidArgumentError
         If there is no descriptor, a name comes twice, or a measured observable has no background.
+
+    References
+    ----------
+    Eq. (lik) of the paper, and its integral in section V.
 
     Examples
     --------

@@ -55,6 +55,10 @@ def entropy_bits(probabilities: ArrayLike) -> float:
     InvalidArgumentError
         If it is no distribution.
 
+    References
+    ----------
+    C. E. Shannon, "A mathematical theory of communication", Bell Syst. Tech. J. 27, 1948.
+
     Examples
     --------
     >>> entropy_bits([0.5, 0.25, 0.25])
@@ -82,6 +86,10 @@ def mutual_information_bits(joint: ArrayLike) -> float:
     ------
     InvalidArgumentError
         If it is no distribution.
+
+    References
+    ----------
+    C. E. Shannon, "A mathematical theory of communication", Bell Syst. Tech. J. 27, 1948.
 
     Examples
     --------
@@ -122,6 +130,10 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
     InvalidArgumentError
         If shapes differ, a row is no distribution or a state is none.
 
+    References
+    ----------
+    D. Barber and F. Agakov, "The IM algorithm: a variational approach to information maximization", 2003.
+
     Examples
     --------
     >>> sure = information_from_posteriors([[1.0, 0.0], [0.0, 1.0]] * 500, [0, 1] * 500)
@@ -136,7 +148,11 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
 
 
 def state_entropy_bits(states: ArrayLike, count: int) -> float:
-    """Return the entropy of labels, its small-sample bias added back, at most log2 of their number.
+    r"""Return the entropy of labels, its small-sample bias added back, at most log2 of their number.
+
+    .. math:: \hat H = \min\Big(-\sum_k \hat p_k \log_2 \hat p_k + \frac{K_+ - 1}{2 n \ln 2},\; \log_2 K\Big)
+
+    with K_+ the labels that occur.
 
     Parameters
     ----------
@@ -149,6 +165,10 @@ def state_entropy_bits(states: ArrayLike, count: int) -> float:
     -------
     float
         Bits, at most log2 K.
+
+    References
+    ----------
+    G. A. Miller, "Note on the bias of information estimates", 1955.
 
     Examples
     --------
@@ -248,6 +268,10 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
     InvalidArgumentError
         If a number is out of range.
 
+    References
+    ----------
+    Proposition (prop:recover) of the paper, part (i).
+
     Examples
     --------
     >>> fano_bound(entropy=2.0, information=0.2, states=4)
@@ -278,6 +302,10 @@ def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
     -------
     float
         In [0, 1 - 1/K].
+
+    References
+    ----------
+    T. M. Cover and J. A. Thomas, *Elements of Information Theory*, 1991, chapter 2 (Fano's inequality).
 
     Examples
     --------
@@ -320,6 +348,11 @@ def conditional_information(acoustic: ArrayLike, both: ArrayLike, states: ArrayL
     InvalidArgumentError
         As `information_from_posteriors`.
 
+    References
+    ----------
+    Section VI of the paper (the vision-unique part); its estimate from posteriors: see
+    `information_from_posteriors`.
+
     Examples
     --------
     >>> round(conditional_information([[0.5, 0.5]] * 2, [[0.9, 0.1], [0.1, 0.9]], [0, 1]), 3)
@@ -354,6 +387,10 @@ def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> Numbers:
     ------
     InvalidArgumentError
         If shapes differ or a row is no distribution.
+
+    References
+    ----------
+    Bayes' rule under assumption (A1), section VI of the paper.
 
     Examples
     --------

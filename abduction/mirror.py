@@ -9,7 +9,9 @@ Numbers = NDArray[np.float64]
 
 
 def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
-    """Return the features of the mirrored scene: azimuths reversed within each segment.
+    r"""Return the features of the mirrored scene: azimuths reversed within each segment.
+
+    .. math:: \bar x_{s,a} = x_{s, A - 1 - a}
 
     Parameters
     ----------
@@ -22,6 +24,10 @@ def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
     -------
     ndarray, shape of `X`
         A copy.
+
+    References
+    ----------
+    From the definition: azimuths are evenly spaced about straight ahead.
 
     Examples
     --------

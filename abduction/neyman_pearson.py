@@ -44,7 +44,7 @@ def neyman_pearson_threshold(
 
     References
     ----------
-    Paper, Section VII; DESIGN.md, Definitions, gamma(alpha).
+    Section VII of the paper; DESIGN.md, Definitions, gamma(alpha).
 
     Examples
     --------

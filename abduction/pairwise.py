@@ -41,7 +41,9 @@ def class_pairs(n_classes: int) -> list[tuple[int, int]]:
 
 
 def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]:
-    """Return class probabilities, shape (n, classes), positive and summing to one.
+    r"""Return class probabilities, shape (n, classes), positive and summing to one.
+
+    .. math:: \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2, \qquad \sum_i p_i = 1
 
     Parameters
     ----------
@@ -54,6 +56,10 @@ def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]
     -------
     ndarray, shape (n, classes)
         Rows that sum to one.
+
+    References
+    ----------
+    T.-F. Wu, C.-J. Lin and R. C. Weng 2004, second method: see `worldstate.abduction.pairwise`.
 
     Examples
     --------

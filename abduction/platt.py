@@ -18,7 +18,9 @@ _RIDGE = 1e-12
 
 
 def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 / (1 + exp(slope * value + offset)) without overflow, broadcast.
+    r"""Return a falling or rising sigmoid without overflow, broadcast.
+
+    .. math:: p(f) = 1 / (1 + \exp(A f + B))
 
     Parameters
     ----------
@@ -32,6 +34,10 @@ def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> 
     ndarray
         In (0, 1).
 
+    References
+    ----------
+    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.platt`.
+
     Examples
     --------
     >>> sigmoid(np.array([0.0, 1e6]), -1.0, 0.0)
@@ -42,7 +48,10 @@ def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> 
 
 
 def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
-    """Return (A, B) of greatest likelihood, with the targets drawn in by Platt's prior.
+    r"""Return (A, B) of greatest likelihood, with the targets drawn in by Platt's prior.
+
+    .. math:: \hat A, \hat B = \arg\min_{A, B} -\sum_i \big[ t_i \ln p(f_i) + (1 - t_i) \ln(1 - p(f_i)) \big],
+              \qquad t_+ = \frac{n_+ + 1}{n_+ + 2}, \quad t_- = \frac{1}{n_- + 2}
 
     Parameters
     ----------
@@ -60,6 +69,10 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
     ------
     InvalidArgumentError
         If there are no samples or they do not fit.
+
+    References
+    ----------
+    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.platt`.
 
     Examples
     --------

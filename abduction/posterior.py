@@ -100,7 +100,7 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
 
     References
     ----------
-    Paper, Section V, eq. (post); [1] "Hearing What You Cannot See" supplies the explanations.
+    Eq. (post) of the paper, section V.
 
     Examples
     --------
@@ -151,6 +151,10 @@ def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: C
     float
         Nats.
 
+    References
+    ----------
+    Section V of the paper, after eq. (post).
+
     Examples
     --------
     >>> from worldstate.abduction.co_evidence import Absent, Unqueried
@@ -194,6 +198,10 @@ def statistic(
     ------
     InvalidArgumentError
         As `abduce`.
+
+    References
+    ----------
+    Eq. (post) of the paper at a fixed prior.
 
     Examples
     --------

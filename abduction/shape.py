@@ -9,7 +9,12 @@ Numbers = NDArray[np.float64]
 
 
 def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
-    """Return peaks, sides, widths and changes of log-levels over directions, shape (n, 13 * segments + 5).
+    r"""Return peaks, sides, widths and changes of log-levels over directions, shape (n, 13 * segments + 5).
+
+    .. math:: p = \sum_a w_a u_a, \qquad \sigma^2 = \sum_a w_a u_a^2 - p^2, \qquad
+              w_a \propto e^{4 (x_a - \max x)}, \quad \sum_a w_a = 1
+
+    are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
 
     Mirroring the directions exchanges the sides and changes the sign of what points to one.
 
@@ -24,6 +29,10 @@ def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
     -------
     ndarray, shape (n, 13 * segments + 5)
         In the unit of the log-levels, directions in steps.
+
+    References
+    ----------
+    Derived here: the weights are a softmax, so that only directions near the peak say where it is.
 
     Examples
     --------

@@ -117,7 +117,9 @@ class SignatureModel:
         return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
 
     def decision_values(self, X: ArrayLike) -> Numbers:
-        """Return f, shape (n, 6): positive where the first class of the pair is the better one.
+        r"""Return f, shape (n, 6): positive where the first class of the pair is the better one.
+
+        .. math:: f_{ij}(x) = w_{ij}^T (x - \mu) / \sigma + b_{ij}
 
         Parameters
         ----------
@@ -127,13 +129,21 @@ class SignatureModel:
         ------
         InvalidArgumentError
             On another shape, NaN or infinity.
+
+        References
+        ----------
+        Y. Schulz et al. 2021: see `SignatureModel`; C. Cortes and V. Vapnik, "Support-vector networks",
+        Machine Learning 20, 1995.
         """
         features = finite_array("X", X, (None, self.n_features))
         values: Numbers = (features - self.mean) / self.scale @ self.coefficients.T + self.intercepts
         return values
 
     def predict_proba(self, X: ArrayLike) -> Numbers:
-        """Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+        r"""Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+
+        .. math:: r_{ij} = 1 / (1 + \exp(A_{ij} f_{ij} + B_{ij})), \qquad
+                  \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2
 
         Errors are those of `decision_values`.
 
@@ -141,11 +151,18 @@ class SignatureModel:
         ----------
         X : array_like, shape (n, features)
             One row a window.
+
+        References
+        ----------
+        J. Platt 1999 (sigmoids), T.-F. Wu, C.-J. Lin and R. C. Weng 2004 (coupling): see `platt` and
+        `pairwise`.
         """
         return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
 
     def log_likelihoods(self, X: ArrayLike) -> Numbers:
-        r"""Return :math:`\log P_c - \log \pi_c` of left, right, front (visible), none, shape (n, 4), nats.
+        r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
+
+        .. math:: \log \ell_c = \log P_c - \log \pi_c
 
         Errors are those of `decision_values`.
 
@@ -153,11 +170,17 @@ class SignatureModel:
         ----------
         X : array_like, shape (n, features)
             One row a window.
+
+        References
+        ----------
+        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return explanation_ratios(self.predict_proba(X), self.class_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
-        """Return the log-likelihoods of one feature vector, shape (features,).
+        r"""Return the log-likelihoods of one feature vector, shape (features,).
+
+        .. math:: \log \ell_c = \log P_c - \log \pi_c
 
         Parameters
         ----------
@@ -168,6 +191,10 @@ class SignatureModel:
         ------
         InvalidArgumentError
             On another shape, NaN or infinity.
+
+        References
+        ----------
+        Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
 
@@ -216,6 +243,10 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Number
     ndarray, shape (n,)
         In [0, 1].
 
+    References
+    ----------
+    Eq. (post) of the paper at the training prior.
+
     Examples
     --------
     >>> [hazard_statistic([[0.5, 0.3, 0.1, 0.1]], beta).round(3).item() for beta in (1.0, 0.0)]
@@ -228,7 +259,9 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Number
 
 
 def explanation_ratios(posteriors: Numbers, class_prior: ArrayLike) -> Numbers:
-    """Return log P_c - log pi_c of left, right, visible, none by window, shape (n, 4), nats.
+    r"""Return log-likelihoods of left, right, visible, none by window, shape (n, 4), nats.
+
+    .. math:: \log \ell_c = \log P_c - \log \pi_c
 
     Parameters
     ----------
@@ -241,6 +274,10 @@ def explanation_ratios(posteriors: Numbers, class_prior: ArrayLike) -> Numbers:
     -------
     ndarray, shape (n, 4)
         Nats.
+
+    References
+    ----------
+    Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
 
     Examples
     --------

@@ -87,7 +87,12 @@ class PublishedClassifier:
         self.penalty = penalty
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Fit on features, shape (n, features), and class names, shape (n,).
+        r"""Fit on features, shape (n, features), and class names, shape (n,).
+
+        .. math:: \min_{w, b} \tfrac12 \|w\|^2 + C \sum_n \max\big(0,\; 1 - y_n (w^T z_n + b)\big), \qquad
+                  z = (x - \mu) / \sigma
+
+        for each pair of classes, then a sigmoid a pair by `fit_sigmoid` on samples held out.
 
         Parameters
         ----------
@@ -105,6 +110,11 @@ class PublishedClassifier:
         ------
         InvalidArgumentError
             If the features are not finite or a class is missing or unknown.
+
+        References
+        ----------
+        Y. Schulz et al. 2021: see `SignatureModel`; C. Cortes and V. Vapnik, "Support-vector networks",
+        Machine Learning 20, 1995.
         """
         features = finite_array("X", X, (None, None))
         features, labels = mirror_hazards(features, checked_labels(y, len(features)))
@@ -158,7 +168,10 @@ class PublishedClassifier:
 
 
 def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
-    """Append the mirror images of all left and right windows, sides swapped.
+    r"""Append the mirror images of all left and right windows, sides swapped.
+
+    .. math:: (x, left) \to (\bar x, right), \qquad (x, right) \to (\bar x, left), \qquad
+              \bar x_{s,a} = x_{s, A - 1 - a}
 
     Only these two classes are mirrored, as published: hazards become more frequent than they were.
 
@@ -171,6 +184,10 @@ def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
     -------
     X, y : ndarray
         Longer by the number of hazard windows.
+
+    References
+    ----------
+    Y. Schulz et al. 2021: see `SignatureModel`.
 
     Examples
     --------

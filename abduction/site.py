@@ -79,16 +79,24 @@ class SiteReference:
     def shifted(self, offset: ArrayLike) -> "SiteReference":
         """Return the reference of a site whose log-levels are higher by `offset`, shape (features,).
 
+        ``r' = r + offset`` for each of the three.
+
         Parameters
         ----------
         offset : array_like, shape (features,)
             Natural logarithms.
+
+        References
+        ----------
+        From the definition.
         """
         return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
 
 
 def log_levels(X: ArrayLike) -> Numbers:
-    """Return the natural logarithm of levels, silence held at 1e-4.
+    r"""Return the natural logarithm of levels, silence held at 1e-4.
+
+    .. math:: x = \ln \max(X, 10^{-4})
 
     Parameters
     ----------
@@ -100,6 +108,10 @@ def log_levels(X: ArrayLike) -> Numbers:
     ndarray, same shape
         Natural logarithms.
 
+    References
+    ----------
+    From the definition.
+
     Examples
     --------
     >>> log_levels([[1.0, 0.0]]).round(2)
@@ -109,7 +121,10 @@ def log_levels(X: ArrayLike) -> Numbers:
 
 
 def site_reference(levels: ArrayLike) -> SiteReference:
-    """Return the reference of a site from its windows, shape (windows, features), natural logarithms.
+    r"""Return the reference of a site from its windows, shape (windows, features), natural logarithms.
+
+    .. math:: r = \big(\langle x \rangle,\; \mathrm{median}\, x,\;
+              \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
 
     Parameters
     ----------
@@ -125,6 +140,11 @@ def site_reference(levels: ArrayLike) -> SiteReference:
     ------
     InvalidArgumentError
         If there is no window or a number is not finite.
+
+    References
+    ----------
+    Derived here: whoever comes raises the loudest direction, so that the windows where it is least hold
+    nobody.
 
     Examples
     --------

@@ -106,7 +106,10 @@ class SiteEstimate:
         return cls(np.zeros(n_features))
 
     def updated(self, feature: ArrayLike, dt_s: float, settings: SiteEstimateSettings) -> "SiteEstimate":
-        """Return the estimate after one more window, `dt_s` seconds after the last.
+        r"""Return the estimate after one more window, `dt_s` seconds after the last.
+
+        .. math:: h \leftarrow h\, e^{-\Delta t / \tau} + \Delta t, \qquad
+                  m \leftarrow m + \frac{\Delta t}{h}\, (\ln X - m)
 
         Parameters
         ----------
@@ -121,6 +124,10 @@ class SiteEstimate:
         ------
         InvalidArgumentError
             On another shape, NaN or infinity, or time that stands still.
+
+        References
+        ----------
+        An exponential mean, from the definition.
         """
         levels = log_levels(finite_array("feature", feature, self.level.shape))
         passed_s = in_range("dt_s", dt_s, 0.0, math.inf, open_low=True, open_high=True)
@@ -128,7 +135,10 @@ class SiteEstimate:
         return SiteEstimate(self.level + passed_s / heard_s * (levels - self.level), heard_s)
 
     def reference(self, model: EnsembleModel, settings: SiteEstimateSettings) -> SiteReference:
-        """Return what windows are to be compared with; that of the training sites before anything was heard.
+        r"""Return what windows are to be compared with; that of the training sites before anything was heard.
+
+        .. math:: r = r_{home} + \frac{h}{h + h_0} \big( g_{level} \langle d \rangle
+                  + g_{pattern} (d - \langle d \rangle) \big), \qquad d = m - x_{empty}
 
         Parameters
         ----------
@@ -141,6 +151,10 @@ class SiteEstimate:
         ------
         InvalidArgumentError
             If the model has another number of features.
+
+        References
+        ----------
+        Derived here: see the head of `worldstate.abduction.site_estimate`; gains by experiment.
         """
         if self.level.shape != model.empty.shape:
             raise InvalidArgumentError(f"model: expected {self.level.size} features, got {model.n_features}")

@@ -7,7 +7,9 @@ Numbers = NDArray[np.float64]
 
 
 def standardisation(inputs: Numbers) -> tuple[Numbers, Numbers]:
-    """Return mean and standard deviation of each column; 1 where a column never changes.
+    r"""Return mean and standard deviation of each column; 1 where a column never changes.
+
+    .. math:: \mu = \frac1n \sum_i x_i, \qquad \sigma^2 = \frac1n \sum_i (x_i - \mu)^2
 
     Parameters
     ----------
@@ -18,6 +20,10 @@ def standardisation(inputs: Numbers) -> tuple[Numbers, Numbers]:
     -------
     mean, std : ndarray, shape (columns,)
         In the units of the columns.
+
+    References
+    ----------
+    From the definition.
 
     Examples
     --------

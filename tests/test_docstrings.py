@@ -23,31 +23,56 @@ ARRAYS = r"ArrayLike|NDArray|Numbers|FloatArray|ComplexArray|Matrix"
 SHAPES = r"\([^()]*,[^()]*\)|\(\.\.\.\)|shape|any number|broadcast|[Aa]s for|array_like of float|scalar"
 # An equation is written as one and relates two sides; a source is a year, the paper, or says what it is.
 MATHS = r"\.\. math::.*(?:\n(?: .*)?)*|:math:`[^`]*`|``[^`]*``"
-RELATION = r"=|<|>|\\(?:ge|le|approx|leftarrow)\b"
-PAPER = r"(?:\b[Ee]q\. \((?:looming|crbtau|crbtheta)\)|\(cor:endfire\)|[Ss]ection [IVX]+) of the paper"
+RELATION = r"=|<|>|\\(?:ge|le|approx|propto|leftarrow)\b"
+LABELS = r"\b[Ee]q\. \((?:looming|crbtau|crbtheta|lik|post)\)|\((?:cor:endfire|prop:recover)\)"
+PAPER = rf"(?:{LABELS}|\b[Ss]ection [IVX]+) of the paper"
 SOURCE = rf"\b(?:19|20)\d\d\b|{PAPER}|\b[Ff]rom the definition\b|\b[Dd]erived here: \w"
-# Of `frontend`: what computes no quantity, and what it does instead.
+# What computes no quantity, and what it does instead.
 WITHOUT_EQUATION = {
-    "array.py:roof_array_56": "constant",
-    "channel_health.py:ArrayHealth.unknown": "container",
-    "channel_health.py:ArrayHealth.with_fault": "look-up",
-    "channel_health.py:faults_where": "container",
-    "ego_noise.py:spanned": "indices",
-    "gaps.py:GapFinder.push": "delegates",
-    "gcc.py:all_pairs": "indices",
-    "harmonic_cancellation.py:HarmonicCanceller.follow": "setter",
-    "hops.py:HopCutter.cut": "container",
-    "listener.py:Listener.push": "delegates",
-    "masking.py:ChannelMask.all_of": "container",
-    "music.py:checked_covariance": "validation",
-    "place_check.py:PlaceCheck.faults": "look-up",
-    "presence.py:Presence.push": "container",
-    "spectra.py:finite_complex": "validation",
-    "stream.py:FrontEnd.follow_engine": "setter",
-    "stream.py:FrontEnd.learn_ego_noise": "setter",
-    "stream.py:FrontEnd.process": "delegates",
-    "threads.py:one_blas_thread": "threads",
+    "frontend/array.py:roof_array_56": "constant",
+    "frontend/channel_health.py:ArrayHealth.unknown": "container",
+    "frontend/channel_health.py:ArrayHealth.with_fault": "look-up",
+    "frontend/channel_health.py:faults_where": "container",
+    "frontend/ego_noise.py:spanned": "indices",
+    "frontend/gaps.py:GapFinder.push": "delegates",
+    "frontend/gcc.py:all_pairs": "indices",
+    "frontend/harmonic_cancellation.py:HarmonicCanceller.follow": "setter",
+    "frontend/hops.py:HopCutter.cut": "container",
+    "frontend/listener.py:Listener.push": "delegates",
+    "frontend/masking.py:ChannelMask.all_of": "container",
+    "frontend/music.py:checked_covariance": "validation",
+    "frontend/place_check.py:PlaceCheck.faults": "look-up",
+    "frontend/presence.py:Presence.push": "container",
+    "frontend/spectra.py:finite_complex": "validation",
+    "frontend/stream.py:FrontEnd.follow_engine": "setter",
+    "frontend/stream.py:FrontEnd.learn_ego_noise": "setter",
+    "frontend/stream.py:FrontEnd.process": "delegates",
+    "frontend/threads.py:one_blas_thread": "threads",
+    "abduction/any_signature.py:signature_from_dict": "look-up",
+    "abduction/classifier_signature.py:FittedClassifier.predict_proba": "interface",
+    "abduction/cueing.py:CueingPolicies.for_alpha": "look-up",
+    "abduction/cueing.py:CueingPolicy.rule": "container",
+    "abduction/descriptors.py:car": "constant",
+    "abduction/descriptors.py:motorcycle": "constant",
+    "abduction/ensemble.py:EnsembleModel.at_site": "container",
+    "abduction/ensemble_training.py:SiteEnsembleClassifier.predict_proba": "delegates",
+    "abduction/pairwise.py:class_pairs": "indices",
+    "abduction/risk_map.py:risk_map_from_dict": "look-up",
+    "abduction/schema.py:check_schema": "validation",
+    "abduction/schema.py:read_number": "validation",
+    "abduction/schema.py:read_numbers": "validation",
+    "abduction/schema.py:read_rows": "validation",
+    "abduction/schema.py:schema_stamp": "constant",
+    "abduction/signature.py:evidence_of": "container",
+    "abduction/signature_training.py:Classifier.fit": "interface",
+    "abduction/signature_training.py:Classifier.predict_proba": "interface",
+    "abduction/signature_training.py:PublishedClassifier.predict_proba": "delegates",
+    "abduction/signature_training.py:checked_labels": "validation",
+    "abduction/site.py:SiteReference.from_row": "container",
+    "abduction/site_estimate.py:SiteEstimate.start": "container",
 }
+# Neither do these, wherever they are.
+SERIALISED = (".to_dict", ".from_dict")
 PLAIN_BASES = {"Protocol", "Enum", "StrEnum", "Exception", "ValueError", "NamedTuple"}
 
 
@@ -211,7 +236,7 @@ def test_everything_computed_has_a_source() -> None:
 
 def test_nothing_is_excused_without_need() -> None:
     """Neither what is no longer there nor what has both."""
-    there = {_short(one): one for one in functions(("frontend",))}
+    there = {one.where: one for one in functions(FULL)}
     needless = [
         name
         for name in WITHOUT_EQUATION
@@ -220,14 +245,10 @@ def test_nothing_is_excused_without_need() -> None:
     assert needless == []
 
 
-def _short(one: Public) -> str:
-    return one.where.removeprefix("frontend/")
-
-
 def _computing() -> dict[str, Public]:
-    """Functions and methods of `frontend` that are not excused."""
-    every = {_short(one): one for one in functions(("frontend",))}
-    return {name: one for name, one in every.items() if name not in WITHOUT_EQUATION}
+    """Functions and methods of `FULL` that are not excused."""
+    every = {one.where: one for one in functions(FULL) if not one.where.endswith(SERIALISED)}
+    return {where: one for where, one in every.items() if where not in WITHOUT_EQUATION}
 
 
 def _equations(one: Public) -> list[str]:
