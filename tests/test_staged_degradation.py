@@ -21,8 +21,9 @@ from worldstate.adapters.video import VIDEO_NAME, open_video
 from worldstate.adapters.vision import VisionSettings
 from worldstate.adapters.watched_camera import any_motion, watch
 from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.evaluation.looks_file import load_looks, save_looks
 from worldstate.evaluation.staged_degradation import hear_staged
-from worldstate.evaluation.staged_looks import CameraState, Staging, load_looks, save_looks, stage_looks
+from worldstate.evaluation.staged_looks import CameraState, Staging, stage_looks
 from worldstate.filter import WorldFilter
 
 CAMERA = PinholeCamera()

@@ -15,15 +15,9 @@ from worldstate.adapters.ovad import OvadDataset, Recording
 from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.video import VIDEO_NAME, Video, open_video
 from worldstate.errors import InputFileError
+from worldstate.evaluation.looks_file import load_looks, save_looks
 from worldstate.evaluation.staged_degradation import hear_staged
-from worldstate.evaluation.staged_looks import (
-    CameraState,
-    StagedLooks,
-    Staging,
-    load_looks,
-    save_looks,
-    stage_looks,
-)
+from worldstate.evaluation.staged_looks import CameraState, StagedLooks, Staging, stage_looks
 from worldstate.evaluation.staged_recording import StagedRecording
 
 # What a camera sees depends on this code: a change of it is another number.
