@@ -151,6 +151,18 @@ def test_early_onsets_are_no_detections(streams):
     assert rule_figures(score.published, score, np.arange(20))["detection"] == pytest.approx(0.9)
 
 
+def test_the_camera_alone_warns_of_nothing_that_is_not_in_sight(streams):
+    score = score_twins(streams, np.random.default_rng(0))
+    everyone = np.arange(len(streams))
+    assert rule_figures(score.vision, score, everyone)["detection"] == 0.0
+    time_s, t0_s = streams[0].time_s, streams[0].t0_s
+    leak = replace(streams[0], reference_rad=np.where(time_s > t0_s - 0.55, 0.1, np.nan))
+    score = score_twins([leak, *streams[1:]], np.random.default_rng(0))
+    figures = rule_figures(score.vision, score, everyone)
+    assert figures["detection"] == pytest.approx(0.1)
+    assert figures["lead_s"] == pytest.approx(0.5)
+
+
 def test_report_has_every_target_and_judges_by_its_rule(streams):
     score = score_twins(streams, np.random.default_rng(0))
     report = twin_report(twin_figures(score), twin_intervals(score, np.random.default_rng(0), draws=20))

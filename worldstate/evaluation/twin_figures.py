@@ -11,7 +11,7 @@ from worldstate.evaluation.bearing_gating import BearingChecks, joined
 from worldstate.evaluation.hop_stream import HOP_S
 from worldstate.evaluation.metrics import auroc
 from worldstate.evaluation.twin_recording import TwinRecording
-from worldstate.evaluation.twin_score import ALPHA, RuleOutcome, TwinScore, labelled_windows
+from worldstate.evaluation.twin_score import ALPHA, ALPHA_LOOSE, RuleOutcome, TwinScore, labelled_windows
 
 Numbers = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -45,7 +45,13 @@ def twin_figures(score: TwinScore, rows: Rows | None = None) -> dict[str, float]
     approaches = [recording for recording in recordings if not recording.hazard_free]
     calm = [recording for recording in recordings if recording.hazard_free]
     figures = {f"auroc_{name}": _auroc(approaches, calm, h) for name, h in HORIZONS.items()}
-    rules = {"published": score.published, "sustained": score.sustained, "ours": score.ours[ALPHA]}
+    rules = {
+        "vision": score.vision,
+        "published": score.published,
+        "sustained": score.sustained,
+        "ours": score.ours[ALPHA],
+        "ours_loose": score.ours[ALPHA_LOOSE],
+    }
     for name, outcome in rules.items():
         figures |= {f"{name}_{key}": value for key, value in rule_figures(outcome, score, chosen).items()}
     return (
