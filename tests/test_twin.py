@@ -12,6 +12,7 @@ from worldstate.abduction.ensemble import EnsembleModel
 from worldstate.adapters.model_file import load_model
 from worldstate.adapters.simulation import SimulationSettings, preset, simulate_recording, site
 from worldstate.adapters.simulation.plan import plan_static
+from worldstate.adapters.site_signature import SiteSignature
 from worldstate.cli.main import main
 from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.evaluation.hop_stream import ABSENT
@@ -220,7 +221,8 @@ def test_another_classifier_judges_what_was_heard(streams):
     asked = {"answer": np.full(HOPS, ABSENT), "miss_rate": np.full(HOPS, 0.3)}
     answered = replace(streams[0], features=features, **asked)
     judged = answered.judged(signature)
-    likelihoods = np.exp([signature.evidence(feature).log_likelihoods for feature in features])
+    listening = SiteSignature(signature)
+    likelihoods = np.exp([listening.evidence(feature).log_likelihoods for feature in features])
     joint = likelihoods * signature.reference_prior
     assert np.allclose(judged.posteriors, joint / joint.sum(axis=1, keepdims=True))
     joint[:, 2] *= 0.3

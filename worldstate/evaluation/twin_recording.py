@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.any_signature import AnySignature
+from worldstate.abduction.ensemble import EnsembleModel
 from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.feature_table import N_FEATURES
+from worldstate.adapters.site_signature import SiteSignature
 from worldstate.checks import check_shape
 from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.evaluation.hop_stream import HopStream
@@ -112,8 +114,9 @@ class TwinRecording:
         return np.asarray(self.posteriors.argmax(axis=1) < DIRECTION_COLUMNS.stop)
 
     def judged(self, signature: AnySignature) -> "TwinRecording":
-        """Return the recording with what a classifier makes of its features."""
-        evidence = [signature.evidence(feature) for feature in self.features]
+        """Return the recording as a classifier hears it; one that learns its site learns it anew."""
+        listening = SiteSignature(signature) if isinstance(signature, EnsembleModel) else signature
+        evidence = [listening.evidence(feature) for feature in self.features]
         stream = replace(
             HopStream.blank(self.name, len(self.time_s)),
             log_likelihoods=np.stack([one.log_likelihoods for one in evidence]),
