@@ -12,10 +12,13 @@ from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.listen import Source, Step, listen_steps
 from worldstate.evaluation.bearing_gating import BearingChecks, check_bearings
 from worldstate.evaluation.health import HealthLog, RecordingHealth
-from worldstate.evaluation.timeline import Timeline
+from worldstate.evaluation.timeline import EntityTrail, Timeline
 from worldstate.evaluation.warning import WarningMeter, WarningSummary
-from worldstate.state import Entity, WorldState
+from worldstate.state import WorldState
 from worldstate.values import seconds
+
+# An entity is drawn where it more likely exists than not.
+LIKELY = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +122,7 @@ class _HopLog:
     risk: list[float] = field(default_factory=list)
     advisory: list[bool] = field(default_factory=list)
     srp: list[np.ndarray] = field(default_factory=list)
-    entity: list[tuple[float, float]] = field(default_factory=list)
+    entities: dict[str, list[tuple[float, float, float, bool]]] = field(default_factory=dict)
     heard: list[tuple[float, float, float]] = field(default_factory=list)
     moving_rad: list[list[float]] = field(default_factory=list)
     azimuths_rad: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -134,8 +137,10 @@ class _HopLog:
         self.advisory.append(any(cue.advisory for cue in state.cues))
         self.srp.append(step.frame.srp.astype(np.float32))
         self.azimuths_rad = step.frame.azimuths_rad
-        leading = _leading_entity(state)
-        self.entity.append((leading.azimuth_rad, leading.azimuth_std_rad) if leading else (np.nan, np.nan))
+        for entity in state.entities:
+            if entity.moving and entity.existence_probability >= LIKELY:
+                row = now_s, entity.azimuth_rad, entity.azimuth_std_rad, entity.status == "hidden"
+                self.entities.setdefault(entity.id, []).append(row)
         frame = step.frame
         self.heard.append((frame.bearing_age_s, frame.bearing_rad, frame.prominence))
         self.moving_rad.append([seen.azimuth_rad for seen in step.measurement.sightings if seen.moving])
@@ -145,7 +150,6 @@ class _HopLog:
         return check_bearings(self.time_s, age_s, bearing_rad, prominence, self.moving_rad)
 
     def timeline(self, source: Source, title: str) -> Timeline:
-        entity = np.array(self.entity, dtype=np.float64).reshape(-1, 2)
         boxes = [(t, azimuth) for t, row in zip(self.time_s, self.moving_rad, strict=True) for azimuth in row]
         sightings = np.array(boxes, dtype=np.float64).reshape(-1, 2)
         return Timeline(
@@ -157,8 +161,7 @@ class _HopLog:
             advisory=np.array(self.advisory, dtype=bool),
             azimuths_rad=self.azimuths_rad,
             srp=np.array(self.srp),
-            entity_azimuth_rad=entity[:, 0],
-            entity_std_rad=entity[:, 1],
+            entities=tuple(map(_trail, self.entities.values())),
             sighting_time_s=sightings[:, 0],
             sighting_azimuth_rad=sightings[:, 1],
             t0_s=source.t0_s,
@@ -166,6 +169,6 @@ class _HopLog:
         )
 
 
-def _leading_entity(state: WorldState) -> Entity | None:
-    moving = [entity for entity in state.entities if entity.moving]
-    return max(moving, key=lambda entity: entity.existence_probability, default=None)
+def _trail(rows: list[tuple[float, float, float, bool]]) -> EntityTrail:
+    time_s, azimuth_rad, std_rad, hidden = np.array(rows, dtype=np.float64).T
+    return EntityTrail(time_s, azimuth_rad, std_rad, hidden.astype(bool))

@@ -16,6 +16,38 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
+# Hops of one entity further apart than this are not joined by a line.
+_GAP_S = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EntityTrail:
+    """Where one entity was believed to be, at the hops in which it more likely existed than not.
+
+    Parameters
+    ----------
+    time_s, azimuth_rad, std_rad : array (m,)
+        Ends of the windows, azimuth, standard deviation.
+    hidden : array (m,) of bool
+        Whether it was behind an occluder.
+    """
+
+    time_s: Floats
+    azimuth_rad: Floats
+    std_rad: Floats
+    hidden: NDArray[np.bool_]
+
+    def broken(self) -> "EntityTrail":
+        """Return the trail with a row of NaN in every gap, so that no line is drawn across."""
+        gaps = np.flatnonzero(np.diff(self.time_s) > _GAP_S) + 1
+        return EntityTrail(
+            np.insert(self.time_s, gaps, np.nan),
+            np.insert(self.azimuth_rad, gaps, np.nan),
+            np.insert(self.std_rad, gaps, np.nan),
+            np.insert(self.hidden, gaps, False),
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Timeline:
     """One row a hop of everything that the figure shows.
@@ -36,8 +68,8 @@ class Timeline:
         Search grid, left positive.
     srp : array (n, a)
         Steered response power of each window.
-    entity_azimuth_rad, entity_std_rad : array (n,)
-        Azimuth of the leading entity and its standard deviation; NaN where there is none.
+    entities : tuple of EntityTrail
+        Moving entities, in the order in which they came up.
     sighting_time_s, sighting_azimuth_rad : array (d,)
         Moving camera detections.
     t0_s : float or None
@@ -54,8 +86,7 @@ class Timeline:
     advisory: NDArray[np.bool_]
     azimuths_rad: Floats
     srp: Floats
-    entity_azimuth_rad: Floats
-    entity_std_rad: Floats
+    entities: tuple[EntityTrail, ...]
     sighting_time_s: Floats
     sighting_azimuth_rad: Floats
     t0_s: float | None
@@ -98,13 +129,29 @@ def _draw_azimuths(axes: "Axes", timeline: Timeline) -> None:
     )
     colorbar = axes.figure.colorbar(mesh, ax=axes, pad=0.01)
     colorbar.set_label("SRP over its median")
-    azimuth, spread = np.degrees(timeline.entity_azimuth_rad), np.degrees(timeline.entity_std_rad)
-    axes.fill_between(timeline.time_s, azimuth - spread, azimuth + spread, color="tab:blue", alpha=0.2, lw=0)
-    axes.plot(timeline.time_s, azimuth, color="tab:blue", label="entity azimuth, ±1 std")
+    for trail in timeline.entities:
+        _draw_trail(axes, trail.broken())
     seen = np.degrees(timeline.sighting_azimuth_rad)
     axes.plot(timeline.sighting_time_s, seen, ".", color="tab:red", label="camera")
     axes.set(ylabel="azimuth, left positive (deg)", ylim=(-90, 90), yticks=range(-90, 91, 45))
-    axes.legend(loc="upper left", fontsize="small")
+    handles, labels = axes.get_legend_handles_labels()
+    once = dict(zip(labels, handles, strict=True))
+    axes.legend(once.values(), once.keys(), loc="upper left", fontsize="small")
+
+
+def _draw_trail(axes: "Axes", trail: EntityTrail) -> None:
+    azimuth, spread = np.degrees(trail.azimuth_rad), np.degrees(trail.std_rad)
+    for hidden, color, label in ((True, "tab:orange", "hidden"), (False, "tab:blue", "in view")):
+        # The first hop in view ends the hidden line too: it is one entity.
+        shown = trail.hidden == hidden
+        joined = shown | (np.roll(shown, 1) & np.isfinite(azimuth) & (np.arange(shown.size) > 0))
+        line, low, high = (
+            np.where(where, x, np.nan)
+            for where, x in ((joined, azimuth), (shown, azimuth - spread), (shown, azimuth + spread))
+        )
+        if shown.any():
+            axes.fill_between(trail.time_s, low, high, color=color, alpha=0.25, lw=0)
+            axes.plot(trail.time_s, line, color=color, label=f"entity, {label}, ±1 std")
 
 
 def _draw_statistic(axes: "Axes", timeline: Timeline) -> None:
