@@ -1,4 +1,4 @@
-"""The figure of a recording: every entity has a line of its own, and no line crosses what was not believed."""
+"""The figure of a recording: every entity has lines of its own, and none crosses what was not believed."""
 
 from dataclasses import replace
 
