@@ -30,8 +30,8 @@ Thresholds are gamma(alpha) on the hazard-free recordings of other folds. A last
 
 DATASET is in the OVAD layout with video, as `worldstate simulate --video` writes it. What the camera saw of
 each recording lies in OUT/staged and is not staged again: an interrupted run goes on where it stopped, and
-another model costs seconds. The model that ships has heard the real junctions only: at simulated ones listen
-with a model that was trained on other simulated recordings, as below.
+another model costs a few seconds a recording. The model that ships has heard the real junctions only: at
+simulated ones listen with a model that was trained on other simulated recordings, as below.
 
 OUT/degradation.json is the report, OUT/degradation.png the figure."""
 

@@ -82,7 +82,7 @@ def write_sweep_figure(rows: Sequence[SweepRow], path: Path) -> None:
     left.set(
         xlabel="share of hops that the detector misses", ylabel="hazard awareness after $T_0$", ylim=(0, 1.02)
     )
-    left.legend(fontsize="small", loc="center")
+    left.legend(fontsize="small", loc="lower left")
     right.set(xlabel="level of the family", ylabel="per hazard-free hour", ylim=(0, None))
     right.set_title("advisories (solid), awareness (dotted)", fontsize="small")
     with atomic_path(path) as temporary:
