@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
-from worldstate.adapters.atomic import atomic_path
 from worldstate.checks import check_shape, finite_array
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.errors import InvalidArgumentError
+from worldstate.evaluation.npz_file import load_npz, save_npz
 from worldstate.measurement import Measurement
 from worldstate.values import NotUsable, seconds
 
@@ -171,16 +171,17 @@ def save_streams(path: str | Path, streams: Iterable[HopStream]) -> None:
     """
     kept = list(streams)
     arrays = {name: np.concatenate([getattr(stream, name) for stream in kept]) for name in _ARRAYS}
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
-            file,
-            version=np.array(VERSION),
-            names=np.array([stream.name for stream in kept]),
-            labels=np.array([stream.label for stream in kept]),
-            t0_s=np.array([stream.t0_s for stream in kept]),
-            hops=np.array([len(stream) for stream in kept]),
-            **arrays,  # type: ignore[arg-type]
-        )
+    save_npz(
+        path,
+        {
+            "version": np.array(VERSION),
+            "names": np.array([stream.name for stream in kept]),
+            "labels": np.array([stream.label for stream in kept]),
+            "t0_s": np.array([stream.t0_s for stream in kept]),
+            "hops": np.array([len(stream) for stream in kept]),
+            **arrays,
+        },
+    )
 
 
 def load_streams(path: str | Path) -> list[HopStream]:
@@ -199,18 +200,7 @@ def load_streams(path: str | Path) -> list[HopStream]:
     ...     [(stream.name, len(stream)) for stream in load_streams(Path(folder) / "s.npz")]
     [('a', 3), ('b', 2)]
     """
-    source = Path(path)
-    try:
-        if source.stat().st_size > MAX_BYTES:
-            raise InputFileError(path, f"expected hop streams of at most {MAX_BYTES >> 20} MiB")
-        with np.load(source, allow_pickle=False) as file:
-            return _streams({name: file[name] for name in file.files})
-    except InputFileError:
-        raise
-    except OSError as error:
-        raise InputFileError(path, f"expected hop streams as npz ({error.strerror or error})") from error
-    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
-        raise InputFileError(path, f"expected hop streams as npz, they do not read: {error}") from error
+    return load_npz(path, "hop streams", MAX_BYTES, _streams)
 
 
 def _streams(arrays: dict[str, np.ndarray]) -> list[HopStream]:

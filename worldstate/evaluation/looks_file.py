@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.camera_health import DegradationLog
 from worldstate.adapters.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.miss_rates import MissRates
 from worldstate.adapters.watched_camera import Watched
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.errors import InvalidArgumentError
+from worldstate.evaluation.npz_file import load_npz, save_npz
 from worldstate.evaluation.staged_looks import StagedLooks
 
 MAX_BYTES = 64 << 20
@@ -45,8 +45,7 @@ def save_looks(path: str | Path, looks: StagedLooks, origin: str) -> None:
         "read_ns": np.stack([log.stamps_ns for log in logs]),
         "degradation": np.stack([log.degradation for log in logs]),
     }
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, origin=np.array(origin), **values)  # type: ignore[arg-type]
+    save_npz(path, {"origin": np.array(origin), **values})
 
 
 def load_looks(path: str | Path, origin: str, rates: MissRates) -> StagedLooks | None:
@@ -66,22 +65,14 @@ def load_looks(path: str | Path, origin: str, rates: MissRates) -> StagedLooks |
     InputFileError
         If the file is too large or damaged.
     """
-    source = Path(path)
-    if not source.is_file():
+    if not Path(path).is_file():
         return None
-    if source.stat().st_size > MAX_BYTES:
-        raise InputFileError(path, f"expected staged looks of at most {MAX_BYTES >> 20} MiB")
-    try:
-        with np.load(source, allow_pickle=False) as file:
-            values = {name: file[name] for name in file.files}
-        return _read(values, rates) if str(values["origin"]) == origin else None
-    except (OSError, InvalidArgumentError) as error:
-        raise InputFileError(path, f"expected staged looks ({error})") from error
-    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
-        raise InputFileError(path, f"expected staged looks, they do not read: {error}") from error
+    return load_npz(path, "staged looks", MAX_BYTES, lambda values: _read(values, origin, rates))
 
 
-def _read(values: dict[str, np.ndarray], rates: MissRates) -> StagedLooks:
+def _read(values: dict[str, np.ndarray], origin: str, rates: MissRates) -> StagedLooks | None:
+    if str(values["origin"]) != origin:
+        return None
     states, stamps_ns = tuple(values["states"].tolist()), values["stamps_ns"]
     frames = _frames(values)
     if len(frames) != stamps_ns.size:

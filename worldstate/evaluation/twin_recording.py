@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.any_signature import AnySignature
 from worldstate.abduction.ensemble import EnsembleModel
-from worldstate.adapters.atomic import atomic_path
 from worldstate.adapters.feature_table import N_FEATURES
 from worldstate.adapters.site_signature import SiteSignature
 from worldstate.checks import check_shape
-from worldstate.errors import InputFileError, InvalidArgumentError
 from worldstate.evaluation.hop_stream import HopStream
+from worldstate.evaluation.npz_file import load_npz, save_npz
 from worldstate.evaluation.stream_statistic import stream_statistic
 
 Numbers = NDArray[np.float64]
@@ -186,8 +185,7 @@ def save_twin(path: str | Path, recording: TwinRecording, origin: str) -> None:
         If the folder is missing.
     """
     values = {name: np.array(getattr(recording, name)) for name in (*_TEXTS, *_SCALARS, *_HEARD)}
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, origin=np.array(origin), **values)  # type: ignore[arg-type]
+    save_npz(path, {"origin": np.array(origin), **values})
 
 
 def load_twin(path: str | Path, origin: str) -> TwinRecording | None:
@@ -207,18 +205,9 @@ def load_twin(path: str | Path, origin: str) -> TwinRecording | None:
     >>> kept.name, kept.time_s, other
     ('a', array([1. , 1.1]), None)
     """
-    source = Path(path)
-    if not source.is_file():
+    if not Path(path).is_file():
         return None
-    if source.stat().st_size > MAX_BYTES:
-        raise InputFileError(path, f"expected a recording of the twin of at most {MAX_BYTES >> 20} MiB")
-    try:
-        with np.load(source, allow_pickle=False) as file:
-            return _read({name: file[name] for name in file.files}, origin)
-    except (OSError, InvalidArgumentError) as error:
-        raise InputFileError(path, f"expected a recording of the twin ({error})") from error
-    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
-        raise InputFileError(path, f"expected a recording of the twin, it does not read: {error}") from error
+    return load_npz(path, "recordings of the twin", MAX_BYTES, lambda values: _read(values, origin))
 
 
 def _read(values: dict[str, np.ndarray], origin: str) -> TwinRecording | None:

@@ -1,0 +1,68 @@
+"""Arrays as an npz file without objects: written whole or not at all, read within a bound."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from worldstate.adapters.atomic import atomic_path
+from worldstate.errors import InputFileError, InvalidArgumentError
+
+Result = TypeVar("Result")
+
+
+def save_npz(path: str | Path, values: Mapping[str, Any]) -> None:
+    """Write arrays by name.
+
+    Raises
+    ------
+    InputFileError
+        If the folder is missing.
+    """
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **values)
+
+
+def load_npz(
+    path: str | Path, what: str, max_bytes: int, read: Callable[[dict[str, np.ndarray]], Result]
+) -> Result:
+    """Return what `read` makes of the arrays of a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    what : str
+        What it should hold, for messages; in the plural.
+    max_bytes : int
+        A larger file is refused.
+    read : callable
+        From arrays by name to the value; whatever it raises is the file's fault.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing, too large or damaged.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_npz(Path(folder) / "a.npz", {"x": np.arange(3)})
+    ...     load_npz(Path(folder) / "a.npz", "numbers", 1 << 10, lambda values: values["x"].sum())
+    np.int64(3)
+    """
+    try:
+        if Path(path).stat().st_size > max_bytes:
+            raise InputFileError(path, f"expected {what} of at most {max_bytes >> 20} MiB")
+        with np.load(path, allow_pickle=False) as file:
+            return read({name: file[name] for name in file.files})
+    except InputFileError:
+        raise
+    except OSError as error:
+        raise InputFileError(path, f"expected {what} as npz ({error.strerror or error})") from error
+    except InvalidArgumentError as error:
+        raise InputFileError(path, f"expected {what} ({error})") from error
+    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
+        raise InputFileError(path, f"expected {what} as npz, they do not read: {error}") from error
