@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.detections import STAMP_SLACK_NS, DetectionLog
+from worldstate.adapters.detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
 from worldstate.checks import in_range
 from worldstate.values import nanoseconds
 
@@ -84,6 +84,34 @@ def parked(
         return np.zeros(len(boxes_px), dtype=bool)
     there = [_held(earlier.boxes_px, boxes_px, rule.tolerance_px) for earlier in past]
     return np.asarray(np.mean(there, axis=0) >= rule.share)
+
+
+def kept_and_parked(
+    log: DetectionLog, frame: int, keep: DetectionFilter, rule: ParkedRule
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the indices of the boxes of `frame` that count, and which of those are parked.
+
+    Parameters
+    ----------
+    log : DetectionLog
+        All boxes, unfiltered.
+    frame : int
+        Number of the frame.
+    keep : DetectionFilter
+        Which boxes count.
+    rule : ParkedRule
+        How still and for how long.
+
+    Returns
+    -------
+    kept : ndarray of int, shape (n,)
+        Indices among the frame's boxes.
+    stood : ndarray of bool, shape (n,)
+        As from `parked`.
+    """
+    here = log.frames[frame]
+    kept = here.select(keep)
+    return kept, parked(log, frame, here.boxes_px[kept], rule)
 
 
 def _held(

@@ -11,7 +11,7 @@ from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.adapters.camera import PinholeCamera
 from worldstate.adapters.detections import DetectionFilter, DetectionLog
-from worldstate.adapters.parked import ParkedRule, parked
+from worldstate.adapters.parked import ParkedRule, kept_and_parked
 from worldstate.adapters.protocol import Side
 from worldstate.adapters.sector import WHOLE_SIDES, Sector
 from worldstate.checks import in_range
@@ -198,8 +198,7 @@ class VisionQuery:
 
     def _look(self, log: DetectionLog, number: int) -> tuple[Sighting, ...]:
         frame = log.frames[number]
-        kept = frame.select(self.settings.keep)
-        still = parked(log, number, frame.boxes_px[kept], self.settings.still)
+        kept, still = kept_and_parked(log, number, self.settings.keep, self.settings.still)
         return tuple(
             self.camera.sighting(frame.boxes_px[i], frame.labels[i], float(frame.scores[i]), moving=not stood)
             for i, stood in zip(kept, still.tolist(), strict=True)
@@ -251,9 +250,8 @@ def moving_boxes(
         number = log.latest(stamp_ns, nanoseconds(chosen.max_frame_age_s))
         boxes_px = np.empty((0, 4))
         if number is not None:
-            frame = log.frames[number]
-            boxes_px = frame.boxes_px[frame.select(chosen.keep)]
-            boxes_px = boxes_px[~parked(log, number, boxes_px, chosen.still)]
+            kept, still = kept_and_parked(log, number, chosen.keep, chosen.still)
+            boxes_px = log.frames[number].boxes_px[kept[~still]]
         found.append(boxes_px)
     return found
 

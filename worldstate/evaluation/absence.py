@@ -12,7 +12,7 @@ from worldstate.adapters.degradation import FAMILIES, LEVELS, Family, degrade
 from worldstate.adapters.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.detector import Detector, overlaps
 from worldstate.adapters.miss_rates import FamilyCounts, MissRates
-from worldstate.adapters.parked import ParkedRule, parked
+from worldstate.adapters.parked import ParkedRule, kept_and_parked
 from worldstate.adapters.sector import Sector
 from worldstate.adapters.video import Video
 from worldstate.checks import in_range
@@ -233,11 +233,8 @@ class _Look:
 
 
 def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> NDArray[np.int64]:
-    frame = reference.frames[number]
-    kept = frame.select(settings.keep)
-    if not settings.moving_only:
-        return kept
-    return kept[~parked(reference, number, frame.boxes_px[kept], ParkedRule())]
+    kept, still = kept_and_parked(reference, number, settings.keep, ParkedRule())
+    return kept[~still] if settings.moving_only else kept
 
 
 def _inside(boxes_px: Numbers, others_px: Numbers) -> NDArray[np.bool_]:

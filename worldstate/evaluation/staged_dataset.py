@@ -113,7 +113,7 @@ def _stage(folder: Path, settings: StagedDataset, recording: Recording) -> Stage
     video = open_video(recording.path / VIDEO_NAME)
     camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
     staging = replace(settings.staging, camera=camera)
-    looks = _looks(folder, replace(settings, staging=staging), recording, video)
+    looks = _looks(folder, settings, recording, video)
     source = open_source(recording.path, model=settings.model)
     label = recording.label or "none"
     return hear_staged(source, looks, staging, name=recording.recording_id, label=label)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
@@ -21,6 +21,7 @@ from worldstate.frontend.stream import AcousticFrame
 from worldstate.measurement import Measurement
 
 Heard = tuple[AcousticFrame, Measurement]
+Boxes = NDArray[np.float64]
 
 
 def hear_staged(
@@ -55,7 +56,8 @@ def hear_staged(
     rows = [list(_asked(source, measured, query)) for query in (*queries, None)]
     streams = [hop_stream(row, name=name, label=label, t0_s=source.t0_s, there=there) for row in rows]
     stamps_ns = [frame.stamp_ns for frame, _ in measured]
-    found = [_found(source, seen.detections, staging, stamps_ns) for seen in looks.watched]
+    reference = _reference(source, staging, stamps_ns)
+    found = [_found(reference, seen.detections, staging, stamps_ns) for seen in looks.watched]
     degradation = [[seen.degradation(stamp_ns) for stamp_ns in stamps_ns] for seen in looks.watched]
     return StagedRecording.of(
         streams,
@@ -66,17 +68,21 @@ def hear_staged(
     )
 
 
-def _found(source: Source, log: DetectionLog, staging: Staging, stamps_ns: Sequence[int]) -> list[bool]:
-    """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
+def _reference(source: Source, staging: Staging, stamps_ns: Sequence[int]) -> list[Boxes]:
+    """Return the reference's moving boxes at each stamp, in pixels of the video, which may be smaller."""
     if source.detections is None:
-        return [False] * len(stamps_ns)
-    # The reference lies in the recording's own image, the video may be a smaller one of it.
-    whole = PinholeCamera()
-    scale = np.tile([staging.camera.width_px / whole.width_px, staging.camera.height_px / whole.height_px], 2)
-    there = moving_boxes(source.detections, stamps_ns)
-    detected = moving_boxes(log, stamps_ns, staging.settings)
-    least = AbsenceSettings().min_overlap
-    return [bool((overlaps(a * scale, b) >= least).any()) for a, b in zip(there, detected, strict=True)]
+        return [np.empty((0, 4))] * len(stamps_ns)
+    whole, camera = PinholeCamera(), staging.camera
+    scale = np.tile([camera.width_px / whole.width_px, camera.height_px / whole.height_px], 2)
+    return [boxes_px * scale for boxes_px in moving_boxes(source.detections, stamps_ns)]
+
+
+def _found(
+    reference: Sequence[Boxes], log: DetectionLog, staging: Staging, stamps_ns: Sequence[int]
+) -> list[bool]:
+    """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
+    detected, least = moving_boxes(log, stamps_ns, staging.settings), AbsenceSettings().min_overlap
+    return [bool((overlaps(a, b) >= least).any()) for a, b in zip(reference, detected, strict=True)]
 
 
 class _Again:

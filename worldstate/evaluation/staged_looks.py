@@ -108,7 +108,6 @@ def stage_looks(
     staging: Staging,
     states: Sequence[CameraState],
     rng: np.random.Generator,
-    on_frame: Callable[[], None] = lambda: None,
 ) -> StagedLooks:
     """Decode once, degrade and look in every state.
 
@@ -125,8 +124,6 @@ def stage_looks(
         At least one.
     rng : numpy.random.Generator
         Draws the staged noise.
-    on_frame : callable
-        Called after each frame, all states of it done.
 
     Raises
     ------
@@ -140,5 +137,4 @@ def stage_looks(
         stamp_ns = nanoseconds(number / video.frame_rate_hz)
         for watcher, state in zip(watchers, states, strict=True):
             watcher.look(stamp_ns, degrade(frame, state.family, state.degradation, rng))
-        on_frame()
     return StagedLooks(tuple(map(str, states)), tuple(watcher.watched() for watcher in watchers))

@@ -1,4 +1,4 @@
-"""What is kept of a recording whose camera was staged in several states: a few numbers a hop and state."""
+"""A recording whose camera was staged in several states: a few numbers a hop and state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

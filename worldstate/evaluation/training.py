@@ -104,7 +104,7 @@ def train_model(
     """
     rng = np.random.default_rng(settings.seed)
     compares = settings.method == "worldstate"
-    inputs = with_site_references(table) if compares else table
+    inputs = seen_by(table, settings.method)
     make: MakeClassifier = site_ensemble if compares else PublishedClassifier
     passes = []
     for _ in range(settings.repeats):
@@ -113,7 +113,7 @@ def train_model(
     levels = [passes]
     if compares and len(np.unique(table.environments)) > 1:
         levels.insert(0, [out_of_fold(inputs, junction_folds(table), make, rng)])
-    signature = _trained(inputs, rng, compares=compares)
+    signature = fit_signature(inputs, settings.method, rng)
     on_step()
     provenance = Provenance(
         dataset=dataset,
@@ -128,8 +128,24 @@ def train_model(
     return Model(signature, _policies(table, signature, levels, settings), provenance)
 
 
-def _trained(inputs: FeatureTable, rng: np.random.Generator, *, compares: bool) -> AnySignature:
-    if compares:
+def seen_by(table: FeatureTable, method: TrainingMethod) -> FeatureTable:
+    """Return windows as the classifier of a method sees them: the ensemble with their site's reference."""
+    return with_site_references(table) if method == "worldstate" else table
+
+
+def fit_signature(inputs: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> AnySignature:
+    """Fit the classifier of a method.
+
+    Parameters
+    ----------
+    inputs : FeatureTable
+        From `seen_by`.
+    method : {"baseline", "worldstate"}
+        The published classifier or the ensemble.
+    rng : numpy.random.Generator
+        Draws the folds of the published classifier; the ensemble draws nothing.
+    """
+    if method == "worldstate":
         return SiteEnsembleClassifier().fit(inputs.features, inputs.labels).model_
     return PublishedClassifier(rng).fit(inputs.features, inputs.labels).model_
 

@@ -13,13 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.any_signature import AnySignature
-from worldstate.abduction.ensemble_training import SiteEnsembleClassifier
-from worldstate.abduction.signature_training import PublishedClassifier
 from worldstate.adapters.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.simulation import SITES, Preset
 from worldstate.evaluation.simulated_windows import LAYOUT, simulated_windows
-from worldstate.evaluation.site_references import with_site_references
-from worldstate.evaluation.training import TrainingMethod
+from worldstate.evaluation.training import TrainingMethod, fit_signature, seen_by
 from worldstate.evaluation.twin_simulation import VERSION
 
 # 170 windows of each class of left and right together, front and none: the released set has 170, 170 and 158
@@ -72,10 +69,7 @@ def train_on_twin(
     else:
         table = _simulate(levels, seed, jobs, per_approach, progress)
         write_features(path, table)
-    if method == "worldstate":
-        inputs = with_site_references(table)
-        return SiteEnsembleClassifier().fit(inputs.features, inputs.labels).model_
-    return PublishedClassifier(np.random.default_rng(seed)).fit(table.features, table.labels).model_
+    return fit_signature(seen_by(table, method), method, np.random.default_rng(seed))
 
 
 def _simulate(
