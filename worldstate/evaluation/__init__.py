@@ -1,1 +1,0 @@
-"""Protocols and metrics that hold the library against data."""
