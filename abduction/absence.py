@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InputFileError, InvalidArgumentError
-
-from .schema import check_schema, read_numbers, read_rows, schema_stamp
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
 
 SCHEMA = "worldstate.MissRateTable"
 VERSION = "1.0.0"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.checks import in_range
+from worldstate.ground.checks import in_range
 
 
 @dataclass(frozen=True, slots=True)

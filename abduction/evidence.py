@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 
 @dataclass(frozen=True, slots=True)

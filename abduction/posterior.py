@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import check_shape, finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import check_shape, finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 from .co_evidence import CoEvidence
 from .evidence import SignatureEvidence

@@ -9,18 +9,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.adapters.grounding import Grounding, observe
-from worldstate.adapters.protocol import CoEvidenceChannel, Side
-from worldstate.checks import in_range
-from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.measurement import Approach, Bearing, Measurement
-from worldstate.values import NotUsable, wrap_angle
+from worldstate.ground.checks import in_range
+from worldstate.ground.values import NotUsable, wrap_angle
+from worldstate.measurement.measurement import Approach, Bearing, Measurement
+from worldstate.measurement.protocols import CoEvidenceChannel, Side
+
+from .acoustic_grounding import Grounding, observe
 
 
 class Signature(Protocol):
-    """What is asked of a signature model; `abduction.signature.SignatureModel` is one.
+    """What is asked of a signature model; `abduction.signature.published_signature.SignatureModel` is one.
 
     Examples
     --------
@@ -106,7 +107,7 @@ class AcousticAdapter:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import roof_array_56
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> class Flat:
     ...     def evidence(self, feature): return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     >>> adapter = AcousticAdapter(roof_array_56(), 48_000, Flat())

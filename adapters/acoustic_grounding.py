@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, field
 
-from worldstate.abduction.descriptors import Descriptor, car, motorcycle
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.grounded import GroundedAnswer, GroundedSettings, ground
-from worldstate.abduction.observation import GroundedObservation, Observable
+from worldstate.abduction.grounding.class_descriptors import Descriptor, car, motorcycle
+from worldstate.abduction.grounding.grounded_likelihood import GroundedAnswer, GroundedSettings, ground
+from worldstate.abduction.grounding.observation import GroundedObservation, Observable
 from worldstate.frontend.frame import AcousticFrame
-from worldstate.measurement import Approach, Bearing
-from worldstate.values import NotUsable
+from worldstate.ground.values import NotUsable
+from worldstate.measurement.measurement import Approach, Bearing
 
 LINE_SPACING = "line_spacing_hz"
 

@@ -5,31 +5,32 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from worldstate.abduction.any_signature import AnySignature
-from worldstate.abduction.cueing import CueingPolicy
-from worldstate.abduction.ensemble import EnsembleModel
-from worldstate.abduction.site_estimate import SiteEstimate, SiteEstimateSettings
-from worldstate.adapters.acoustic import AcousticAdapter, Signature
-from worldstate.adapters.array_xml import read_array_xml
-from worldstate.adapters.audio import open_audio
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.detections import DetectionLog, read_detections
-from worldstate.adapters.grounding import Grounding
-from worldstate.adapters.miss_rates import MissRates, load_miss_rates
-from worldstate.adapters.model_file import load_model
-from worldstate.adapters.ovad import Recording
-from worldstate.adapters.sector import Sector
-from worldstate.adapters.site_signature import SiteSignature
-from worldstate.adapters.video import VIDEO_NAME, open_video
-from worldstate.adapters.vision import VisionQuery
-from worldstate.adapters.watched_camera import video_degradation
-from worldstate.filter import WorldFilter
-from worldstate.frontend.array import MicrophoneArray, roof_array_56
-from worldstate.frontend.ego_noise import EgoNoiseSettings
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
+from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.camera.camera_channel import video_degradation
+from worldstate.adapters.camera.detections import DetectionLog, read_detections
+from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.files.array_file import read_array_xml
+from worldstate.adapters.files.model_file import load_model
+from worldstate.core.filter import WorldFilter
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.measurement import Measurement
+from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
+
+from .acoustic import AcousticAdapter, Signature
+from .acoustic_grounding import Grounding
 
 BLOCKS_PER_SECOND = 20
 

@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from worldstate.frontend.array import roof_array_56
-from worldstate.frontend.bins import bin_frequencies_hz
-from worldstate.frontend.ego_noise import EgoNoise, EgoNoiseSettings
-from worldstate.frontend.from_below import FromBelow
-from worldstate.frontend.harmonic_cancellation import HarmonicCanceller
-from worldstate.frontend.phat import whiten
-from worldstate.frontend.steering import Steering
-from worldstate.frontend.stft import StreamingStft
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
+from worldstate.frontend.ego_noise.elevation_split import FromBelow
+from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
+from worldstate.frontend.spectra.bins import bin_frequencies_hz
+from worldstate.frontend.spectra.phat import whiten
+from worldstate.frontend.spectra.stft import StreamingStft
 
 RATE, NFFT, HOPS, WARM_UP = 47_998, 512, 120, 60
 BINS, SRP = range(1, 19), slice(2, 18)

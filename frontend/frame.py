@@ -5,14 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.values import NotUsable
-
-from .channel_health import ArrayHealth
-from .geometry import Ambiguity
-from .looming import Looming
-from .music_stage import MusicReading
-from .peaks import Peak
-from .tone_stage import ToneReading
+from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.approach.tone_stage import ToneReading
+from worldstate.frontend.array.geometry import Ambiguity
+from worldstate.frontend.direction.music_stage import MusicReading
+from worldstate.frontend.direction.peaks import Peak
+from worldstate.frontend.health.channel_health import ArrayHealth
+from worldstate.ground.values import NotUsable
 
 _NOT_WATCHED = NotUsable("microphones were not watched")
 TONE_IS_OFF = NotUsable("the tone is off: see FrontEndSettings.tone_band_hz")
@@ -65,7 +64,7 @@ class AcousticFrame:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> from worldstate.frontend.stream import FrontEnd
     >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
     >>> sound = np.random.default_rng(0).standard_normal((8000, 3))

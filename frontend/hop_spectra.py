@@ -5,21 +5,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .array import MicrophoneArray
-from .bins import band_bins, bin_frequencies_hz
-from .channel_health import ArrayHealth
-from .channel_monitor import ChannelMonitor
-from .ego_noise import EgoNoise, spanned
-from .feature import feature_steering, pair_sum, pair_sum_of
-from .from_below import FromBelow
-from .harmonic_cancellation import HarmonicCanceller
-from .masking import ChannelMask
-from .music_stage import MusicStage
-from .phat import power, whiten
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.direction.feature import feature_steering, pair_sum, pair_sum_of
+from worldstate.frontend.direction.music_stage import MusicStage
+from worldstate.frontend.direction.srp import steered_power
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, spanned
+from worldstate.frontend.ego_noise.elevation_split import FromBelow
+from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
+from worldstate.frontend.health.channel_health import ArrayHealth
+from worldstate.frontend.health.channel_monitor import ChannelMonitor
+from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.phat import power, whiten
+from worldstate.frontend.spectra.stft import StreamingStft
+
 from .settings import FrontEndSettings
-from .srp import steered_power
-from .steering import Steering, cross_spectra
-from .stft import StreamingStft
 
 Spectra = NDArray[np.complex64]
 Steered = tuple[Spectra, Steering]
@@ -36,10 +37,10 @@ class HopSums:
     centre : float
         Mean of their middles, samples from the start of the stream.
     power : ndarray of float64, shape (E * A,)
-        Steered power: see `worldstate.frontend.srp.steered_power`. Where microphones are left out, power and
+        Steered power: see `steered_power`. Where microphones are left out, power and
         pairs are scaled to what all would give.
     pairs : ndarray of complex128, shape (30,)
-        Pair sums: see `worldstate.frontend.feature.pair_sum`.
+        Pair sums: see `worldstate.frontend.direction.feature.pair_sum`.
     energies : ndarray of float64, shape (M,)
         Mean square in the looming band of every microphone.
     health : ArrayHealth

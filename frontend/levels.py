@@ -3,11 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from .bands import band_edges, log_band_energy, mean_square_per_bin
-from .bins import band_bins
-from .phat import power
+from worldstate.frontend.spectra.bands import band_edges, log_band_energy, mean_square_per_bin
+from worldstate.frontend.spectra.bins import band_bins
+from worldstate.frontend.spectra.phat import power
+from worldstate.frontend.spectra.stft import StreamingStft
+
 from .settings import FrontEndSettings
-from .stft import StreamingStft
 
 # Highest frequency that the anti-aliasing filters of usual converters leave alone, as a share of the sample
 # rate.
@@ -66,7 +67,7 @@ class LevelMeter:
 
         References
         ----------
-        P. D. Welch 1967: see `worldstate.frontend.bands.mean_square_per_bin`.
+        P. D. Welch 1967: see `worldstate.frontend.spectra.bands.mean_square_per_bin`.
         """
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         kept = None if keep is None else keep[self._channels]

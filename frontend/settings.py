@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-
-from .ego_noise import EgoNoiseSettings
-from .feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_SEGMENTS
-from .geometry import SPEED_OF_SOUND_M_S
-from .tone_stage import ENGINE_BAND_HZ
+from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_SEGMENTS
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 Band = tuple[float, float]
 
@@ -44,7 +43,7 @@ class FrontEndSettings:
     music_sources : int
         Sources that MUSIC shall expect, at most as many as microphones less one; 0 leaves MUSIC out.
     tone_band_hz : (float, float), optional
-        Look for an engine line there, e.g. (20, 400) Hz: see `worldstate.frontend.tone_stage`. None, the
+        Look for an engine line there, e.g. (20, 400) Hz: see `tone_stage`. None, the
         default, leaves it out.
     tone_hops : int
         Hops in the window of the tone fit.
@@ -65,7 +64,7 @@ class FrontEndSettings:
     ego_noise : EgoNoiseSettings, optional
         Learn the noise of the own vehicle and prewhiten with it: see `FrontEnd.learn_ego_noise`.
     watch_channels : bool
-        Look for microphones that misbehave and leave them out: see `worldstate.frontend.channel_health`.
+        Look for microphones that misbehave and leave them out: see `channel_health`.
 
     Raises
     ------

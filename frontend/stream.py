@@ -5,27 +5,27 @@ from collections import deque
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import check_shape, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable, nanoseconds
+from worldstate.frontend.approach.looming import Looming, looming
+from worldstate.frontend.approach.tone_stage import ToneReading, ToneStage
+from worldstate.frontend.array.front_back_ambiguity import twin_azimuth_rad, twin_reflection
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.bearing import bearing_of
+from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, segment_feature
+from worldstate.frontend.direction.music_stage import MusicReading
+from worldstate.frontend.direction.peaks import find_peaks
+from worldstate.frontend.direction.srp import normalised
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise
+from worldstate.frontend.spectra.bands import SILENCE
+from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.checks import check_shape, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable, nanoseconds
 
-from .array import MicrophoneArray
-from .bands import SILENCE
-from .bearing import bearing_of
-from .ego_noise import EgoNoise
-from .feature import FEATURE_SEGMENTS, segment_feature
 from .frame import TONE_IS_OFF, AcousticFrame
-from .hops import Hop, HopCutter
+from .hop_spectra import HopSums, Listener
 from .levels import LevelMeter
-from .listener import HopSums, Listener
-from .looming import Looming, looming
-from .music_stage import MusicReading
-from .peaks import find_peaks
 from .settings import FrontEndSettings
-from .srp import normalised
-from .threads import one_blas_thread
-from .tone_stage import ToneReading, ToneStage
-from .twins import twin_azimuth_rad, twin_reflection
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
@@ -62,7 +62,7 @@ class FrontEnd:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import roof_array_56
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> front_end = FrontEnd(roof_array_56(), sample_rate_hz=16_000)
     >>> sound = np.random.default_rng(0).standard_normal((17_600, 56), dtype=np.float32)
     >>> frames = front_end.process(sound)

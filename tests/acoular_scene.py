@@ -6,7 +6,7 @@ import acoular
 import numpy as np
 from scipy.optimize import brentq
 
-from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 RATE = 47_998
 SPEED_OF_SOUND_M_S = 343.0

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter, zoom
 
-from worldstate.adapters.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 
 WIDTH, HEIGHT = 640, 400
 

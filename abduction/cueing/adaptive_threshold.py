@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-
-from .schema import read_number
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_number
 
 SECONDS_PER_HOUR = 3600.0
 _EXTREME_LOGIT = 20.0

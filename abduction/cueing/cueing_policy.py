@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_number, read_numbers
 
 from .adaptive_threshold import AdaptiveBudget
 from .risk_map import RiskMap, risk_map_from_dict
-from .schema import read_number, read_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class CueingPolicy:
 
     Examples
     --------
-    >>> from worldstate.abduction.risk_map import PlattMap
+    >>> from worldstate.abduction.cueing.risk_map import PlattMap
     >>> policy = CueingPolicy(0.8, 3, 0.02, (0.25, 0.25, 0.25, 0.25), PlattMap(-1.0, 0.0))
     >>> policy.exceeded(0.9), round(policy.risk_map(0.9), 2)
     (True, 0.9)
@@ -212,7 +212,7 @@ class CueingPolicies:
 
     Examples
     --------
-    >>> from worldstate.abduction.risk_map import PlattMap
+    >>> from worldstate.abduction.cueing.risk_map import PlattMap
     >>> policy = CueingPolicy(0.8, 3, 0.02, (0.25, 0.25, 0.25, 0.25), PlattMap(-1.0, 0.0))
     >>> CueingPolicies((policy,)).for_alpha(0.02).gamma
     0.8

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 _SWEEPS = 2000
 _TOLERANCE = 1e-10

@@ -5,15 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
-from .cueing import sustained_statistic
+from .cueing_policy import sustained_statistic
 
 
-def neyman_pearson_threshold(
-    hazard_free: Sequence[ArrayLike], alpha: float, sustain_hops: int = 1
-) -> float:
+def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sustain_hops: int = 1) -> float:
     r"""Return the smallest threshold whose sustained alarm keeps its budget on hazard-free recordings.
 
     .. math::

@@ -8,8 +8,8 @@ Source: Lin, Lin, Weng, "A note on Platt's probabilistic outputs for support vec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 _ITERATIONS = 100
 _SMALLEST_STEP = 1e-10
@@ -36,7 +36,7 @@ def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> 
 
     References
     ----------
-    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.platt`.
+    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.cueing.platt`.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
 
     References
     ----------
-    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.platt`.
+    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.cueing.platt`.
 
     Examples
     --------
@@ -92,9 +92,7 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
     return slope / unit, offset
 
 
-def _newton(
-    decision: NDArray[np.float64], target: NDArray[np.float64], offset: float
-) -> tuple[float, float]:
+def _newton(decision: NDArray[np.float64], target: NDArray[np.float64], offset: float) -> tuple[float, float]:
     point = np.array([0.0, offset])
     loss = _loss(decision, target, point)
     for _ in range(_ITERATIONS):

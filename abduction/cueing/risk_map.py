@@ -7,11 +7,11 @@ from typing import Any, Protocol, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_number, read_numbers
 
 from .platt import fit_sigmoid, sigmoid
-from .schema import read_number, read_numbers
 
 SMALL_SAMPLE = 200
 
@@ -209,7 +209,7 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
         As for `fit_isotonic`.
     independent : float, optional
         How many independent samples they are worth; n where not given. Windows of one recording repeat each
-        other: see `abduction.correlation`.
+        other: see `abduction.cueing.effective_windows`.
 
     Returns
     -------

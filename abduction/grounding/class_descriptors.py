@@ -15,8 +15,8 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 SPEED_OF_SOUND_M_S = 343.0
 # Total ratio of gearbox and final drive, first to fifth gear: ordinary numbers of a passenger car (3.6, 2.05,
@@ -225,7 +225,7 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     References
     ----------
     European Commission, Directive 2015/996 (CNOSSOS-EU), annex, category 1: see
-    `worldstate.abduction.descriptors`.
+    `worldstate.abduction.grounding.class_descriptors`.
 
     Examples
     --------
@@ -301,9 +301,7 @@ def motorcycle() -> Descriptor:
     return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
 
 
-def _octave_db(
-    speed_m_s: Numbers, rolling: tuple[float, float], propulsion: tuple[float, float]
-) -> Numbers:
+def _octave_db(speed_m_s: Numbers, rolling: tuple[float, float], propulsion: tuple[float, float]) -> Numbers:
     ratio = speed_m_s / REFERENCE_SPEED_M_S
     rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
     propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)

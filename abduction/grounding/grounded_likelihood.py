@@ -16,11 +16,11 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
 
-from .descriptors import Descriptor
-from .evidence import SignatureEvidence
+from .class_descriptors import Descriptor
 from .observation import GroundedObservation, Observable
 
 _SPEEDS_M_S = np.linspace(-5.0, 30.0, 141)
@@ -239,7 +239,7 @@ def ground(
 
     Examples
     --------
-    >>> from worldstate.abduction.descriptors import car
+    >>> from worldstate.abduction.grounding.class_descriptors import car
     >>> scores = SignatureEvidence(("left", "right"), (1.0, -1.0), 0.0, 0.0)
     >>> closing = GroundedObservation(radial_speed_m_s=Observable(8.0, 1.0))
     >>> answer = ground(scores, closing, [car()])

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from worldstate.checks import finite_array, in_range
-from worldstate.values import NotUsable
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.values import NotUsable
 
 
 @dataclass(frozen=True, slots=True)

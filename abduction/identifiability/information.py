@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import check_shape, finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import check_shape, finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 Numbers = NDArray[np.float64]
 _BITS = 1.0 / math.log(2.0)

@@ -5,12 +5,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
-from .evidence import SignatureEvidence
-from .pairwise import SMALLEST_PROBABILITY
-from .signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS
+from .pairwise_coupling import SMALLEST_PROBABILITY
+from .published_signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS
 
 Numbers = NDArray[np.float64]
 

@@ -16,16 +16,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_numbers
 
-from .evidence import SignatureEvidence
 from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
 from .mirror import SEGMENTS, mirror_features
-from .pairwise import SMALLEST_PROBABILITY
-from .schema import read_numbers
-from .signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS, LEFT, RIGHT, evidence_of, explanation_ratios
-from .site import KINDS, SiteReference, log_levels
+from .pairwise_coupling import SMALLEST_PROBABILITY
+from .published_signature import (
+    CLASSES,
+    DIRECTIONS,
+    EXPLANATION_COLUMNS,
+    LEFT,
+    RIGHT,
+    evidence_of,
+    explanation_ratios,
+)
+from .site_reference import KINDS, SiteReference, log_levels
 
 MOST_EXPERTS = 32
 KIND = "ensemble"

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.linear_model import LogisticRegression
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 from .ensemble import MIRRORED_CLASSES, EnsembleModel
 from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
 from .mirror import SEGMENTS, mirror_features
-from .signature import CLASSES, NONE
-from .signature_training import checked_labels
-from .site import KINDS, SiteReference
-from .standardise import standardisation
+from .published_signature import CLASSES, NONE
+from .published_training import checked_labels
+from .site_reference import KINDS, SiteReference
+from .standardisation import standardisation
 
 _ITERATIONS = 1000
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_numbers, read_rows
 
 from .mirror import SEGMENTS
-from .schema import read_numbers, read_rows
-from .shape import shape_features
-from .site import KINDS, log_levels
+from .pattern_features import shape_features
+from .site_reference import KINDS, log_levels
 
 SHAPE, SHAPE_CHANGE = "shape", "shape_change"
 VIEWS = (*KINDS, SHAPE, SHAPE_CHANGE)

@@ -59,7 +59,7 @@ def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]
 
     References
     ----------
-    T.-F. Wu, C.-J. Lin and R. C. Weng 2004, second method: see `worldstate.abduction.pairwise`.
+    T.-F. Wu, C.-J. Lin and R. C. Weng 2004, second method: see `pairwise_coupling`.
 
     Examples
     --------

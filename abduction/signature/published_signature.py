@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.cueing.platt import sigmoid
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_numbers, read_rows
 
-from .evidence import SignatureEvidence
-from .pairwise import class_pairs, couple
-from .platt import sigmoid
-from .schema import read_numbers, read_rows
+from .pairwise_coupling import class_pairs, couple
 
 CLASSES = ("front", "left", "none", "right")
 DIRECTIONS = ("left", "right")

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.svm import SVC
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.cueing.platt import fit_sigmoid
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 from .mirror import mirror_features as mirror_features
-from .pairwise import class_pairs
-from .platt import fit_sigmoid
-from .signature import CLASSES, FRONT, LEFT, NONE, RIGHT, SignatureModel
-from .standardise import standardisation
+from .pairwise_coupling import class_pairs
+from .published_signature import CLASSES, FRONT, LEFT, NONE, RIGHT, SignatureModel
+from .standardisation import standardisation
 
 PLATT_FOLDS = 5
 

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_number, read_numbers
 
 from .ensemble import EnsembleModel
-from .schema import read_number, read_numbers
-from .site import SiteReference, log_levels
+from .site_reference import SiteReference, log_levels
 
 Numbers = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ class SiteEstimate:
 
         References
         ----------
-        Derived here: see the head of `worldstate.abduction.site_estimate`; gains by experiment.
+        Derived here: see the head of `worldstate.abduction.signature.site_estimate`; gains by experiment.
         """
         if self.level.shape != model.empty.shape:
             raise InvalidArgumentError(f"model: expected {self.level.size} features, got {model.n_features}")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 SMALLEST_LEVEL = 1e-4
 QUIET_SHARE = 0.35

@@ -3,10 +3,11 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.ensemble import EnsembleModel
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.site_estimate import SiteEstimate, SiteEstimateSettings
-from worldstate.checks import check_shape, finite_array, in_range
+from worldstate.ground.checks import check_shape, finite_array, in_range
+
+from .ensemble import EnsembleModel
+from .site_estimate import SiteEstimate, SiteEstimateSettings
 
 HOP_S = 0.1
 
@@ -37,8 +38,8 @@ class SiteSignature:
 
     Examples
     --------
-    >>> from worldstate.abduction.expert import Expert
-    >>> from worldstate.abduction.site import SiteReference
+    >>> from worldstate.abduction.signature.expert import Expert
+    >>> from worldstate.abduction.signature.site_reference import SiteReference
     >>> expert = Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4))
     >>> model = EnsembleModel((expert,), np.full(4, 0.25), SiteReference(*np.zeros((3, 6))), np.zeros(6))
     >>> signature = SiteSignature(model)

@@ -9,8 +9,9 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from worldstate.adapters.riff import data_size
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+from .riff import data_size
 
 Samples = NDArray[np.float32]
 
@@ -139,9 +140,7 @@ class SilentChannelsError(InputFileError):
         self.channels = channels
 
 
-def open_audio(
-    path: str | Path, expect_channels: int | None = None, *, strict: bool = True
-) -> AudioSource:
+def open_audio(path: str | Path, expect_channels: int | None = None, *, strict: bool = True) -> AudioSource:
     """Open a WAV, RF64, W64 or FLAC recording and check what can be checked before the first block.
 
     FLAC holds 8 channels at most and WAV 4 GiB, nine minutes of 56 channels: use RF64 or W64 beyond.

@@ -6,17 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.camera_health import CameraHealth, DegradationLog, HealthMonitor, degradation_log
-from worldstate.adapters.detections import DetectionFilter, DetectionFrame, DetectionLog
-from worldstate.adapters.detector import Detector
-from worldstate.adapters.image_quality import image_quality
-from worldstate.adapters.miss_rates import MissRates
-from worldstate.adapters.sector import Sector
-from worldstate.adapters.video import Video
-from worldstate.adapters.vision import VisionQuery, VisionSettings
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import nanoseconds
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import nanoseconds
+from worldstate.measurement.sector import Sector
+
+from .camera_health import CameraHealth, DegradationLog, HealthMonitor, degradation_log
+from .detections import DetectionFilter, DetectionFrame, DetectionLog
+from .detector import Detector
+from .image_quality import image_quality
+from .miss_rates import MissRates
+from .pinhole import PinholeCamera
+from .video import Video
+from .vision_query import VisionQuery, VisionSettings
 
 Frame = NDArray[np.uint8]
 

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.schema import read_number, read_numbers
-from worldstate.adapters.degradation import LEVELS, degrade, level_of
-from worldstate.adapters.image_quality import ImageQuality, image_quality
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.schema import read_number, read_numbers
+
+from .degradation import LEVELS, degrade, level_of
+from .image_quality import ImageQuality, image_quality
 
 Frame = NDArray[np.uint8]
 

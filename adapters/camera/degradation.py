@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from worldstate.adapters.vision_extra import opencv
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+
+from .opencv import opencv
 
 Family = Literal["blur", "darkness", "noise", "all"]
 FAMILIES: tuple[Family, ...] = get_args(Family)

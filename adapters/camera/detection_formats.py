@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.detections import (
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+from .detections import (
     MAX_BOXES_A_FRAME,
     MAX_BYTES,
     MAX_FRAMES,
@@ -17,8 +20,6 @@ from worldstate.adapters.detections import (
     DetectionLog,
     read_detections,
 )
-from worldstate.checks import in_range
-from worldstate.errors import InputFileError, InvalidArgumentError
 
 # The road users among COCO's categories, by the number that results files carry, and by their place in the
 # list of eighty names that YOLO text counts through.

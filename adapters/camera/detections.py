@@ -10,9 +10,9 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InputFileError, InvalidArgumentError
-from worldstate.values import nanoseconds
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.values import nanoseconds
 
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 100_000

@@ -5,7 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.detections import DetectionFrame
+from .detections import DetectionFrame
 
 
 class Detector(Protocol):

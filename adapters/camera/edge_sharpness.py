@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.vision_extra import opencv
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+
+from .opencv import opencv
 
 # Takes the pixel noise off the gradient; far narrower than any width asked for.
 _SMOOTHING_PX = 0.7

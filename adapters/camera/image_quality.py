@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, sobel
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
 
 # Side of the central part that is looked at, at full resolution: reducing it would hide blur and noise.
 LARGEST_PX = 640

@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.absence import MissRateTable
-from worldstate.abduction.isotonic_grid import isotonic_grid
-from worldstate.abduction.schema import check_schema, read_numbers, read_rows, schema_stamp
-from worldstate.adapters.atomic import write_text
-from worldstate.adapters.camera_health import CameraHealth, Health
-from worldstate.adapters.degradation import LEVELS
-from worldstate.checks import finite_array
-from worldstate.errors import InputFileError, InvalidArgumentError
-from worldstate.state.reading import decode_json
+from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
+from worldstate.adapters.files.atomic import write_text
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.reading import decode_json
+from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
+
+from .camera_health import CameraHealth, Health
+from .degradation import LEVELS
 
 SCHEMA = "worldstate.MissRates"
 VERSION = "1.0.0"

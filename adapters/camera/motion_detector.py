@@ -6,11 +6,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.detections import DetectionFrame
-from worldstate.adapters.outline import difference, outlined_share
-from worldstate.adapters.vision_extra import opencv
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+
+from .detections import DetectionFrame
+from .edge_sharpness import difference, outlined_share
+from .opencv import opencv
 
 # No edge of an image is narrower: pixels have a size, and noise is smoothed before it is looked for.
 NARROWEST_EDGE_PX = 3.0

@@ -8,11 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.detections import MAX_BOXES_A_FRAME, DetectionFrame
-from worldstate.adapters.detector import suppress
-from worldstate.adapters.vision_extra import opencv
-from worldstate.checks import in_range
-from worldstate.errors import InputFileError, InvalidArgumentError, MissingExtraError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
+
+from .detections import MAX_BOXES_A_FRAME, DetectionFrame
+from .detector import suppress
+from .opencv import opencv
 
 MAX_BYTES = 2 << 30
 # What a letterbox is filled up with.

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from worldstate.errors import MissingExtraError
+from worldstate.ground.errors import MissingExtraError
 
 
 def opencv() -> Any:

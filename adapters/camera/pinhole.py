@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.measurement import Sighting
-from worldstate.values import wrap_angle
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import wrap_angle
+from worldstate.measurement.measurement import Sighting
 
 Angles = NDArray[np.float64]
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
-from worldstate.checks import in_range
-from worldstate.values import nanoseconds
+from worldstate.ground.checks import in_range
+from worldstate.ground.values import nanoseconds
+
+from .detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,7 @@ def parked(
 
     Examples
     --------
-    >>> from worldstate.adapters.detections import DetectionFrame
+    >>> from worldstate.adapters.camera.detections import DetectionFrame
     >>> still = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9]), ("car",))
     >>> log = DetectionLog.at_rate([still] * 20, frame_rate_hz=10.0)
     >>> [parked(log, i, still.boxes_px, ParkedRule()).tolist() for i in (9, 10)]

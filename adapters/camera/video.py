@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.detections import MAX_FRAMES
-from worldstate.adapters.vision_extra import opencv
-from worldstate.errors import InputFileError
+from worldstate.ground.errors import InputFileError
+
+from .detections import MAX_FRAMES
+from .opencv import opencv
 
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"

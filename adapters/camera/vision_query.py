@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.detections import DetectionFilter, DetectionLog
-from worldstate.adapters.parked import ParkedRule, kept_and_parked
-from worldstate.adapters.protocol import Side
-from worldstate.adapters.sector import WHOLE_SIDES, Sector
-from worldstate.checks import in_range
-from worldstate.errors import InputFileError
-from worldstate.measurement import Bearing, Sighting
-from worldstate.values import NotUsable, nanoseconds, seconds
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
+from worldstate.measurement.measurement import Bearing, Sighting
+from worldstate.measurement.protocols import Side
+from worldstate.measurement.sector import WHOLE_SIDES, Sector
+
+from .detections import DetectionFilter, DetectionLog
+from .pinhole import PinholeCamera
+from .static_boxes import ParkedRule, kept_and_parked
 
 # Points at which a miss rate is averaged over the part of the sector that is in view.
 SAMPLES = 8
@@ -107,7 +108,7 @@ class VisionQuery:
 
     Examples
     --------
-    >>> from worldstate.adapters.detections import DetectionFrame
+    >>> from worldstate.adapters.camera.detections import DetectionFrame
     >>> empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     >>> query = VisionQuery(PinholeCamera(), DetectionLog.at_rate([empty] * 30, frame_rate_hz=10.0))
     >>> answer = query.ask(nanoseconds(1.0), Bearing(0.0, 0.05))

@@ -8,14 +8,15 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.signature import CLASSES
-from worldstate.adapters.audio import AudioSource, open_audio
-from worldstate.adapters.csv_rows import read_rows
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.adapters.ovad_layout import AUDIO_NAME
-from worldstate.errors import InputFileError
-from worldstate.frontend.array import MicrophoneArray
-from worldstate.frontend.feature import published_feature
+from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.adapters.audio.sound_file import AudioSource, open_audio
+from worldstate.adapters.files.csv_rows import read_rows
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import published_feature
+from worldstate.ground.errors import InputFileError
+
+from .feature_table import FeatureTable
+from .ovad_layout import AUDIO_NAME
 
 WINDOW_S = 1.0
 BLOCK_S = 0.1

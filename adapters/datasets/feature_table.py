@@ -2,7 +2,7 @@
 
 Columns: ``feat0`` to ``feat59``, ``Class`` (front, left, none, right), ``ID``, ``Environment`` (S.. standing
 ego, D.. moving ego), ``T0`` (frame number, may be empty) and ``Recording ID``. Azimuths run from -90 to 90
-degrees and grow to the right, as in the released data and in `frontend.feature`.
+degrees and grow to the right, as in the released data and in `frontend.direction.feature`.
 """
 
 import csv
@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.signature import CLASSES
-from worldstate.adapters.atomic import atomic_path
-from worldstate.adapters.csv_rows import read_rows
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.csv_rows import read_rows
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 N_FEATURES = 60
 FEATURE_COLUMNS = tuple(f"feat{i}" for i in range(N_FEATURES))

@@ -13,12 +13,13 @@ from typing import Literal, TypeGuard, final, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.audio import AudioSource, open_audio
-from worldstate.adapters.csv_rows import read_rows
-from worldstate.adapters.detections import DetectionLog, read_detections
-from worldstate.adapters.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
-from worldstate.errors import InputFileError
-from worldstate.values import wrap_angle
+from worldstate.adapters.audio.sound_file import AudioSource, open_audio
+from worldstate.adapters.camera.detections import DetectionLog, read_detections
+from worldstate.adapters.files.csv_rows import read_rows
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.values import wrap_angle
+
+from .ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
 
 Label = Literal["left", "none", "right"]
 
@@ -115,7 +116,7 @@ class Recording:
         return None if self.t0_frame is None else self.t0_frame / FRAME_RATE_HZ
 
     def open_audio(self, expect_channels: int | None = None) -> AudioSource:
-        """Open the sound; raises what `adapters.audio.open_audio` raises."""
+        """Open the sound; raises what `adapters.audio.sound_file.open_audio` raises."""
         return open_audio(self.audio_path, expect_channels)
 
     def read_detections(self) -> DetectionLog | None:

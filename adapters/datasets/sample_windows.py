@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from worldstate.adapters.feature_extraction import WINDOW_S, LabelledWindow
-from worldstate.adapters.ovad import OvadDataset, Recording
-from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
+from .feature_extraction import WINDOW_S, LabelledWindow
+from .ovad import OvadDataset, Recording
+from .ovad_layout import FRAME_RATE_HZ
 
 MOVING_LATER_S, FRONT_LATER_S = 0.5, 1.5
 FRONT = "front"

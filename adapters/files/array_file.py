@@ -10,9 +10,10 @@ import numpy as np
 from defusedxml.common import DefusedXmlException
 from numpy.typing import NDArray
 
-from worldstate.adapters.atomic import write_text
-from worldstate.errors import InputFileError, InvalidArgumentError
-from worldstate.frontend.array import MicrophoneArray
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+from .atomic import write_text
 
 MAX_BYTES = 1 << 20
 MAX_MICROPHONES = 1024

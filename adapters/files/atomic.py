@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from worldstate.errors import InputFileError
+from worldstate.ground.errors import InputFileError
 
 
 @contextmanager

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from worldstate.abduction.site_estimate import SiteEstimate
-from worldstate.adapters.atomic import write_text
-from worldstate.errors import InputFileError, InvalidArgumentError, SchemaVersionError
-from worldstate.filter import WorldFilter
-from worldstate.state.reading import decode_json
+from worldstate.abduction.signature.site_estimate import SiteEstimate
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+from worldstate.ground.reading import decode_json
+
+from .atomic import write_text
 
 MAX_BYTES = 16 << 20
 

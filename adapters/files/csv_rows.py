@@ -5,7 +5,7 @@ import io
 from collections.abc import Collection
 from pathlib import Path
 
-from worldstate.errors import InputFileError
+from worldstate.ground.errors import InputFileError
 
 MAX_BYTES = 16 << 20
 

@@ -7,12 +7,13 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from worldstate.abduction.any_signature import AnySignature, signature_from_dict
-from worldstate.abduction.cueing import CueingPolicies, CueingPolicy
-from worldstate.abduction.schema import check_schema, read_number, schema_stamp
-from worldstate.adapters.atomic import write_text
-from worldstate.errors import InputFileError, InvalidArgumentError
-from worldstate.state.reading import decode_json
+from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.signature.signature_io import AnySignature, signature_from_dict
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.reading import decode_json
+from worldstate.ground.schema import check_schema, read_number, schema_stamp
+
+from .atomic import write_text
 
 SCHEMA = "worldstate.Model"
 VERSION = "1.1.0"

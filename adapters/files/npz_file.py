@@ -6,8 +6,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+from .atomic import atomic_path
 
 Result = TypeVar("Result")
 

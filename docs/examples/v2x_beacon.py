@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.adapters.protocol import CoEvidenceChannel
-from worldstate.filter import WorldFilter, uncalibrated_policy
-from worldstate.measurement import Approach, Bearing, Measurement, Sighting
+from worldstate.core.filter import WorldFilter, uncalibrated_policy
+from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
+from worldstate.measurement.measurement import Approach, Bearing, Measurement, Sighting
+from worldstate.measurement.protocols import CoEvidenceChannel
 from worldstate.state import WorldState
-from worldstate.values import NotUsable, nanoseconds, wrap_angle
 
 DIRECTIONS = ("left", "right")
 

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
 
-from .geometry import SPEED_OF_SOUND_M_S
-from .harmonics import HarmonicTrack
-from .scurve import PARAMETERS, PassBy, fit_pass_by, radial_speed_gradient, radial_speed_m_s
+from .engine_line import HarmonicTrack
+from .pass_by import PARAMETERS, PassBy, fit_pass_by, radial_speed_gradient, radial_speed_m_s
 
 FloatArray = NDArray[np.float64]
 
@@ -148,7 +148,7 @@ def radial_speed(
     Parameters
     ----------
     track : HarmonicTrack
-        From `worldstate.frontend.harmonics.track_fundamental`.
+        From `worldstate.frontend.approach.engine_line.track_fundamental`.
     settings : DopplerSettings, optional
         When to answer.
     speed_of_sound_m_s : float
@@ -174,7 +174,7 @@ def radial_speed(
 
     References
     ----------
-    Section IV of the paper; the S-curve: see `worldstate.frontend.scurve`; BIC: G. Schwarz, "Estimating the
+    Section IV of the paper; the S-curve: see `pass_by`; BIC: G. Schwarz, "Estimating the
     dimension of a model", Ann. Statist. 6, 1978.
 
     Examples

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import signal
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
-from .comb import ZERO_PADDING, FloatArray, HarmonicSettings, best_path, spectrum_and_floor
-from .lines import Fundamental, Windows, measure_fundamental
+from .harmonic_sum import ZERO_PADDING, FloatArray, HarmonicSettings, best_path, spectrum_and_floor
+from .partials import Fundamental, Windows, measure_fundamental
 
 __all__ = ["HarmonicSettings", "HarmonicTrack", "track_fundamental"]
 
@@ -97,7 +97,7 @@ def track_fundamental(
     References
     ----------
     A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the track), D. C. Rife and R. R. Boorstyn 1974 (the
-    teeth): see `worldstate.frontend.comb` and `worldstate.frontend.lines`.
+    teeth): see `worldstate.frontend.approach.harmonic_sum` and `worldstate.frontend.approach.partials`.
 
     Examples
     --------

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from worldstate.checks import in_range
+from worldstate.ground.checks import in_range
 
 FloatArray = NDArray[np.float64]
 
@@ -150,7 +150,7 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
 
     References
     ----------
-    A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the path): see `worldstate.frontend.comb`.
+    A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the path): see `harmonic_sum`.
 
     Examples
     --------

@@ -29,9 +29,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
 
 MIN_POINTS = 4
 # Scatter of log E about the fit, nats (3 dB), beyond which energy is not that of one approaching source.
@@ -101,7 +101,7 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
 
     References
     ----------
-    Eq. (looming) of the paper, after D. Lee 1976: see `worldstate.frontend.looming`. The line is derived
+    Eq. (looming) of the paper, after D. Lee 1976: see `looming`. The line is derived
     here: E goes as the inverse square of the range, which changes evenly at constant speed.
 
     Examples

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .comb import ZERO_PADDING, FloatArray, HarmonicSettings
+from .harmonic_sum import ZERO_PADDING, FloatArray, HarmonicSettings
 
 # Largest correction, in resolutions 1 / window, that one Newton step may make to a tooth.
 REACH = 0.75
@@ -112,7 +112,7 @@ def measure_fundamental(
     References
     ----------
     Weighted least squares, from the definition; sigma_h is the first-order error of the maximum of D. C. Rife
-    and R. R. Boorstyn 1974: see `worldstate.frontend.lines`.
+    and R. R. Boorstyn 1974: see `worldstate.frontend.approach.partials`.
 
     Examples
     --------

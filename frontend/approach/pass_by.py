@@ -77,7 +77,7 @@ def radial_speed_m_s(
 
     References
     ----------
-    P. M. Morse and K. U. Ingard 1968, section 11.2: see `worldstate.frontend.scurve`.
+    P. M. Morse and K. U. Ingard 1968, section 11.2: see `worldstate.frontend.approach.pass_by`.
 
     Examples
     --------

@@ -15,12 +15,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import wrap_angle
-
-from .bounds import tone_crb_hz2
-from .spectra import ComplexArray, finite_complex
+from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
+from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import wrap_angle
 
 FEWEST_SAMPLES = 8
 # A grid of a quarter of the resolution puts the coarse peak within an eighth of it: well inside the main
@@ -97,11 +96,11 @@ def estimate_tone(
 
     Notes
     -----
-    Bound: `worldstate.frontend.bounds.tone_crb_hz2`.
+    Bound: `worldstate.frontend.bounds.cramer_rao.tone_crb_hz2`.
 
     References
     ----------
-    D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.tone`.
+    D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.approach.tone`.
 
     Examples
     --------
@@ -262,9 +261,7 @@ def _rows(
     return rows
 
 
-def _tone(
-    y: NDArray[np.float64] | ComplexArray, omega: float, amplitude: complex, rate: float
-) -> Tone:
+def _tone(y: NDArray[np.float64] | ComplexArray, omega: float, amplitude: complex, rate: float) -> Tone:
     complex_signal, count, size = np.iscomplexobj(y), len(y), abs(amplitude)
     model = amplitude * tone_wave(omega, count)
     residual = y - (model if complex_signal else model.real)

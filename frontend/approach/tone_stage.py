@@ -15,15 +15,15 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
+from worldstate.frontend.spectra.decimator import Decimator
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
 
-from .array import MicrophoneArray
-from .bounds import tone_crb_hz2
-from .comb import MEDIAN_OF_EXPONENTIAL
-from .decimator import Decimator
-from .masking import ChannelMask
+from .harmonic_sum import MEDIAN_OF_EXPONENTIAL
 from .tone import climb
 
 ENGINE_BAND_HZ = (20.0, 400.0)
@@ -166,7 +166,7 @@ class ToneStage:
 
         References
         ----------
-        D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.tone`.
+        D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.approach.tone`.
         """
         if self._n_out < len(self._heard):
             return NotUsable(f"needs {len(self._heard) / self._rate:.2f} s of sound")

@@ -69,7 +69,7 @@ class Nodes:
 
         References
         ----------
-        N. J. Higham 1990 (the pivoting): see `worldstate.frontend.nodes`.
+        N. J. Higham 1990 (the pivoting): see `worldstate.frontend.array.angular_interpolation`.
         """
         count = vectors.shape[2]
         rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)

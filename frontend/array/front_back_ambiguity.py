@@ -10,9 +10,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.values import NotUsable
+from worldstate.ground.values import NotUsable
 
-from .array import MicrophoneArray
+from .microphone_array import MicrophoneArray
 
 # Horizontal part of an axis below which a cone holds every azimuth.
 _LEVEL = 1e-6

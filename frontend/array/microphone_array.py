@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vectors, nearest_spacings_m
 
@@ -122,7 +122,7 @@ class MicrophoneArray:
 
     @property
     def ambiguity(self) -> Ambiguity:
-        """Directions that no algorithm can tell apart here: see `worldstate.frontend.geometry.ambiguity`."""
+        """Directions that no algorithm can tell apart here: see `ambiguity`."""
         return ambiguity(self.positions_m)
 
     def delays_s(

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .array import MicrophoneArray
+from .angular_interpolation import Nodes
 from .geometry import SPEED_OF_SOUND_M_S
-from .nodes import Nodes
+from .microphone_array import MicrophoneArray
 
 # Largest part of a steering vector, relative to its length, that the factors may miss: single precision's
 # own.
@@ -220,7 +220,7 @@ class Steering:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeBeams:
-    """Beams at a few directions: see `worldstate.frontend.nodes`.
+    """Beams at a few directions: see `worldstate.frontend.array.angular_interpolation`.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ class NodeBeams:
 
         References
         ----------
-        N. J. Higham 1990: see `worldstate.frontend.nodes`.
+        N. J. Higham 1990: see `worldstate.frontend.array.angular_interpolation`.
         """
         nodes = Nodes.of(weights)
         if nodes is None:

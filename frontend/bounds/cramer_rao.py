@@ -7,10 +7,9 @@ ratios are power ratios, not decibels.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-
-from .geometry import SPEED_OF_SOUND_M_S, direction_vectors
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S, direction_vectors
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 # Information below this share of its largest possible value is called none.
 NEGLIGIBLE = 1e-12

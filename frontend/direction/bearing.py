@@ -107,7 +107,7 @@ def strongest_bearing(
 
     References
     ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001 (the bearing): see `worldstate.frontend.srp`.
+    J. DiBiase, H. Silverman and M. Brandstein 2001 (the bearing): see `worldstate.frontend.direction.srp`.
 
     Examples
     --------

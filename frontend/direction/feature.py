@@ -25,15 +25,14 @@ import numpy as np
 import scipy.signal
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-
-from .array import MicrophoneArray
-from .bins import band_bins, bin_frequencies_hz
-from .geometry import SPEED_OF_SOUND_M_S
-from .phat import whiten
-from .steering import Steering, cross_spectra
-from .threads import one_blas_thread
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.phat import whiten
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
 """The published azimuths in this library's convention (left positive), in the published order."""
@@ -75,7 +74,7 @@ def feature_steering(
 
     References
     ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
 
     Examples
     --------
@@ -104,11 +103,11 @@ def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.
 
     References
     ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
 
     Examples
     --------
-    >>> from worldstate.frontend.steering import Steering
+    >>> from worldstate.frontend.array.steering import Steering
     >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0])
     >>> pair_sum(np.array([[[1.0, 1j]]], np.complex64), steering).round(3)
     array([0.-1.j])
@@ -135,11 +134,11 @@ def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[
 
     References
     ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
 
     Examples
     --------
-    >>> from worldstate.frontend.steering import Steering
+    >>> from worldstate.frontend.array.steering import Steering
     >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0])
     >>> pair_sum_of(np.ones((1, 2, 2), np.complex64), steering).round(3)
     array([1.+0.j])
@@ -169,7 +168,7 @@ def segment_feature(
 
     References
     ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
 
     Examples
     --------
@@ -209,7 +208,7 @@ def published_feature(
 
     References
     ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.feature`.
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
 
     Examples
     --------

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable, wrap_angle
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable, wrap_angle
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,10 +19,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
-
-from .spectra import ComplexArray, finite_complex
+from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 Weighting = Literal["none", "phat", "scot", "ml"]
 WEIGHTINGS: tuple[Weighting, ...] = ("none", "phat", "scot", "ml")
@@ -172,7 +171,7 @@ def gcc_delays(
 
     References
     ----------
-    C. Knapp and G. C. Carter 1976, table I (the weightings): see `worldstate.frontend.gcc`.
+    C. Knapp and G. C. Carter 1976, table I (the weightings): see `worldstate.frontend.direction.gcc`.
 
     Examples
     --------

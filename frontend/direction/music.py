@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.errors import InvalidArgumentError
-
-from .spectra import ComplexArray, finite_complex
+from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.ground.errors import InvalidArgumentError
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -65,7 +64,7 @@ def covariance(spectra: ArrayLike) -> ComplexArray:
 
     References
     ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.music`.
+    R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
 
     Examples
     --------
@@ -103,7 +102,7 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
 
     References
     ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.music`; L. Sirovich, "Turbulence and the dynamics of coherent
+    R. O. Schmidt 1986: see `music`; L. Sirovich, "Turbulence and the dynamics of coherent
     structures", Quart. Appl. Math. 45, 1987 (the smaller eigenproblem).
 
     Examples
@@ -153,7 +152,7 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
 
     References
     ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.music`.
+    R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
 
     Examples
     --------
@@ -194,7 +193,7 @@ def music_spectrum(
 
     References
     ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.music`.
+    R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
 
     Examples
     --------

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.spectra.spectra import ComplexArray
+from worldstate.frontend.spectra.window_sum import WindowSum
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
 
-from .masking import ChannelMask
 from .peaks import find_peaks
-from .spectra import ComplexArray
-from .steering import Steering
 from .subspace import SubspaceTracker
-from .window_sum import WindowSum
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,7 @@ class MusicStage:
     r"""Running covariance of a window of spectra, its signal subspace, and the spectrum over a grid.
 
     Fed with prewhitened spectra and read with prewhitened beams it is the generalised eigenvalue form: the
-    eigenvectors of :math:`R^{-1/2} R_x R^{-1/2}`, R being the noise (`worldstate.frontend.prewhitening`).
+    eigenvectors of :math:`R^{-1/2} R_x R^{-1/2}`, R being the noise (`prewhitening`).
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class MusicStage:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> array, grid = MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)]), np.linspace(-1.5, 1.5, 31)
     >>> stage = MusicStage(Steering.towards(array, [500.0, 700.0], grid), grid, 1, 4, window_hops=2)
     >>> wave = array.steering([500.0, 700.0], 0.4)[None, :, :, 0].astype(np.complex64)
@@ -107,7 +107,7 @@ class MusicStage:
 
         References
         ----------
-        R. O. Schmidt 1986: see `worldstate.frontend.music`.
+        R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
         """
         by_bin = spectra.transpose(1, 0, 2)
         np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.open_slot())
@@ -132,7 +132,7 @@ class MusicStage:
 
         References
         ----------
-        R. O. Schmidt 1986: see `worldstate.frontend.music`.
+        R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
         """
         if mask.n_kept <= self._sources:
             return NotUsable(f"{mask.n_kept} microphones left for {self._sources} sources")

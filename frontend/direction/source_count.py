@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 Criterion = Literal["mdl", "aic", "few"]
 CRITERIA: tuple[Criterion, ...] = ("mdl", "aic", "few")
@@ -69,7 +69,7 @@ def count_sources(
     References
     ----------
     M. Wax and T. Kailath 1985 (AIC, MDL), R. R. Nadakuditi and A. Edelman 2008 (few): see
-    `worldstate.frontend.sources`.
+    `worldstate.frontend.direction.source_count`.
 
     Examples
     --------

@@ -15,10 +15,9 @@ J. DiBiase, H. Silverman and M. Brandstein, Robust localization in reverberant r
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import check_shape
-
-from .phat import whiten
-from .steering import Steering
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.spectra.phat import whiten
+from worldstate.ground.checks import check_shape
 
 
 def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
@@ -38,11 +37,11 @@ def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArra
 
     References
     ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.srp`.
+    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.direction.srp`.
 
     Examples
     --------
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
     >>> steered_power(np.ones((3, 1, 2), np.complex64), steering).round(1)
     array([12. ,  9.8])
@@ -71,7 +70,7 @@ def normalised(
 
     References
     ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.srp`.
+    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.direction.srp`.
 
     Examples
     --------
@@ -105,11 +104,11 @@ def srp_phat(spectra: NDArray[np.complex64], steering: Steering) -> NDArray[np.f
 
     References
     ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.srp`.
+    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.direction.srp`.
 
     Examples
     --------
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
     >>> steering = Steering.towards(array, [500.0], [-0.5, 0.0, 0.5])
     >>> plane_wave = array.steering(500.0, 0.5).transpose(2, 0, 1).astype(np.complex64)

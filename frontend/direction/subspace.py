@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.frontend.spectra.spectra import ComplexArray
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 from .music import Subspace, checked_covariance
-from .spectra import ComplexArray
 
 FloatArray = NDArray[np.floating[Any]]
 

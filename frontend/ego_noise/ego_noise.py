@@ -30,16 +30,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.spectra.phat import whiten
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
-from .from_below import FromBelow, share_of
-from .guarded import Guard
+from .elevation_split import FromBelow, share_of
+from .guard_delay import Guard
 from .harmonic_cancellation import HarmonicCanceller
 from .noise_memory import NoiseCovariance, NoiseLevel
-from .phat import whiten
 from .prewhitening import shrunk_inverse_root, white_share
-from .steering import Steering, cross_spectra
 from .whitened_beams import WhitenedBeams
 
 _TINY = np.float32(1e-30)
@@ -132,7 +132,7 @@ class EgoNoise:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> plain = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
     >>> ego = EgoNoise(EgoNoiseSettings(guard_hops=0), 200.0, 2, [(plain, slice(1, 2))])
     >>> hop = np.ones((20, 3, 2), np.complex64)
@@ -200,7 +200,7 @@ class EgoNoise:
         References
         ----------
         K. Nakamura et al. 2009 (whitening), B. Widrow et al. 1975 (cancelling), Y. Chen et al. 2010
-        (shrinkage): see `worldstate.frontend.prewhitening` and `worldstate.frontend.harmonic_cancellation`.
+        (shrinkage): see `prewhitening` and `harmonic_cancellation`.
         """
         heard = spectra[:, self._bins]
         if self.engine is not None:

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .array import MicrophoneArray
-from .geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 _BELOW_DEG, _STREET_DEG = (-60.0, -50.0, -40.0, -30.0, -20.0), (0.0, 10.0, 20.0, 30.0)
 _AZIMUTHS_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
@@ -43,7 +43,7 @@ class FromBelow:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import roof_array_56
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> array = roof_array_56()
     >>> judge = FromBelow.of(array, [500.0, 1000.0])
     >>> def heard(elevation):
@@ -88,7 +88,7 @@ class FromBelow:
 
         References
         ----------
-        B. F. Cron and C. H. Sherman 1962 (model fields): see `worldstate.frontend.from_below`; the normal
+        B. F. Cron and C. H. Sherman 1962 (model fields): see `elevation_split`; the normal
         equations of least squares, by Cramer's rule.
         """
         b, s = (_field(array, frequencies_hz, el, speed_of_sound_m_s) for el in (_BELOW_DEG, _STREET_DEG))

@@ -25,8 +25,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 ComplexArray = NDArray[np.complexfloating]
 FloatArray = NDArray[np.float64]
@@ -192,7 +192,7 @@ class HarmonicCanceller:
 
     Examples
     --------
-    >>> from worldstate.frontend.stft import StreamingStft
+    >>> from worldstate.frontend.spectra.stft import StreamingStft
     >>> t = np.arange(16_000) / 16_000.0
     >>> engine = sum(np.cos(2 * np.pi * 50.0 * h * t + h) for h in range(1, 30))
     >>> spectra = StreamingStft(1, 256, range(5, 20)).push(engine[:, None].astype(np.float32))
@@ -277,7 +277,7 @@ class HarmonicCanceller:
 
         References
         ----------
-        B. Widrow et al. 1975, H. Vold and J. Leuridan 1993: see `worldstate.frontend.harmonic_cancellation`.
+        B. Widrow et al. 1975, H. Vold and J. Leuridan 1993: see `harmonic_cancellation`.
         Derived here: kappa takes off what noise adds to the power of an amplitude, once more for safety.
         """
         if self._engine is None or not len(spectra):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .guarded import Guard
+from .guard_delay import Guard
 
 # Memory of the level of whitened noise, hops.
 _LEVEL_HOPS = 10.0
@@ -51,7 +51,7 @@ class NoiseCovariance:
         References
         ----------
         An exponential mean, from the definition; unit-length snapshots by D. E. Tyler 1987: see
-        `worldstate.frontend.ego_noise`.
+        `worldstate.frontend.ego_noise.ego_noise`.
         """
         kept = math.exp(-weight * n_frames / self._forgetting)
         total *= np.float32(weight)
@@ -127,7 +127,7 @@ class NoiseLevel:
         References
         ----------
         H. M. Finn and R. S. Johnson 1968 (constant false-alarm rate): see
-        `worldstate.frontend.ego_noise.EgoNoise.levelled`.
+        `worldstate.frontend.ego_noise.ego_noise.EgoNoise.levelled`.
         """
         ripe = self._guard.push(level, weight)
         if ripe is not None and ripe[1] > 0.0:

@@ -22,11 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-
-from .spectra import ComplexArray, finite_complex
-from .threads import one_blas_thread
+from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 # A microphone whose noise is this far below the mean (power) is dead: it keeps no say in anything.
 _DEAD = 1e-9
@@ -100,7 +99,7 @@ class Prewhitener:
 
         References
         ----------
-        K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`.
+        K. Nakamura et al. 2009: see `worldstate.frontend.ego_noise.prewhitening`.
         """
         X = finite_complex("spectra", spectra, (None, *self.roots.shape[:2]))
         # y_i = sum_j root_ij x_j, with x as rows: the transpose.
@@ -128,7 +127,7 @@ class Prewhitener:
 
         References
         ----------
-        R. Roy and T. Kailath 1989, K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`.
+        R. Roy and T. Kailath 1989, K. Nakamura et al. 2009: see `worldstate.frontend.ego_noise.prewhitening`.
         """
         R = finite_complex("covariance", covariance, self.roots.shape)
         return np.asarray(self.roots @ R @ self.roots)
@@ -155,7 +154,7 @@ class Prewhitener:
 
         References
         ----------
-        K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`. The length is derived here: what
+        K. Nakamura et al. 2009: see `prewhitening`. The length is derived here: what
         whitening takes from the sound it takes from a.
         """
         A = finite_complex("steering", steering, (*self.roots.shape[:2], None))
@@ -234,7 +233,7 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
 
     References
     ----------
-    Y. Chen, A. Wiesel, Y. Eldar and A. Hero 2010: see `worldstate.frontend.prewhitening`.
+    Y. Chen, A. Wiesel, Y. Eldar and A. Hero 2010: see `worldstate.frontend.ego_noise.prewhitening`.
 
     Examples
     --------

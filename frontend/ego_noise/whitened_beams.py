@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from .steering import Steering
+from worldstate.frontend.array.steering import Steering
 
 _TINY = np.float32(1e-30)
 
@@ -22,7 +22,7 @@ class WhitenedBeams:
 
     Examples
     --------
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> plain = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
     >>> beams = WhitenedBeams(plain)
     >>> beams.update(0, 3.0 * np.eye(2, dtype=np.complex64))
@@ -50,7 +50,7 @@ class WhitenedBeams:
 
         References
         ----------
-        K. Nakamura et al. 2009: see `worldstate.frontend.prewhitening`.
+        K. Nakamura et al. 2009: see `worldstate.frontend.ego_noise.prewhitening`.
         """
         plain, ours = self.plain, self.steering
         weights = plain.weights[bin_index]

@@ -6,10 +6,10 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.values import NotUsable
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.ground.values import NotUsable
 
-from .gaps import Gap
-from .masking import ChannelMask
+from .dropouts import Gap
 from .sample_clock import RateEstimate
 
 

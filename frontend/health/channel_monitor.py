@@ -3,15 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from .array import MicrophoneArray
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+
+from .channel_activity import Presence
 from .channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Fault, faults_where
-from .gaps import Gap, GapFinder
-from .masking import ChannelMask
-from .place_check import PlaceCheck
-from .presence import Presence
-from .rails import RailCounter
+from .clipping import RailCounter
+from .dropouts import Gap, GapFinder
+from .geometry_check import PlaceCheck
+from .running_mean import SlowMean
 from .sample_clock import SampleClock
-from .slow_mean import SlowMean
 
 # Mean square of the band against the median channel's below which a channel counts as silent: -30 dB.
 _SILENT = 1e-3

@@ -4,11 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from worldstate.values import NotUsable
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.values import NotUsable
 
-from .array import MicrophoneArray
 from .channel_health import ChannelFault, Fault, faults_where
-from .place_fit import place_scores, place_weights
+from .position_fit import place_scores, place_weights
 
 # Judged once in so many hops, on a mean over the last two seconds.
 _EVERY_HOPS = 10
@@ -139,9 +139,7 @@ class PlaceCheck:
         self._suspects[[fault.channel for fault in swapped]] = True
         share = own / typical
         return (
-            swapped
-            + faults_where(Fault.NOISY, noisy, share)
-            + faults_where(Fault.INVERTED, inverted, share)
+            swapped + faults_where(Fault.NOISY, noisy, share) + faults_where(Fault.INVERTED, inverted, share)
         )
 
     def _confirm(self, found: list[ChannelFault]) -> None:

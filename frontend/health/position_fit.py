@@ -25,8 +25,8 @@ Soc. Am., 1955.
 import numpy as np
 from numpy.typing import NDArray
 
-from .array import MicrophoneArray
-from .geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 # Incoherent power of a usable channel against the field's: delay mismatch and self-noise of real arrays.
 _NOISE = 0.2
@@ -64,7 +64,7 @@ def place_weights(
     References
     ----------
     C. Rasmussen and C. Williams 2006, section 5.4.2; R. Cook et al. 1955 (Gamma): see
-    `worldstate.frontend.place_fit`.
+    `worldstate.frontend.health.position_fit`.
 
     Examples
     --------

@@ -11,9 +11,9 @@ header says 48,000 is 42 millionths off: a clock that is good to a millisecond n
 import math
 from dataclasses import dataclass
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import NotUsable, seconds
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable, seconds
 
 # Fewer pairs say too little about their own scatter.
 _MIN_READINGS = 10

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
 
 # Mean square that stands for silence, far below 24-bit quantisation; keeps the logarithm finite.
 SILENCE = 1e-20

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
 
 
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:

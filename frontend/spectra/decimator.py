@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from worldstate.checks import in_range
+from worldstate.ground.checks import in_range
 
 # What folds into the band is this far down, and so is the ripple within it.
 _ATTENUATION_DB = 80.0

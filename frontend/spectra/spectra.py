@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import check_shape
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import check_shape
+from worldstate.ground.errors import InvalidArgumentError
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 

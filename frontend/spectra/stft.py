@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
 
 
 class StreamingStft:

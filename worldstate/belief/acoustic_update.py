@@ -3,8 +3,8 @@
 import math
 from dataclasses import replace
 
-from worldstate.measurement import Measurement
-from worldstate.values import NotUsable
+from worldstate.ground.values import NotUsable
+from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
 from .motion import log_azimuth_likelihood, update_approach, update_azimuth

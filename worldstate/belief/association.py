@@ -5,11 +5,11 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from worldstate.measurement import Sighting
-from worldstate.values import wrap_angle
+from worldstate.ground.values import wrap_angle
+from worldstate.measurement.measurement import Sighting
 
 from .settings import FilterSettings
-from .side import Scene
+from .site_geometry import Scene
 from .track import Track
 
 _NEVER = 1e6

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from worldstate.measurement import Measurement
-from worldstate.values import NANOSECONDS_PER_SECOND
+from worldstate.ground.values import NANOSECONDS_PER_SECOND
+from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
-from .side import Scene
+from .site_geometry import Scene
 from .track import Track, entity_id
 
 HIDDEN_LABEL = "vehicle"

@@ -9,7 +9,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, abduce
 
-from .chain import RatesHz, equilibrium, transition
+from .markov_chain import RatesHz, equilibrium, transition
 
 # Keeps every log finite: about 1e-261, far below anything that a likelihood could bring back in time.
 LOG_FLOOR = -600.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from worldstate.values import NANOSECONDS_PER_SECOND
+from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
 RatesHz = tuple[float, float, float, float, float, float]
 """arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""

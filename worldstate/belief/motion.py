@@ -7,7 +7,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from worldstate.values import wrap_angle
+from worldstate.ground.values import wrap_angle
 
 from .polar import AZIMUTH, LOG_RANGE, RADIAL_RATE, jacobian, process_noise, propagate
 
@@ -152,9 +152,7 @@ def _update(belief: MotionBelief, row: int, value: float, std: float, weight: fl
     )
     step = engine.x - belief.mean
     covariance = weight * engine.P + (1.0 - weight) * belief.covariance
-    return _belief(
-        belief.mean + weight * step, covariance + weight * (1.0 - weight) * np.outer(step, step)
-    )
+    return _belief(belief.mean + weight * step, covariance + weight * (1.0 - weight) * np.outer(step, step))
 
 
 def _wrapped(z: Floats, expected: Floats) -> Floats:

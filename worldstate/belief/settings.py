@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, fields
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from worldstate.values import wrap_angle
+from worldstate.ground.values import wrap_angle
 
 from .motion import MotionBelief
 from .settings import FilterSettings

@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass, replace
 from uuid import UUID, uuid5
 
-from worldstate.measurement import Sighting
+from worldstate.measurement.measurement import Sighting
 
 from .existence import after_time
 from .motion import MotionBelief, predict, relax
-from .side import Scene
+from .site_geometry import Scene
 
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
 _LABEL_GAIN = 0.3

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
-from worldstate.measurement import Measurement, Sighting
+from worldstate.measurement.measurement import Measurement, Sighting
 
 from .association import match_hidden, match_visible
 from .existence import after_empty_look, after_sighting
@@ -14,7 +14,7 @@ from .explanation import ExplanationBelief
 from .motion import MotionBelief, update_azimuth
 from .polar import LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
-from .side import Scene
+from .site_geometry import Scene
 from .track import Track, entity_id, merged, relabelled
 
 _NEW_RATE_STD = (0.5, 0.5)

@@ -6,23 +6,23 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 
-from worldstate.errors import WorldstateError
+from worldstate.ground.errors import WorldstateError
 
 # Modules are imported when the parser is built; each keeps its heavy imports inside `run`.
 COMMANDS = (
-    "demo",
-    "run",
-    "doctor",
-    "bounds",
-    "simulate",
-    "train",
-    "calibrate",
-    "measure_absence",
-    "evaluate_degradation",
-    "evaluate_features",
-    "extract_features",
-    "twin",
-    "bench",
+    "users.demo",
+    "users.run",
+    "users.doctor",
+    "users.bounds",
+    "users.simulate",
+    "users.train",
+    "users.calibrate",
+    "users.measure_absence",
+    "studies.evaluate_degradation",
+    "studies.evaluate_features",
+    "users.extract_features",
+    "studies.twin",
+    "users.bench",
 )
 
 

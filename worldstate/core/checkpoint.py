@@ -6,17 +6,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing import CueingPolicy, SustainedRule
+from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
+from worldstate.belief.belief_lag import Heard, Trail
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.motion import MotionBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
-from worldstate.belief.trail import Heard, Trail
-from worldstate.errors import InvalidArgumentError
-from worldstate.memory import Memory
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state import ANSWERS, Priors, Record
+
+from .memory import Memory
 
 T = TypeVar("T")
 

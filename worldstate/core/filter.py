@@ -5,11 +5,17 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from worldstate.abduction.cueing import CueingPolicy
-from worldstate.abduction.risk_map import PlattMap
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.cueing.risk_map import PlattMap
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
-from worldstate.checkpoint import (
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.measurement.measurement import Measurement
+from worldstate.state import Context, Record, WorldState, check_schema
+
+from .checkpoint import (
     SCHEMA_NAME,
     SCHEMA_VERSION,
     memory_from_record,
@@ -18,14 +24,9 @@ from worldstate.checkpoint import (
     settings_from_record,
     settings_to_dict,
 )
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.measurement import Measurement
-from worldstate.memory import Memory, first_memory, priors_of
-from worldstate.publishing import cues_of, entity_of, relations_of
-from worldstate.state import Context, Record, WorldState, check_schema
-from worldstate.step import Ground, advance, alarmed, alert, listen, renew, scene_of, watch, weights_of
-from worldstate.values import NotUsable, nanoseconds
+from .memory import Memory, first_memory, priors_of
+from .snapshot_builder import cues_of, entity_of, relations_of
+from .step import Ground, advance, alarmed, alert, listen, renew, scene_of, watch, weights_of
 
 # A step and the stamp that it aims at may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field
 
-from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing import CueingPolicy, SustainedRule
+from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
+from worldstate.belief.belief_lag import Trail
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.track import Track
-from worldstate.belief.trail import Trail
 from worldstate.state import Context, Priors
 
 

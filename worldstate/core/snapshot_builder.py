@@ -3,15 +3,16 @@
 import math
 from collections.abc import Sequence
 
+from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.explanation import ExplanationBelief
-from worldstate.belief.hearing import hidden_share
 from worldstate.belief.motion import MotionBelief
 from worldstate.belief.polar import AZIMUTH_RATE, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
-from worldstate.memory import Memory, priors_of
 from worldstate.state import EGO, Classification, Context, Entity, Relation, RiskCue, Visibility
-from worldstate.step import Ground
+
+from .memory import Memory, priors_of
+from .step import Ground
 
 # A range whose logarithm is less certain than this was never measured, only assumed.
 _KNOWN_LOG_RANGE_STD = 0.25

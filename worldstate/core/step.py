@@ -5,22 +5,23 @@ from functools import partial
 
 import numpy as np
 
-from worldstate.abduction.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing import CueingPolicy
+from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import abduce
+from worldstate.belief.acoustic_update import hear, hidden_share
+from worldstate.belief.belief_lag import Heard
+from worldstate.belief.birth_death import renew_hidden
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
-from worldstate.belief.hearing import hear, hidden_share
-from worldstate.belief.lifecycle import renew_hidden
-from worldstate.belief.seeing import log_co_evidence, look, surviving
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side import Scene, Side
+from worldstate.belief.site_geometry import Scene, Side
 from worldstate.belief.track import predict_track
-from worldstate.belief.trail import Heard
-from worldstate.measurement import Measurement
-from worldstate.memory import Memory, priors_of
+from worldstate.belief.vision_update import log_co_evidence, look, surviving
+from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, seconds
+from worldstate.measurement.measurement import Measurement
 from worldstate.state import Context
-from worldstate.values import NANOSECONDS_PER_SECOND, nanoseconds, seconds
+
+from .memory import Memory, priors_of
 
 # Sides whose probabilities differ by rounding only are equally likely.
 _TIE = 1e-9

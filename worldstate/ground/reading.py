@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from worldstate.errors import InvalidArgumentError, SchemaVersionError
+from .errors import InvalidArgumentError, SchemaVersionError
 
 T = TypeVar("T")
 

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from worldstate.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+from .errors import InputFileError, InvalidArgumentError, SchemaVersionError
 
 MOST_ITEMS = 100_000
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.checks import in_range
-from worldstate.values import NotUsable
+from worldstate.ground.checks import in_range
+from worldstate.ground.values import NotUsable
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,9 @@ from collections.abc import Collection
 from typing import Literal, Protocol, TypeVar
 
 from worldstate.abduction.co_evidence import CoEvidence
-from worldstate.measurement import Bearing, Measurement, Sighting
-from worldstate.values import NotUsable
+from worldstate.ground.values import NotUsable
+
+from .measurement import Bearing, Measurement, Sighting
 
 RawT = TypeVar("RawT", contravariant=True)
 
@@ -56,7 +57,7 @@ class MeasurementAdapter(Protocol[RawT]):
 class CoEvidenceChannel(Protocol):
     """A channel that can be asked whether the co-evidence that a signature predicts is there.
 
-    `adapters.vision.VisionQuery` is one, over recorded detections; a live detector is another.
+    `adapters.camera.vision_query.VisionQuery` is one, over recorded detections; a live detector is another.
 
     Examples
     --------

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.protocol import Side
-from worldstate.values import wrap_angle
+from worldstate.ground.values import wrap_angle
+
+from .protocols import Side
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,10 @@
 """S_t = {entities, relations, context, cues} as immutable values."""
 
+from worldstate.ground.reading import Record, check_schema
+
 from .context import Context, Occluder, Priors, Rates, blind_corner
 from .cue import RiskCue
 from .entity import ANSWERS, Classification, Entity, Visibility
-from .reading import Record, check_schema
 from .relation import EGO, Relation
 from .world_state import SCHEMA_NAME, SCHEMA_VERSION, WorldState
 

@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-
-from .reading import Record
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.reading import Record
 
 
 @dataclass(frozen=True, slots=True)

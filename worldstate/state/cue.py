@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+from worldstate.ground.reading import Record
+
 from .context import Priors
-from .reading import Record
 
 
 @dataclass(frozen=True, slots=True)

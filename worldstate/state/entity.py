@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from .reading import Record
+from worldstate.ground.reading import Record
 
 STATUSES = ("hidden", "emerged", "visible")
 ANSWERS = ("visible", "absent", "unqueried")

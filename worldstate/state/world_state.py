@@ -4,13 +4,13 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.reading import Record, check_schema, decode_json
 
 from .context import Context
 from .cue import RiskCue
 from .entity import Entity
 from .graph import scene_graph
-from .reading import Record, check_schema, decode_json
 from .relation import Relation
 
 if TYPE_CHECKING:

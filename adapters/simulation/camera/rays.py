@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.camera.pinhole import PinholeCamera
 
 Floats = NDArray[np.float32]
 Image = NDArray[np.float32]

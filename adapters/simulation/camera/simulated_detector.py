@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.camera import PinholeCamera
-
-from .kinds import LIGHT, VehicleKind
-from .occluders import hidden_by
-from .scene import Site
-from .vehicle import LENGTH_M, WIDTH_M, Trajectory
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.kinds import LIGHT, VehicleKind
+from worldstate.adapters.simulation.scene.occluders import hidden_by
+from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .detector import ARRAY_HEIGHT_M
-from .scene import Site, site_generator
+from worldstate.adapters.simulation.scene.junction import Site, site_generator
+
+from .rays import OVERSAMPLING, Panel, Patch, View, cast_panels, reduced
+from .simulated_detector import ARRAY_HEIGHT_M
 from .textures import Facade, Floats, Image, asphalt, flags, grass, leaves, paving, smooth_noise, tinted
-from .view import OVERSAMPLING, Panel, Patch, View, cast_panels, reduced
 
 ROAD_Z_M = -ARRAY_HEIGHT_M
 FAR_M = 150.0

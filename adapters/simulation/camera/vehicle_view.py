@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.adapters.simulation.scene.vehicle import AXLES_BEHIND_FRONT_M, HEIGHT_M, LENGTH_M, WIDTH_M
+
+from .rays import Patch, cast_solid, reduced
 from .street_view import ROAD_Z_M, StreetView
 from .textures import GLASS, Colour, Floats, Image, tinted
-from .vehicle import AXLES_BEHIND_FRONT_M, HEIGHT_M, LENGTH_M, WIDTH_M
-from .view import Patch, cast_solid, reduced
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

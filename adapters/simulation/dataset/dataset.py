@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 import soundfile
 
-from worldstate.adapters.atomic import atomic_path, write_text
-from worldstate.adapters.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, LOG_NAME
-from worldstate.adapters.parallel import in_processes
-from worldstate.adapters.video import VIDEO_NAME
-from worldstate.checks import in_range
-from worldstate.errors import InputFileError
+from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.datasets.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, LOG_NAME
+from worldstate.adapters.files.atomic import atomic_path, write_text
+from worldstate.adapters.simulation.camera.simulated_detector import to_json
+from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
+from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
+from worldstate.adapters.simulation.scene.presets import preset
+from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.parallel import in_processes
 
-from .detector import to_json
-from .occlusions import OCCLUSIONS, occluded_scene
 from .plan import DatasetSettings, Plan
-from .presets import preset
 from .recording import SimulatedRecording, simulate_recording
-from .scene import MOVING_SITES, SITES
-from .settings import APPROACHES, draw_settings
-from .video import Picture, camera_frames, write_video
+from .rendered_video import Picture, camera_frames, write_video
 
 TRUTH_NAME = "truth.json"
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-
-from .kinds import vehicle_kind
-from .occlusions import occluded_scene
-from .presets import DEFAULT_PRESET, preset
-from .scene import MOVING_SITES, SITES
+from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
+from worldstate.adapters.simulation.scene.kinds import vehicle_kind
+from worldstate.adapters.simulation.scene.occlusions import occluded_scene
+from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 MAX_RECORDINGS = 10_000
 JUNCTION = "junction"

@@ -8,26 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
-from worldstate.checks import in_range
-from worldstate.frontend.array import MicrophoneArray, roof_array_56
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.simulation.camera.simulated_detector import (
+    ARRAY_HEIGHT_M,
+    Frame,
+    detect,
+    line_of_sight,
+    park,
+)
+from worldstate.adapters.simulation.scene.driving import trajectories
+from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
+from worldstate.adapters.simulation.sound.background import add_background
+from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.ego_sound import ego_noise
+from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
+from worldstate.adapters.simulation.sound.late_field import add_late_field, street_field
+from worldstate.adapters.simulation.sound.propagation import add_sources
+from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.scatter import scattering
+from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
+from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.ground.checks import in_range
 
-from .background import add_background
-from .delay import KNOT_SAMPLES
-from .detector import ARRAY_HEIGHT_M, Frame, detect, line_of_sight, park
-from .driving import trajectories
-from .ego import ego_noise
-from .emission import Emission, MovingSource
-from .late_field import add_late_field, street_field
-from .propagation import add_sources
-from .receiver import Receiver
-from .scatter import scattering
-from .scattered_sound import add_scattered
-from .settings import SimulationSettings
-from .static_field import StaticSources
 from .truth import describe
-from .vehicle import SOURCE_HEIGHT_M, Trajectory, emit
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]

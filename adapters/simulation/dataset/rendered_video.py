@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
-from worldstate.adapters.vision_extra import opencv
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.adapters.camera.opencv import opencv
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.simulation.camera.rays import View
+from worldstate.adapters.simulation.camera.simulated_detector import Frame
+from worldstate.adapters.simulation.camera.street_view import look_at
+from worldstate.adapters.simulation.camera.vehicle_view import PAINTS, Car, add_car, with_parked_car
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
-from .detector import Frame
 from .recording import SimulatedRecording
-from .scene import Site
-from .settings import SimulationSettings
-from .street_view import look_at
-from .vehicle import LENGTH_M, WIDTH_M
-from .vehicle_view import PAINTS, Car, add_car, with_parked_car
-from .view import View
 
 Picture = NDArray[np.uint8]
 

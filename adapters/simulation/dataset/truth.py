@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
-
-from .detector import line_of_sight
-from .settings import SimulationSettings
-from .vehicle import Trajectory
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
+from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.vehicle import Trajectory
 
 SCHEMA = "worldstate.simulation.truth"
 SCHEMA_VERSION = "1.1.0"

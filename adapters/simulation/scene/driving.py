@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.camera.pinhole import PinholeCamera
 
+from .junction import Site
 from .kinds import vehicle_kind
 from .occluders import hidden_by
 from .route import Route, along, turn_in
-from .scene import Site
 from .settings import SimulationSettings, VehicleSettings
 from .vehicle import Trajectory, drive, follow
 

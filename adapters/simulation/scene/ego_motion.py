@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
+from worldstate.ground.checks import in_range
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 from .occluders import Occluder
 

@@ -6,7 +6,7 @@ those are stated assumptions, set against published pass-by levels (see each).
 
 from dataclasses import dataclass, replace
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
 
 Octaves = tuple[float, float, float, float, float, float, float, float]
 

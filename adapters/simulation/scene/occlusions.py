@@ -6,10 +6,10 @@ route of a vehicle that comes into sight while it approaches; give both to `Simu
 
 from dataclasses import dataclass
 
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError
 
+from .junction import Site
 from .occluders import Occluder, box
-from .scene import Site
 
 OPEN_M = 30.0
 

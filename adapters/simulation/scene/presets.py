@@ -24,8 +24,8 @@ presets are not offered: the physics that they were set with is gone. A change i
 
 from dataclasses import dataclass
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 LIMITS: dict[str, tuple[float, float]] = {
     "ambient_spread_db": (0.0, 20.0),

@@ -4,14 +4,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 from .ego_motion import EgoMotion
+from .junction import MOVING_SITES, Site, site
 from .kinds import vehicle_kind
 from .occlusions import scene_of
 from .presets import Preset, preset
-from .scene import MOVING_SITES, Site, site
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
 MANOEUVRES = ("pass", "turn")

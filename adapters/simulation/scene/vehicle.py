@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 from .kinds import LIGHT, TYRE_M, VehicleKind
+from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 from .route import Route
 
 LENGTH_M, WIDTH_M, HEIGHT_M = LIGHT.length_m, LIGHT.width_m, LIGHT.height_m
@@ -148,7 +148,7 @@ def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = n
 
     Examples
     --------
-    >>> from worldstate.adapters.simulation.route import along
+    >>> from worldstate.adapters.simulation.scene.route import along
     >>> time = np.linspace(0, 20, 2001)
     >>> passing = drive(time, entry_s=5, entry_y_m=4, lane_x_m=6, speed_mps=8)
     >>> path = follow(passing, 4.0, along([[6, 8], [6, 2]], 4.0), 2.0)

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .bands import OCTAVES_HZ
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
+
 from .diffraction import SPEED_OF_SOUND_MPS
 
 Array = NDArray[np.float64]

@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfftfreq
 
-from .bands import REFERENCE_PA, level_curve
-from .presets import Preset
-from .scene import Site, site_generator
+from worldstate.adapters.simulation.scene.junction import Site, site_generator
+from worldstate.adapters.simulation.scene.octave_bands import REFERENCE_PA, level_curve
+from worldstate.adapters.simulation.scene.presets import Preset
+
 from .static_field import StaticSources, plane_wave_delays
 
 Array = NDArray[np.float64]

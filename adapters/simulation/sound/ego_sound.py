@@ -12,20 +12,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-
-from .background import noise_frequencies, shaped_noise
-from .bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
-from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
-from .static_field import StaticSources
-from .vehicle import (
+from worldstate.adapters.simulation.scene.octave_bands import (
+    OCTAVES_HZ,
+    REFERENCE_PA,
+    octave_masks,
+    split_octaves,
+)
+from worldstate.adapters.simulation.scene.vehicle import (
     HARMONIC_SHARE,
     POWER_TO_1M_DB,
     SLOWEST_KMH,
     propulsion_level_db,
     rolling_level_db,
 )
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+
+from .background import noise_frequencies, shaped_noise
+from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
+from .static_field import StaticSources
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]

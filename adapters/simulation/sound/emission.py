@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .bands import split_octaves
+from worldstate.adapters.simulation.scene.octave_bands import split_octaves
+from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
+
 from .delay import KNOT_SAMPLES, OVERSAMPLING, Table
-from .vehicle import SOURCE_HEIGHT_M
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]

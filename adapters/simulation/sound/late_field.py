@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-from .scene import Site, site_generator
+from worldstate.adapters.simulation.scene.junction import Site, site_generator
+
 from .static_field import StaticSources, plane_wave_delays
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ def street_field(site: Site, lobe_share: float) -> tuple[Array, Array]:
 
     Examples
     --------
-    >>> from .scene import site
+    >>> from worldstate.adapters.simulation.scene.junction import site
     >>> directions, shares = street_field(site("SA1"), 0.5)
     >>> directions.shape, round(float(shares.sum()), 6)
     ((48, 3), 1.0)

@@ -13,9 +13,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from .bands import OCTAVES_HZ, smooth_step
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
+
 from .diffraction import screen_attenuation_db
-from .scene import Site
 
 Array = NDArray[np.float64]
 

@@ -7,16 +7,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
+
 from .air import air_gain, ground_gain
 from .delay import Table, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import MovingSource
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_paths
 from .receiver import NEAREST_M, Receiver, add_turning
-from .scene import Site
 from .screened import screened_legs
 from .static_field import StaticSources
-from .vehicle import SOURCE_HEIGHT_M
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]

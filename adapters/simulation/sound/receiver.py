@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .bands import resample_whole
+from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
+from worldstate.adapters.simulation.scene.octave_bands import resample_whole
+
 from .delay import KNOT_SAMPLES, OVERSAMPLING, Table, add_delayed
 from .diffraction import SPEED_OF_SOUND_MPS
-from .ego_motion import EgoMotion
 
 Array = NDArray[np.float64]
 Signal = NDArray[np.float32]

@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .bands import OCTAVES_HZ
+from worldstate.adapters.simulation.scene.junction import Site, site_generator
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
+from worldstate.adapters.simulation.scene.presets import Preset
+
 from .paths import SourceImage, near_facade, source_images, through_mouth
-from .presets import Preset
 from .receiver import NEAREST_M
-from .scene import Site, site_generator
 
 Array = NDArray[np.float64]
 
@@ -61,7 +62,7 @@ def scattering(preset: Preset) -> Array:
 
     Examples
     --------
-    >>> from .presets import preset
+    >>> from worldstate.adapters.simulation.scene.presets import preset
     >>> sigma = scattering(preset())
     >>> sigma[[0, -1]].round(3)
     array([0.004, 0.15 ])
@@ -75,7 +76,7 @@ def patches(site: Site) -> list[Patches]:
 
     Examples
     --------
-    >>> from .scene import site
+    >>> from worldstate.adapters.simulation.scene.junction import site
     >>> [(len(group.strengths_m), group.beyond_mouth) for group in patches(site("SA1"))]
     [(12, False), (12, True)]
     """

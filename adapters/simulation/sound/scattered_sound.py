@@ -3,13 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.presets import Preset
+
 from .delay import add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import Emission, MovingSource
-from .presets import Preset
 from .receiver import NEAREST_M, Receiver, add_turning, distance_m
 from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, scattering, seen_through_mouth
-from .scene import Site
 from .static_field import StaticSources
 
 Array = NDArray[np.float64]

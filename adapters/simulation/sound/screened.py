@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .bands import OCTAVES_HZ, smooth_step
+from worldstate.adapters.simulation.scene.occluders import Occluder, detours
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
+
 from .diffraction import screen_attenuation_db
-from .occluders import Occluder, detours
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from worldstate.adapters.detections import DetectionFilter
-    from worldstate.adapters.onnx_detector import OnnxDetector, OnnxSettings
-    from worldstate.evaluation.absence import MakeDetector
+    from worldstate.adapters.camera.detections import DetectionFilter
+    from worldstate.adapters.camera.onnx_detector import OnnxDetector, OnnxSettings
+    from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
 
 def add_detector_options(parser: argparse.ArgumentParser) -> None:
@@ -29,9 +29,9 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
     InvalidArgumentError
         If a model is wanted and none given.
     """
-    from worldstate.adapters.motion_detector import MotionDetector, MotionSettings
-    from worldstate.adapters.onnx_detector import OnnxSettings
-    from worldstate.errors import InvalidArgumentError
+    from worldstate.adapters.camera.motion_detector import MotionDetector, MotionSettings
+    from worldstate.adapters.camera.onnx_detector import OnnxSettings
+    from worldstate.ground.errors import InvalidArgumentError
 
     if arguments.detector == "onnx":
         if arguments.onnx_model is None:
@@ -46,15 +46,15 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
 @cache
 def _opened(path: Path, settings: "OnnxSettings") -> "OnnxDetector":
     """Open a model once a process."""
-    from worldstate.adapters.onnx_detector import open_onnx
+    from worldstate.adapters.camera.onnx_detector import open_onnx
 
     return open_onnx(path, settings)
 
 
 def detector_filter(arguments: argparse.Namespace) -> "DetectionFilter":
     """Return which of its boxes count: all of a motion detector's, whose score is no confidence."""
-    from worldstate.adapters.detections import DetectionFilter
-    from worldstate.adapters.watched_camera import any_motion
+    from worldstate.adapters.camera.camera_channel import any_motion
+    from worldstate.adapters.camera.detections import DetectionFilter
 
     return DetectionFilter() if arguments.detector == "onnx" else any_motion()
 

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-from worldstate.adapters.audio import open_audio
+from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.listen import Source
-from worldstate.cli.progress import progress_bar
-from worldstate.evaluation.recording import RecordingReport, run_recording
+from worldstate.operations.recordings.recording_report import RecordingReport, run_recording
+
+from .progress import progress_bar
 
 
 def listen_with_progress(source: Source, *, title: str, states_path: Path | None) -> RecordingReport:
@@ -13,6 +14,4 @@ def listen_with_progress(source: Source, *, title: str, states_path: Path | None
     with open_audio(source.audio_path, strict=not source.mask_dead) as audio:
         hops = 10.0 * audio.frames / audio.sample_rate_hz
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
-        return run_recording(
-            source, title=title, states_path=states_path, on_hop=lambda step: bar.advance()
-        )
+        return run_recording(source, title=title, states_path=states_path, on_hop=lambda step: bar.advance())

@@ -4,19 +4,19 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.detector_options import (
+from worldstate.cli.common.detector_options import (
     add_detector_options,
     detector_filter,
     detector_maker,
     detector_name,
 )
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.adapters.ovad import Recording
-    from worldstate.evaluation.staged_dataset import StagedDataset
-    from worldstate.evaluation.staged_recording import StagedRecording
+    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.studies.degradation.staged_dataset import StagedDataset
+    from worldstate.studies.degradation.staged_recording import StagedRecording
 
 DESCRIPTION = """\
 Stage blur, darkness and sensor noise, four levels each, on the video of every recording of a data set, and
@@ -82,11 +82,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from worldstate.adapters.atomic import write_text
-    from worldstate.adapters.model_file import load_model
-    from worldstate.evaluation.degradation_report import sweep_report, sweep_table, write_sweep_figure
-    from worldstate.evaluation.degradation_sweep import SweepSettings, degradation_sweep
-    from worldstate.evaluation.staged_dataset import filmed_recordings
+    from worldstate.adapters.files.atomic import write_text
+    from worldstate.adapters.files.model_file import load_model
+    from worldstate.studies.degradation.degradation_report import (
+        sweep_report,
+        sweep_table,
+        write_sweep_figure,
+    )
+    from worldstate.studies.degradation.degradation_sweep import SweepSettings, degradation_sweep
+    from worldstate.studies.degradation.staged_dataset import filmed_recordings
 
     settings = _settings(arguments)
     found = filmed_recordings(arguments.dataset, arguments.most)
@@ -102,11 +106,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> "StagedDataset":
-    from worldstate.adapters.camera import PinholeCamera
-    from worldstate.adapters.miss_rates import load_miss_rates
-    from worldstate.adapters.vision import VisionSettings
-    from worldstate.evaluation.staged_dataset import StagedDataset
-    from worldstate.evaluation.staged_looks import Staging, camera_states
+    from worldstate.adapters.camera.miss_rates import load_miss_rates
+    from worldstate.adapters.camera.pinhole import PinholeCamera
+    from worldstate.adapters.camera.vision_query import VisionSettings
+    from worldstate.studies.degradation.degraded_detections import Staging, camera_states
+    from worldstate.studies.degradation.staged_dataset import StagedDataset
 
     staging = Staging(
         detector_maker(arguments),
@@ -120,7 +124,7 @@ def _settings(arguments: argparse.Namespace) -> "StagedDataset":
 def _stage(
     folder: Path, found: "list[Recording]", settings: "StagedDataset", jobs: int
 ) -> "list[StagedRecording]":
-    from worldstate.evaluation.staged_dataset import stage_dataset
+    from worldstate.studies.degradation.staged_dataset import stage_dataset
 
     folder.mkdir(parents=True, exist_ok=True)
     done = []
@@ -132,7 +136,7 @@ def _stage(
 
 
 def _origin(arguments: argparse.Namespace, recordings: "list[StagedRecording]") -> dict[str, object]:
-    from worldstate.evaluation.hop_stream import HOP_S
+    from worldstate.operations.recordings.hop_stream import HOP_S
 
     free = [one for one in recordings if one.hazard_free]
     return {

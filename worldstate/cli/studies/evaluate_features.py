@@ -4,13 +4,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from worldstate.cli.feature_options import add_table_options
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.feature_options import add_table_options
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.adapters.feature_table import FeatureTable
-    from worldstate.evaluation.features import Predictions
+    from worldstate.adapters.datasets.feature_table import FeatureTable
+    from worldstate.operations.training.feature_evaluation import Predictions
 
 Figures = dict[str, Any]
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
@@ -72,8 +72,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.feature_table import read_features, read_ids
-    from worldstate.evaluation.feature_report import write_predictions
+    from worldstate.adapters.datasets.feature_table import read_features, read_ids
+    from worldstate.studies.features.feature_report import write_predictions
 
     whole = read_features(arguments.table)
     table = whole.group(arguments.group)
@@ -90,16 +90,16 @@ def run(arguments: argparse.Namespace) -> int:
 def _evaluate_method(
     arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
 ) -> tuple[Figures, "list[Predictions]"]:
-    from worldstate.errors import InvalidArgumentError
-    from worldstate.evaluation.comparison import (
+    from worldstate.ground.errors import InvalidArgumentError
+    from worldstate.operations.training.methods import ROWS, row_of
+    from worldstate.studies.features.comparison import (
         COMPARED,
         COMPARED_AFAR,
         comparison,
         row_predictions,
         run_passes,
     )
-    from worldstate.evaluation.feature_report import report
-    from worldstate.evaluation.methods import ROWS, row_of
+    from worldstate.studies.features.feature_report import report
 
     for option in ("seeds", "jobs"):
         if getattr(arguments, option) < 1:
@@ -129,9 +129,9 @@ def _evaluate_method(
 def _evaluate_model(
     arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
 ) -> tuple[Figures, "list[Predictions]"]:
-    from worldstate.adapters.model_file import read_model
-    from worldstate.evaluation.feature_report import report
-    from worldstate.evaluation.held_out import predict_held_out
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate.studies.features.feature_report import report
+    from worldstate.studies.features.held_out import predict_held_out
 
     predictions = predict_held_out(read_model(arguments.model), table, arguments.alpha)
     figures = _origin(arguments, "model", "held-out", 1) | report(table, [predictions])
@@ -139,7 +139,7 @@ def _evaluate_model(
 
 
 def _standing(whole: "FeatureTable", arguments: argparse.Namespace) -> "FeatureTable":
-    from worldstate.errors import InvalidArgumentError
+    from worldstate.ground.errors import InvalidArgumentError
 
     if arguments.group != "dynamic":
         raise InvalidArgumentError("--protocol transfer: expected --group dynamic, static is learned from")

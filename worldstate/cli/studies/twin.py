@@ -4,15 +4,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.abduction.any_signature import AnySignature
+    from worldstate.abduction.signature.signature_io import AnySignature
     from worldstate.adapters.simulation import Preset
-    from worldstate.evaluation.realism import Realism
-    from worldstate.evaluation.twin_recording import TwinRecording
-    from worldstate.evaluation.twin_score import TwinScore
+    from worldstate.studies.streets.decision_rules import TwinScore
+    from worldstate.studies.streets.realism import Realism
+    from worldstate.studies.streets.recording_features import TwinRecording
 
 # Windows from either side at every site, and the seeds, of the comparison with real ones.
 WINDOWS = 10
@@ -86,11 +86,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from worldstate.adapters.atomic import write_text
-    from worldstate.evaluation.twin_figures import twin_figures, twin_intervals
-    from worldstate.evaluation.twin_plot import write_twin_figure
-    from worldstate.evaluation.twin_report import twin_report, twin_table
-    from worldstate.evaluation.twin_score import score_twins
+    from worldstate.adapters.files.atomic import write_text
+    from worldstate.studies.streets.decision_rules import score_twins
+    from worldstate.studies.streets.figure import write_twin_figure
+    from worldstate.studies.streets.published_figures import twin_figures, twin_intervals
+    from worldstate.studies.streets.report import twin_report, twin_table
 
     realism = _realism(arguments)
     heard = _listen(arguments)
@@ -116,9 +116,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _listen(arguments: argparse.Namespace) -> "list[TwinRecording]":
-    from worldstate.adapters.simulation.plan import plan_static
-    from worldstate.checks import in_range
-    from worldstate.evaluation.twin_simulation import TwinSettings, listen_twins
+    from worldstate.adapters.simulation.dataset.plan import plan_static
+    from worldstate.ground.checks import in_range
+    from worldstate.studies.streets.simulated_streets import TwinSettings, listen_twins
 
     in_range("--static", arguments.static, 4, 10_000)
     in_range("--jobs", arguments.jobs, 1, 256)
@@ -137,8 +137,8 @@ def _listen(arguments: argparse.Namespace) -> "list[TwinRecording]":
 
 
 def _signature(arguments: argparse.Namespace) -> "AnySignature":
-    from worldstate.adapters.model_file import load_model
-    from worldstate.evaluation.twin_training import N_RECORDINGS, train_on_twin
+    from worldstate.adapters.files.model_file import load_model
+    from worldstate.studies.streets.street_training import N_RECORDINGS, train_on_twin
 
     if arguments.model is not None:
         return load_model(None if arguments.model == DEFAULT_MODEL else arguments.model)[0]
@@ -167,9 +167,9 @@ def _realism(arguments: argparse.Namespace) -> "dict[int, Realism]":
         return {}
     from functools import partial
 
-    from worldstate.adapters.feature_table import read_features
-    from worldstate.evaluation.realism import realism_over_seeds
-    from worldstate.evaluation.simulated_windows import simulated_windows
+    from worldstate.adapters.datasets.feature_table import read_features
+    from worldstate.studies.streets.realism import realism_over_seeds
+    from worldstate.studies.streets.simulated_windows import simulated_windows
 
     real = read_features(arguments.realism).group(arguments.realism_group)
     # A moving ego's junctions come as they are in the table; a site that it lacks has nothing to be held to.
@@ -187,7 +187,7 @@ def _realism(arguments: argparse.Namespace) -> "dict[int, Realism]":
 
 
 def _origin(arguments: argparse.Namespace, score: "TwinScore") -> dict[str, object]:
-    from worldstate.evaluation.hop_stream import HOP_S
+    from worldstate.operations.recordings.hop_stream import HOP_S
 
     levels = _levels(arguments)
     calm = [recording for recording in score.recordings if recording.hazard_free]

@@ -4,10 +4,10 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.evaluation.bench import BenchReport
+    from worldstate.operations.arrays.bench import BenchReport
 
 DESCRIPTION = """\
 Time the acoustic front-end per 0.1-s hop, stage by stage: 56 channels at 47,998 Hz, one BLAS thread. Peers
@@ -30,8 +30,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.checks import in_range
-    from worldstate.evaluation.bench import run_bench
+    from worldstate.ground.checks import in_range
+    from worldstate.operations.arrays.bench import run_bench
 
     rounds = int(in_range("rounds", arguments.rounds, 1, 1000))
     with progress_bar("timing", rounds, quiet=arguments.json) as bar:

@@ -4,13 +4,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.evaluation.array_bounds import ArrayBounds
-    from worldstate.evaluation.efficiency import Efficiency
-    from worldstate.frontend.array import MicrophoneArray
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.operations.arrays.array_bounds import ArrayBounds
+    from worldstate.operations.arrays.efficiency import Efficiency
 
 AZIMUTHS_DEG = (0.0, 20.0, 40.0, 60.0, 80.0)
 ENDFIRE_DEG = tuple(float(azimuth) for azimuth in range(0, 81, 10))
@@ -62,10 +62,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.array_xml import read_array_xml
-    from worldstate.checks import in_range
-    from worldstate.evaluation.array_bounds import array_bounds
-    from worldstate.frontend.array import roof_array_56
+    from worldstate.adapters.files.array_file import read_array_xml
+    from worldstate.frontend.array.microphone_array import roof_array_56
+    from worldstate.ground.checks import in_range
+    from worldstate.operations.arrays.array_bounds import array_bounds
 
     in_range("--frequency", arguments.frequency, 0.0, 1e6, open_low=True)
     in_range("--snapshots", arguments.snapshots, 1, 1e6)
@@ -113,8 +113,8 @@ def _try_estimators(array: "MicrophoneArray", arguments: argparse.Namespace) -> 
     """Measure, draw, write; return the numbers."""
     import json
 
-    from worldstate.adapters.atomic import write_text
-    from worldstate.evaluation.efficiency_figure import write_efficiency_figure, write_endfire_figure
+    from worldstate.adapters.files.atomic import write_text
+    from worldstate.operations.arrays.efficiency_figure import write_efficiency_figure, write_endfire_figure
 
     arguments.out.mkdir(parents=True, exist_ok=True)
     over_snr, endfire = _measure(array, arguments)
@@ -140,14 +140,14 @@ def _measure(
 ) -> "tuple[list[Efficiency], Efficiency]":
     import numpy as np
 
-    from worldstate.evaluation.efficiency import (
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.operations.arrays.efficiency import (
         bearing_trial,
         delay_trial,
         measure_over_snr,
         measure_toward_endfire,
         tone_trial,
     )
-    from worldstate.frontend.array import MicrophoneArray
 
     there = {"frequency_hz": arguments.frequency, "snapshots": arguments.snapshots}
     arrays = [array]

@@ -5,12 +5,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.evaluation.cueing_calibration import CueingCalibration
-    from worldstate.evaluation.hop_stream import HopStream
+    from worldstate.operations.calibration.cueing_calibration import CueingCalibration
+    from worldstate.operations.recordings.hop_stream import HopStream
 
 DESCRIPTION = """\
 Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from dataclasses import replace
 
-    from worldstate.adapters.model_file import read_model, save_model
-    from worldstate.evaluation.cueing_calibration import CueingSettings, calibrate_cueing
-    from worldstate.evaluation.hop_stream import save_streams
+    from worldstate.adapters.files.model_file import read_model, save_model
+    from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
+    from worldstate.operations.recordings.hop_stream import save_streams
 
     settings = CueingSettings(
         alphas=tuple(arguments.alpha),
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _streams(arguments: argparse.Namespace) -> "list[HopStream]":
-    from worldstate.evaluation.calibration_input import find_inputs, read_input
+    from worldstate.operations.calibration.calibration_input import find_inputs, read_input
 
     found = [item for path in arguments.inputs for item in find_inputs(path)]
     streams = []

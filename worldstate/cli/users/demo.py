@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.output import print_summary
+from worldstate.cli.common.output import print_summary
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,7 +42,7 @@ def simulate_approach(root: Path, seed: int) -> Path:
     import numpy as np
 
     from worldstate.adapters import simulation
-    from worldstate.cli.progress import progress_bar
+    from worldstate.cli.common.progress import progress_bar
 
     rng = np.random.default_rng(seed)
     settings = _delivery_van(rng)
@@ -66,10 +66,10 @@ def _delivery_van(rng: "np.random.Generator") -> "SimulationSettings":
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.atomic import write_text
+    from worldstate.adapters.files.atomic import write_text
     from worldstate.adapters.listen import open_source
-    from worldstate.cli.listening import listen_with_progress
-    from worldstate.evaluation.timeline import write_timeline
+    from worldstate.cli.common.listening import listen_with_progress
+    from worldstate.operations.recordings.timeline import write_timeline
 
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio import AudioSource
-    from worldstate.evaluation.health import RecordingHealth
-    from worldstate.frontend.array import MicrophoneArray
+    from worldstate.adapters.audio.sound_file import AudioSource
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.operations.recordings.channel_report import RecordingHealth
 
 DESCRIPTION = """\
 Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
@@ -46,12 +46,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     import json
 
-    from worldstate.adapters.array_xml import read_array_xml
-    from worldstate.adapters.audio import open_audio
-    from worldstate.adapters.ovad import Recording
-    from worldstate.cli.doctor_report import as_json, as_text
-    from worldstate.evaluation.array_figure import write_array_figure
-    from worldstate.frontend.array import roof_array_56
+    from worldstate.adapters.audio.sound_file import open_audio
+    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.adapters.files.array_file import read_array_xml
+    from worldstate.frontend.array.microphone_array import roof_array_56
+    from worldstate.operations.arrays.array_figure import write_array_figure
+
+    from .doctor_report import as_json, as_text
 
     path: Path = arguments.input
     sound = Recording.open(path).audio_path if path.is_dir() else path
@@ -85,9 +86,9 @@ def examine(
     """
     from dataclasses import replace
 
-    from worldstate.evaluation.health import HealthLog
-    from worldstate.frontend.sample_clock import rate_from_duration
+    from worldstate.frontend.health.sample_clock import rate_from_duration
     from worldstate.frontend.stream import FrontEnd
+    from worldstate.operations.recordings.channel_report import HealthLog
 
     front_end, log = FrontEnd(array, audio.sample_rate_hz), HealthLog()
     for block in audio.blocks(audio.sample_rate_hz):

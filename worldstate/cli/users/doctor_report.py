@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator
 
-from worldstate.adapters.audio import AudioSource
-from worldstate.evaluation.health import ChannelVerdict, RecordingHealth
-from worldstate.frontend.array import MicrophoneArray
-from worldstate.frontend.channel_health import Fault
-from worldstate.frontend.sample_clock import RateEstimate
-from worldstate.values import NotUsable
+from worldstate.adapters.audio.sound_file import AudioSource
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.health.channel_health import Fault
+from worldstate.frontend.health.sample_clock import RateEstimate
+from worldstate.ground.values import NotUsable
+from worldstate.operations.recordings.channel_report import ChannelVerdict, RecordingHealth
 
 
 def as_json(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray) -> dict[str, object]:

@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.adapters.feature_extraction import LabelledWindow
+    from worldstate.adapters.datasets.feature_extraction import LabelledWindow
 
 DESCRIPTION = """\
 Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
@@ -51,10 +51,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     import numpy as np
 
-    from worldstate.adapters.array_xml import read_array_xml
-    from worldstate.adapters.feature_extraction import extract_features, feature_table
-    from worldstate.adapters.feature_table import write_features
-    from worldstate.frontend.array import roof_array_56
+    from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table
+    from worldstate.adapters.datasets.feature_table import write_features
+    from worldstate.adapters.files.array_file import read_array_xml
+    from worldstate.frontend.array.microphone_array import roof_array_56
 
     array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
     windows, left_out = _windows(arguments)
@@ -78,10 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _windows(arguments: argparse.Namespace) -> "tuple[list[LabelledWindow], int]":
-    from worldstate.adapters.feature_extraction import read_labels
-    from worldstate.adapters.ovad_layout import LOG_NAME
-    from worldstate.adapters.sample_windows import sample_windows
-    from worldstate.errors import InputFileError
+    from worldstate.adapters.datasets.feature_extraction import read_labels
+    from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+    from worldstate.adapters.datasets.sample_windows import sample_windows
+    from worldstate.ground.errors import InputFileError
 
     if arguments.labels is not None:
         return read_labels(arguments.labels, arguments.dataset), 0

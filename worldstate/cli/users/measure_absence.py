@@ -4,13 +4,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.detector_options import add_detector_options, detector_maker, detector_name
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.detector_options import add_detector_options, detector_maker, detector_name
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.adapters.miss_rates import MissRates
-    from worldstate.evaluation.absence import MakeDetector, Scene
+    from worldstate.adapters.camera.miss_rates import MissRates
+    from worldstate.operations.detectors.miss_rate_measurement import MakeDetector, Scene
 
 DESCRIPTION = """\
 Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
@@ -58,10 +58,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     import numpy as np
 
-    from worldstate.adapters.miss_rates import save_miss_rates
-    from worldstate.evaluation.absence import AbsenceSettings, measure_absence
-    from worldstate.evaluation.absence_figure import write_absence_figure
-    from worldstate.evaluation.absence_input import find_videos
+    from worldstate.adapters.camera.miss_rates import save_miss_rates
+    from worldstate.operations.detectors.labelled_videos import find_videos
+    from worldstate.operations.detectors.miss_rate_figure import write_absence_figure
+    from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, measure_absence
 
     make, settings = detector_maker(arguments), AbsenceSettings()
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
@@ -87,10 +87,10 @@ def _scene(
     from dataclasses import replace
     from math import radians
 
-    from worldstate.adapters.camera import PinholeCamera
-    from worldstate.adapters.detection_formats import read_any_detections
-    from worldstate.adapters.video import open_video
-    from worldstate.evaluation.absence import Scene, reference_by
+    from worldstate.adapters.camera.detection_formats import read_any_detections
+    from worldstate.adapters.camera.pinhole import PinholeCamera
+    from worldstate.adapters.camera.video import open_video
+    from worldstate.operations.detectors.miss_rate_measurement import Scene, reference_by
 
     video = open_video(path)
     camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from worldstate.cli.output import print_summary
-from worldstate.errors import InputFileError
+from worldstate.cli.common.output import print_summary
+from worldstate.ground.errors import InputFileError
 
 DESCRIPTION = """\
 Listen to a recording and keep the world-state.
@@ -74,12 +74,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.audio import SilentChannelsError
-    from worldstate.adapters.grounding import Grounding
+    from worldstate.adapters.acoustic_grounding import Grounding
+    from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.adapters.listen import open_source
-    from worldstate.cli.listening import listen_with_progress
-    from worldstate.evaluation.bearing_gating import write_gating_figure
-    from worldstate.evaluation.timeline import write_timeline
+    from worldstate.cli.common.listening import listen_with_progress
+    from worldstate.operations.recordings.bearing_gating import write_gating_figure
+    from worldstate.operations.recordings.timeline import write_timeline
 
     source = open_source(
         arguments.input,

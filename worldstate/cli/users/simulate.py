@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")

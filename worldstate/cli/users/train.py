@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from worldstate.cli.feature_options import add_table_options
-from worldstate.cli.output import print_summary
-from worldstate.cli.progress import progress_bar
+from worldstate.cli.common.feature_options import add_table_options
+from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.progress import progress_bar
 
 DESCRIPTION = """\
 Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
@@ -49,9 +49,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.feature_table import read_features, read_ids
-    from worldstate.adapters.model_file import save_model
-    from worldstate.evaluation.training import TrainingSettings, train_model
+    from worldstate.adapters.datasets.feature_table import read_features, read_ids
+    from worldstate.adapters.files.model_file import save_model
+    from worldstate.operations.training.training import TrainingSettings, train_model
 
     table = read_features(arguments.table).group(arguments.group)
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])

@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from worldstate.frontend.array import MicrophoneArray
-from worldstate.frontend.bounds import bearing_crb_rad2, broadside_rad
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, broadside_rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequ
 
     Examples
     --------
-    >>> from worldstate.frontend.array import roof_array_56
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> limits = array_bounds(roof_array_56(), 1000.0, [0.0])
     >>> round(limits.horizontal_moment_m2, 2), round(limits.sigma_deg[0.0], 1), round(limits.alias_hz, -2)
     (3.03, 1.8, 1900.0)

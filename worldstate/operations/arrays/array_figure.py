@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.evaluation.health import RecordingHealth
-from worldstate.frontend.array import MicrophoneArray
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.operations.recordings.channel_report import RecordingHealth
 
 COLOURS = {
     "dead": "dimgray",

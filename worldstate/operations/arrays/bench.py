@@ -16,8 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.evaluation.bench_peers import peer_times
-from worldstate.evaluation.bench_stages import (
+from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.direction.music import music_spectrum, signal_subspace
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.bins import bin_frequencies_hz
+from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.stream import FrontEnd
+
+from .bench_peers import peer_times
+from .bench_stages import (
     AZIMUTHS_RAD,
     GOAL,
     NFFT,
@@ -27,15 +36,7 @@ from worldstate.evaluation.bench_stages import (
     srp_beams,
     stage_times,
 )
-from worldstate.evaluation.stopwatch import Milliseconds, elapsed_ms
-from worldstate.frontend.array import roof_array_56
-from worldstate.frontend.bins import bin_frequencies_hz
-from worldstate.frontend.music import music_spectrum, signal_subspace
-from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.srp import srp_phat
-from worldstate.frontend.stft import StreamingStft
-from worldstate.frontend.stream import FrontEnd
-from worldstate.frontend.tone_stage import ENGINE_BAND_HZ
+from .stopwatch import Milliseconds, elapsed_ms
 
 SECONDS = 6
 WARM_UP_HOPS = 11

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.evaluation.stopwatch import Milliseconds, elapsed_ms
-from worldstate.frontend.array import roof_array_56
+from worldstate.frontend.array.microphone_array import roof_array_56
+
+from .stopwatch import Milliseconds, elapsed_ms
 
 NFFT, REPEATS = 512, 9
 SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]

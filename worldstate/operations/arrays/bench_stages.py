@@ -7,22 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.evaluation.stopwatch import Milliseconds, elapsed_ms
-from worldstate.frontend.array import roof_array_56
-from worldstate.frontend.bins import bin_frequencies_hz
-from worldstate.frontend.channel_monitor import ChannelMonitor
-from worldstate.frontend.feature import feature_steering, pair_sum_of, segment_feature
+from worldstate.frontend.approach.looming import looming
+from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ, ToneStage
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.direction.feature import feature_steering, pair_sum_of, segment_feature
+from worldstate.frontend.direction.music_stage import MusicStage
+from worldstate.frontend.direction.peaks import find_peaks
+from worldstate.frontend.direction.srp import normalised, steered_power
+from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.levels import LevelMeter
-from worldstate.frontend.looming import looming
-from worldstate.frontend.masking import ChannelMask
-from worldstate.frontend.music_stage import MusicStage
-from worldstate.frontend.peaks import find_peaks
-from worldstate.frontend.phat import power, whiten
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.srp import normalised, steered_power
-from worldstate.frontend.steering import Steering, cross_spectra
-from worldstate.frontend.stft import StreamingStft
-from worldstate.frontend.tone_stage import ENGINE_BAND_HZ, ToneStage
+from worldstate.frontend.spectra.bins import bin_frequencies_hz
+from worldstate.frontend.spectra.phat import power, whiten
+from worldstate.frontend.spectra.stft import StreamingStft
+
+from .stopwatch import Milliseconds, elapsed_ms
 
 RATE_HZ, NFFT = 47_998, 512
 SRP_BINS, FEATURE_BINS = range(3, 19), range(1, 16)

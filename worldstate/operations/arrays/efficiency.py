@@ -13,15 +13,15 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
-from worldstate.frontend.array import MicrophoneArray
-from worldstate.frontend.bounds import bearing_crb_rad2, broadside_rad, delay_crb_s2, tone_crb_hz2
-from worldstate.frontend.gcc import gcc_delays
-from worldstate.frontend.peaks import find_peaks
-from worldstate.frontend.srp import srp_phat
-from worldstate.frontend.steering import Steering
-from worldstate.frontend.threads import one_blas_thread
-from worldstate.frontend.tone import estimate_tone
+from worldstate.frontend.approach.tone import estimate_tone
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, broadside_rad, delay_crb_s2, tone_crb_hz2
+from worldstate.frontend.direction.gcc import gcc_delays
+from worldstate.frontend.direction.peaks import find_peaks
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.checks import in_range
 
 Numbers = NDArray[np.float64]
 Generator = np.random.Generator
@@ -197,7 +197,7 @@ def measure_toward_endfire(
 
     Examples
     --------
-    >>> from worldstate.frontend.array import roof_array_56
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> rng = np.random.default_rng(0)
     >>> found = measure_toward_endfire(roof_array_56(), np.radians([0.0, 60.0]), 20.0, 100, rng)
     >>> bool(3.0 < found.mean_square[1] / found.mean_square[0] < 5.5)

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.evaluation.efficiency import Efficiency
-from worldstate.frontend.array import MicrophoneArray
-from worldstate.frontend.bounds import broadside_rad, endfire_information
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.bounds.cramer_rao import broadside_rad, endfire_information
+
+from .efficiency import Efficiency
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from worldstate.adapters.datasets.ovad import OvadDataset, Recording
+from worldstate.adapters.datasets.ovad_layout import LOG_NAME
 from worldstate.adapters.listen import measure_steps, open_source
-from worldstate.adapters.ovad import OvadDataset, Recording
-from worldstate.adapters.ovad_layout import LOG_NAME
-from worldstate.errors import InputFileError
-from worldstate.evaluation.hop_stream import HopStream, hop_stream, load_streams
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, load_streams
 
 
 def find_inputs(path: Path) -> list[Path]:

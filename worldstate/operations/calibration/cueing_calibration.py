@@ -7,18 +7,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.adaptive_threshold import AdaptiveBudget
-from worldstate.abduction.conformal import conformal_threshold, recordings_needed
-from worldstate.abduction.correlation import correlation_time_hops
-from worldstate.abduction.cueing import CueingPolicies, CueingPolicy, sustained_statistic
-from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.risk_map import IsotonicMap, RiskMap, fit_risk_map
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.calibration import MISS_RATES
-from worldstate.evaluation.false_alarm_map import FalseAlarmRate, false_alarm_rate
-from worldstate.evaluation.hop_stream import HOP_S, HopStream
-from worldstate.evaluation.stream_statistic import StatisticSwitches, stream_statistic
+from worldstate.abduction.cueing.adaptive_threshold import AdaptiveBudget
+from worldstate.abduction.cueing.conformal import conformal_threshold, recordings_needed
+from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, sustained_statistic
+from worldstate.abduction.cueing.effective_windows import correlation_time_hops
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_map
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.hop_stream import HOP_S, HopStream
+from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
+from worldstate.operations.training.window_calibration import MISS_RATES
+
+from .false_alarm_map import FalseAlarmRate, false_alarm_rate
 
 Numbers = NDArray[np.float64]
 Method = Literal["conformal", "plain"]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.cueing import sustained_statistic
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.advisories import SECONDS_PER_HOUR, rising_edges
+from worldstate.abduction.cueing.cueing_policy import sustained_statistic
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, rising_edges
 
 
 @dataclass(frozen=True, slots=True)

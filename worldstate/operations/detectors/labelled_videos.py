@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from worldstate.adapters.ovad import OvadDataset, Recording
-from worldstate.adapters.ovad_layout import LOG_NAME
-from worldstate.adapters.video import VIDEO_NAME
-from worldstate.errors import InputFileError
+from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.datasets.ovad import OvadDataset, Recording
+from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+from worldstate.ground.errors import InputFileError
 
 
 def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:

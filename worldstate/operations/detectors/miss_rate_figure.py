@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.adapters.degradation import LEVELS
-from worldstate.adapters.miss_rates import MissRates
+from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.files.atomic import atomic_path
 
 
 def write_absence_figure(rates: MissRates, path: Path) -> None:

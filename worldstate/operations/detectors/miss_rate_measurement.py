@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.camera_health import CameraHealth, learn_health
-from worldstate.adapters.degradation import FAMILIES, LEVELS, Family, degrade
-from worldstate.adapters.detections import DetectionFilter, DetectionFrame, DetectionLog
-from worldstate.adapters.detector import Detector, overlaps
-from worldstate.adapters.miss_rates import FamilyCounts, MissRates
-from worldstate.adapters.parked import ParkedRule, kept_and_parked
-from worldstate.adapters.sector import Sector
-from worldstate.adapters.video import Video
-from worldstate.checks import in_range
-from worldstate.errors import InputFileError, InvalidArgumentError
+from worldstate.adapters.camera.camera_health import CameraHealth, learn_health
+from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, Family, degrade
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detector import Detector, overlaps
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.static_boxes import ParkedRule, kept_and_parked
+from worldstate.adapters.camera.video import Video
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.measurement.sector import Sector
 
 Numbers = NDArray[np.float64]
 MakeDetector = Callable[[], Detector]

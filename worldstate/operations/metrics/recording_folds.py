@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import in_range
+from worldstate.ground.checks import in_range
 
 
 def recording_folds(labels: Sequence[str], folds: int, rng: np.random.Generator) -> NDArray[np.int64]:

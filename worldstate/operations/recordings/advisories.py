@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array, in_range
+from worldstate.ground.checks import finite_array, in_range
 
 LONGEST_LEAD_S = 5.0
 SECONDS_PER_HOUR = 3600.0

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.checks import check_shape
-from worldstate.frontend.gating import GatingCurve, gating_curve
-from worldstate.values import NotUsable, wrap_angle
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.frontend.direction.gating import GatingCurve, gating_curve
+from worldstate.ground.checks import check_shape
+from worldstate.ground.values import NotUsable, wrap_angle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

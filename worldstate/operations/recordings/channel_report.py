@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-from worldstate.frontend.channel_health import MASKED_FAULTS, ArrayHealth, Fault
 from worldstate.frontend.frame import AcousticFrame
-from worldstate.frontend.gaps import Gap
-from worldstate.frontend.sample_clock import RateEstimate
-from worldstate.values import NotUsable, seconds
+from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Fault
+from worldstate.frontend.health.dropouts import Gap
+from worldstate.frontend.health.sample_clock import RateEstimate
+from worldstate.ground.values import NotUsable, seconds
 
 # Gaps beyond these are counted, not listed.
 _LISTED_GAPS = 100
@@ -27,7 +27,7 @@ class ChannelVerdict:
     first_s : float
         End of the first of these hops, seconds.
     value : float
-        How wrong, when last seen: see `worldstate.frontend.channel_health.ChannelFault`.
+        How wrong, when last seen: see `worldstate.frontend.health.channel_health.ChannelFault`.
     looks_like : int or None
         Swapped: the channel whose place it fits.
 
@@ -65,7 +65,7 @@ class RecordingHealth:
     n_hops : int
         Hops listened to.
     coherence : float or NotUsable
-        At the end: see `worldstate.frontend.channel_health.ArrayHealth`.
+        At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`.
     sample_rate : RateEstimate or NotUsable
         By another clock.
 
@@ -100,7 +100,7 @@ class HealthLog:
     Examples
     --------
     >>> import numpy as np
-    >>> from worldstate.frontend.array import MicrophoneArray
+    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> from worldstate.frontend.stream import FrontEnd
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0], [0, -0.1, 0]])
     >>> sound = np.random.default_rng(0).standard_normal((24_000, 1)) * [1.0, 1.0, 0.0]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
-from worldstate.checks import check_shape, finite_array
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.npz_file import load_npz, save_npz
-from worldstate.measurement import Measurement
-from worldstate.values import NotUsable, seconds
+from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.ground.checks import check_shape, finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable, seconds
+from worldstate.measurement.measurement import Measurement
 
 HOP_S = 0.1
 UNQUERIED, ABSENT, PRESENT = 0, 1, 2

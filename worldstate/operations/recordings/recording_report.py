@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.atomic import atomic_path
+from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.listen import Source, Step, listen_steps
-from worldstate.evaluation.bearing_gating import BearingChecks, check_bearings
-from worldstate.evaluation.health import HealthLog, RecordingHealth
-from worldstate.evaluation.timeline import EntityTrail, Timeline
-from worldstate.evaluation.warning import WarningMeter, WarningSummary
+from worldstate.ground.values import seconds
 from worldstate.state import WorldState
-from worldstate.values import seconds
+
+from .bearing_gating import BearingChecks, check_bearings
+from .channel_report import HealthLog, RecordingHealth
+from .timeline import EntityTrail, Timeline
+from .warning import WarningMeter, WarningSummary
 
 # An entity is drawn where it more likely exists than not.
 LIKELY = 0.5

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import finite_array, in_range
-from worldstate.evaluation.hop_stream import ABSENT, PRESENT, HopStream
+from worldstate.ground.checks import finite_array, in_range
+
+from .hop_stream import ABSENT, PRESENT, HopStream
 
 Numbers = NDArray[np.float64]
 

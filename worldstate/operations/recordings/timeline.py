@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.atomic import atomic_path
+from worldstate.adapters.files.atomic import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

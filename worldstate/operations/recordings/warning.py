@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field
 
-from worldstate.evaluation.advisories import LONGEST_LEAD_S, detection
+from worldstate.ground.values import seconds
 from worldstate.state import RiskCue, WorldState
-from worldstate.values import seconds
+
+from .advisories import LONGEST_LEAD_S, detection
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.risk_map import fit_isotonic
-from worldstate.abduction.signature import CLASSES, hazard_statistic
-from worldstate.abduction.signature_training import Classifier
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.cueing.risk_map import fit_isotonic
+from worldstate.abduction.signature.published_signature import CLASSES, hazard_statistic
+from worldstate.abduction.signature.published_training import Classifier
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
 
-from .calibration import MISS_RATES, FitMap, WindowCalibration, between, calibrate_windows
 from .prevalence import matched_risk
 from .splits import Folds, Split
+from .window_calibration import MISS_RATES, FitMap, WindowCalibration, between, calibrate_windows
 
 Numbers = NDArray[np.float64]
 MakeClassifier = Callable[[np.random.Generator], Classifier]

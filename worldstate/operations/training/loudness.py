@@ -5,8 +5,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.abduction.signature import CLASSES, FRONT, LEFT, NONE, RIGHT
-from worldstate.abduction.site import log_levels
+from worldstate.abduction.signature.published_signature import CLASSES, FRONT, LEFT, NONE, RIGHT
+from worldstate.abduction.signature.site_reference import log_levels
 
 Numbers = NDArray[np.float64]
 

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.abduction.ensemble_training import Recipe, SiteEnsembleClassifier
-from worldstate.abduction.risk_map import fit_isotonic, fit_platt
-from worldstate.abduction.signature_training import Classifier, PublishedClassifier
-from worldstate.adapters.feature_table import FeatureTable
+from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
+from worldstate.abduction.signature.ensemble_training import Recipe, SiteEnsembleClassifier
+from worldstate.abduction.signature.published_training import Classifier, PublishedClassifier
+from worldstate.adapters.datasets.feature_table import FeatureTable
 
-from .calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, FitMap
-from .features import MakeClassifier, Predictions, cross_validate, transfer
+from .feature_evaluation import MakeClassifier, Predictions, cross_validate, transfer
 from .loudness import LoudestDirection
 from .site_references import with_site_references
 from .splits import Protocol, Split, junction_folds, recording_folds, split_for
+from .window_calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, FitMap
 
 Passes = list[dict[float, Predictions]]
 

@@ -5,9 +5,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 SMALLEST_RISK = 1e-6
 

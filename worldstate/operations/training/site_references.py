@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.site import log_levels, site_reference
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.signature.site_reference import log_levels, site_reference
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
 
 
 def with_site_references(table: FeatureTable, chosen: NDArray[np.bool_] | None = None) -> FeatureTable:

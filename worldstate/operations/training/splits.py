@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.errors import InvalidArgumentError
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
 
 Protocol = Literal["cv", "lojo", "transfer"]
 PROTOCOLS: tuple[Protocol, ...] = ("cv", "lojo", "transfer")

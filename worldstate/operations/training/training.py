@@ -8,16 +8,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.any_signature import AnySignature
-from worldstate.abduction.cueing import CueingPolicies, CueingPolicy
-from worldstate.abduction.ensemble_training import RECIPES, SiteEnsembleClassifier
-from worldstate.abduction.risk_map import fit_isotonic, fit_platt
-from worldstate.abduction.signature import hazard_statistic
-from worldstate.abduction.signature_training import PublishedClassifier
-from worldstate.adapters.feature_table import FeatureTable, Group
-from worldstate.adapters.model_file import Model, Provenance
+from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
+from worldstate.abduction.signature.ensemble_training import RECIPES, SiteEnsembleClassifier
+from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.adapters.datasets.feature_table import FeatureTable, Group
+from worldstate.adapters.files.model_file import Model, Provenance
+from worldstate.operations.metrics.roc import auroc
 
-from .calibration import (
+from .feature_evaluation import MakeClassifier, out_of_fold
+from .methods import site_ensemble
+from .site_references import with_site_references
+from .splits import N_FOLDS, junction_folds, recording_folds
+from .window_calibration import (
     ABSENT_MISS_RATE,
     MISS_RATES,
     PUBLISHED_MISS_RATE,
@@ -25,11 +30,6 @@ from .calibration import (
     between,
     calibrate_windows,
 )
-from .features import MakeClassifier, out_of_fold
-from .methods import site_ensemble
-from .metrics import auroc
-from .site_references import with_site_references
-from .splits import N_FOLDS, junction_folds, recording_folds
 
 ALPHAS = (0.01, 0.02, 0.05)
 CLASSIFIER = "standardise, linear SVC C=1, left/right mirroring, sigmoid per pair, pairwise coupling"

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.risk_map import RiskMap, fit_isotonic
-from worldstate.abduction.signature import hazard_statistic
-from worldstate.errors import InvalidArgumentError
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.risk_map import RiskMap, fit_isotonic
+from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.ground.errors import InvalidArgumentError
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -119,7 +119,7 @@ def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
 
     Examples
     --------
-    >>> from worldstate.abduction.risk_map import PlattMap
+    >>> from worldstate.abduction.cueing.risk_map import PlattMap
     >>> careful = WindowCalibration(0.0, 0.9, PlattMap(-2.0, 1.0))
     >>> bold = WindowCalibration(0.0, 0.5, PlattMap(-1.0, 0.0))
     >>> middle = between([careful, bold])

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from worldstate.adapters.atomic import atomic_path
-from worldstate.evaluation.degradation_sweep import SweepRow
-from worldstate.evaluation.staged_looks import CLEAN, OFF
+from worldstate.adapters.files.atomic import atomic_path
+
+from .degradation_sweep import SweepRow
+from .degraded_detections import CLEAN, OFF
 
 COLUMNS = (
     ("d", "degradation"), ("beta", "miss_rate"), ("vision", "vision_only"), ("any", "any_detection"),

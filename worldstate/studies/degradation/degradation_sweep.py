@@ -6,16 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.cueing import sustained_alarm
-from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.advisories import detection, false_alarms_per_hour, rising_edges
-from worldstate.evaluation.folds import recording_folds
-from worldstate.evaluation.hop_stream import HOP_S, UNQUERIED
-from worldstate.evaluation.staged_looks import CLEAN, OFF
-from worldstate.evaluation.staged_recording import StagedRecording
-from worldstate.evaluation.stream_statistic import stream_statistic
+from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.recording_folds import recording_folds
+from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
+from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
+from worldstate.operations.recordings.stream_statistic import stream_statistic
+
+from .degraded_detections import CLEAN, OFF
+from .staged_recording import StagedRecording
 
 DRAWS = 1000
 

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.degradation import LEVELS, Family, degrade
-from worldstate.adapters.detector import Detector
-from worldstate.adapters.miss_rates import MissRates
-from worldstate.adapters.video import Video
-from worldstate.adapters.vision import VisionSettings
-from worldstate.adapters.watched_camera import Watched, Watcher
-from worldstate.errors import InvalidArgumentError
-from worldstate.values import nanoseconds
+from worldstate.adapters.camera.camera_channel import Watched, Watcher
+from worldstate.adapters.camera.degradation import LEVELS, Family, degrade
+from worldstate.adapters.camera.detector import Detector
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.video import Video
+from worldstate.adapters.camera.vision_query import VisionSettings
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import nanoseconds
 
 # States that every sweep has: the camera as it is, and no camera at all.
 CLEAN, OFF = "clean", "off"

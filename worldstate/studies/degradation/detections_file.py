@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.camera_health import DegradationLog
-from worldstate.adapters.detections import DetectionFrame, DetectionLog
-from worldstate.adapters.miss_rates import MissRates
-from worldstate.adapters.watched_camera import Watched
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.npz_file import load_npz, save_npz
-from worldstate.evaluation.staged_looks import StagedLooks
+from worldstate.adapters.camera.camera_channel import Watched
+from worldstate.adapters.camera.camera_health import DegradationLog
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.ground.errors import InvalidArgumentError
+
+from .degraded_detections import StagedLooks
 
 MAX_BYTES = 64 << 20
 

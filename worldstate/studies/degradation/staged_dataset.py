@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.camera import PinholeCamera
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.video import VIDEO_NAME, Video, open_video
+from worldstate.adapters.datasets.ovad import OvadDataset, Recording
 from worldstate.adapters.listen import open_source
-from worldstate.adapters.ovad import OvadDataset, Recording
-from worldstate.adapters.parallel import in_processes
-from worldstate.adapters.video import VIDEO_NAME, Video, open_video
-from worldstate.errors import InputFileError
-from worldstate.evaluation.looks_file import load_looks, save_looks
-from worldstate.evaluation.staged_degradation import hear_staged
-from worldstate.evaluation.staged_looks import CameraState, StagedLooks, Staging, stage_looks
-from worldstate.evaluation.staged_recording import StagedRecording
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.parallel import in_processes
+
+from .degraded_detections import CameraState, StagedLooks, Staging, stage_looks
+from .detections_file import load_looks, save_looks
+from .staged_degradation import hear_staged
+from .staged_recording import StagedRecording
 
 # What a camera sees depends on this code: a change of it is another number.
 VERSION = 2

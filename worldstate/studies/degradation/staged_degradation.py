@@ -7,18 +7,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.detections import DetectionLog
-from worldstate.adapters.detector import overlaps
+from worldstate.adapters.camera.detections import DetectionLog
+from worldstate.adapters.camera.detector import overlaps
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import VisionQuery, moving_boxes
 from worldstate.adapters.listen import Source, line_of_sight, measure_steps
-from worldstate.adapters.vision import VisionQuery, moving_boxes
-from worldstate.evaluation.absence import AbsenceSettings
-from worldstate.evaluation.hop_stream import hop_stream
-from worldstate.evaluation.staged_looks import OFF, StagedLooks, Staging
-from worldstate.evaluation.staged_recording import StagedRecording
-from worldstate.filter import WorldFilter
+from worldstate.core.filter import WorldFilter
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.measurement import Measurement
+from worldstate.measurement.measurement import Measurement
+from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings
+from worldstate.operations.recordings.hop_stream import hop_stream
+
+from .degraded_detections import OFF, StagedLooks, Staging
+from .staged_recording import StagedRecording
 
 Heard = tuple[AcousticFrame, Measurement]
 Boxes = NDArray[np.float64]

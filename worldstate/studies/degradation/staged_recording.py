@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.checks import check_shape, finite_array
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.hop_stream import HopStream
+from worldstate.ground.checks import check_shape, finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.hop_stream import HopStream
 
 Numbers = NDArray[np.float64]
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.calibration_error import brier_score, expected_calibration_error
-from worldstate.adapters.feature_table import FeatureTable
-
-from .features import Predictions
-from .metrics import auroc
-from .splits import recording_labels
+from worldstate.abduction.cueing.calibration_error import brier_score, expected_calibration_error
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.training.feature_evaluation import Predictions
+from worldstate.operations.training.splits import recording_labels
 
 DRAWS = 500
 COVERAGE = 0.95

@@ -7,15 +7,15 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy.stats import binom
 
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.errors import InvalidArgumentError
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.training.feature_evaluation import Predictions
+from worldstate.operations.training.methods import METHODS, ROWS, Passes, evaluate_pass
+from worldstate.operations.training.splits import Protocol
+from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 
 from .bootstrap import DRAWS, FigureDraws, draw_figures, recording_draws
-from .calibration import ABSENT_MISS_RATE
 from .feature_report import group_figures, mean_figures, report_groups, window_figures
-from .features import Predictions
-from .methods import METHODS, ROWS, Passes, evaluate_pass
-from .splits import Protocol
 
 BOOTSTRAP_SEED = 0
 COMPARED = ("baseline", "baseline_absent", "loudest_direction", "commissioning_drive")

@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.abduction.calibration_error import (
+from worldstate.abduction.cueing.calibration_error import (
     brier_score,
     calibration_error_sampling,
     expected_calibration_error,
 )
-from worldstate.adapters.atomic import atomic_path
-from worldstate.adapters.feature_table import FeatureTable
-
-from .features import Predictions
-from .metrics import auroc, auroc_by_group, macro, rate
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate
+from worldstate.operations.training.feature_evaluation import Predictions
 
 FLOOR_SEED = 0
 Figures = dict[str, float | None]

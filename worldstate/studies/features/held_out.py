@@ -2,14 +2,13 @@
 
 import numpy as np
 
-from worldstate.abduction.ensemble import EnsembleModel
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.adapters.model_file import Model
-from worldstate.errors import InvalidArgumentError
-
-from .calibration import MISS_RATES, WindowCalibration
-from .features import Predictions, predict_with
-from .site_references import with_site_references
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.files.model_file import Model
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.training.feature_evaluation import Predictions, predict_with
+from worldstate.operations.training.site_references import with_site_references
+from worldstate.operations.training.window_calibration import MISS_RATES, WindowCalibration
 
 
 def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[float, Predictions]:

@@ -6,21 +6,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.calibration_error import (
+from worldstate.abduction.cueing.calibration_error import (
     brier_score,
     calibration_error_floor,
     expected_calibration_error,
 )
-from worldstate.abduction.cueing import sustained_alarm
-from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.risk_map import fit_isotonic
-from worldstate.checks import in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.advisories import detection, false_alarms_per_hour, rising_edges
-from worldstate.evaluation.folds import recording_folds
-from worldstate.evaluation.hop_stream import HOP_S, HopStream
-from worldstate.evaluation.metrics import auroc
-from worldstate.evaluation.stream_statistic import StatisticSwitches, presence_statistic, stream_statistic
+from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.risk_map import fit_isotonic
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.recording_folds import recording_folds
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
+from worldstate.operations.recordings.hop_stream import HOP_S, HopStream
+from worldstate.operations.recordings.stream_statistic import (
+    StatisticSwitches,
+    presence_statistic,
+    stream_statistic,
+)
 
 Numbers = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ at a time.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.checks import finite_array
-from worldstate.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
 
 FloatArray = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
 
     References
     ----------
-    R. A. Fisher 1936, one band at a time: see `worldstate.frontend.fisher_profile`; section IV of the paper.
+    R. A. Fisher 1936, one band at a time: see `fisher_profile`; section IV of the paper.
 
     Examples
     --------

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.abduction.fisher import combined_information
-from worldstate.abduction.information import (
+from worldstate.abduction.identifiability.fisher_information import combined_information
+from worldstate.abduction.identifiability.information import (
     fano_bound,
     information_from_posteriors,
     nearest_neighbour_information_bits,
     sharp_fano_bound,
     state_entropy_bits,
 )
-from worldstate.checks import finite_array, in_range
-from worldstate.errors import InvalidArgumentError
-from worldstate.frontend.array import MicrophoneArray
-from worldstate.frontend.bounds import bearing_crb_rad2, endfire_information
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_information
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
 
 Numbers = NDArray[np.float64]
 
@@ -182,11 +182,11 @@ def reach_of_array(
     Raises
     ------
     InvalidArgumentError
-        As `frontend.bounds.bearing_crb_rad2`.
+        As `frontend.bounds.cramer_rao.bearing_crb_rad2`.
 
     Examples
     --------
-    >>> from worldstate.frontend.array import roof_array_56
+    >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> found = reach_of_array(roof_array_56(), [0.0, 1.5], [500.0, 1000.0], [0.1, 0.1], snapshots=40)
     >>> bool(found.std_rad[0] < found.std_rad[1])
     True

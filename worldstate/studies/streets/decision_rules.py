@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.cueing import sustained_alarm
-from worldstate.abduction.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.risk_map import fit_isotonic
-from worldstate.errors import InvalidArgumentError
-from worldstate.evaluation.advisories import detection, rising_edges
-from worldstate.evaluation.twin_recording import TwinRecording
+from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.risk_map import fit_isotonic
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.advisories import detection, rising_edges
+
+from .recording_features import TwinRecording
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.calibration_error import reliability_curve
-from worldstate.adapters.atomic import atomic_path
-from worldstate.evaluation.bearing_gating import draw_gating
-from worldstate.evaluation.twin_figures import HORIZONS, rule_figures, twin_bearings, twin_figures
-from worldstate.evaluation.twin_report import TARGETS
-from worldstate.evaluation.twin_score import ALPHA, TwinScore, labelled_windows
+from worldstate.abduction.cueing.calibration_error import reliability_curve
+from worldstate.adapters.files.atomic import atomic_path
+from worldstate.operations.recordings.bearing_gating import draw_gating
+
+from .decision_rules import ALPHA, TwinScore, labelled_windows
+from .published_figures import HORIZONS, rule_figures, twin_bearings, twin_figures
+from .report import TARGETS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

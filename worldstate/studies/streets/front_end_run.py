@@ -7,26 +7,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.camera import PinholeCamera
-from worldstate.adapters.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.listen import line_of_sight
-from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation import SimulatedRecording
-from worldstate.adapters.simulation.vehicle import LENGTH_M
-from worldstate.adapters.vision import VisionQuery
-from worldstate.evaluation.hop_stream import hop_stream
-from worldstate.evaluation.twin_recording import NONE_APPROACH, TwinRecording
-from worldstate.frontend.array import MicrophoneArray, roof_array_56
-from worldstate.frontend.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.doppler import DopplerSettings, radial_speed
-from worldstate.frontend.harmonics import track_fundamental
-from worldstate.frontend.music import music_spectrum, signal_subspace
+from worldstate.adapters.simulation.scene.vehicle import LENGTH_M
+from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
+from worldstate.frontend.approach.engine_line import track_fundamental
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.stft import StreamingStft
+from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import AcousticFrame
-from worldstate.frontend.threads import one_blas_thread
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
+from worldstate.operations.recordings.hop_stream import hop_stream
 from worldstate.state import Context
-from worldstate.values import NotUsable, nanoseconds, seconds
+
+from .recording_features import NONE_APPROACH, TwinRecording
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.calibration_error import expected_calibration_error
-from worldstate.evaluation.advisories import SECONDS_PER_HOUR
-from worldstate.evaluation.bearing_gating import BearingChecks, joined
-from worldstate.evaluation.hop_stream import HOP_S
-from worldstate.evaluation.metrics import auroc
-from worldstate.evaluation.twin_recording import TwinRecording
-from worldstate.evaluation.twin_score import ALPHA, ALPHA_LOOSE, RuleOutcome, TwinScore, labelled_windows
+from worldstate.abduction.cueing.calibration_error import expected_calibration_error
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
+from worldstate.operations.recordings.bearing_gating import BearingChecks, joined
+from worldstate.operations.recordings.hop_stream import HOP_S
+
+from .decision_rules import ALPHA, ALPHA_LOOSE, RuleOutcome, TwinScore, labelled_windows
+from .recording_features import TwinRecording
 
 Numbers = NDArray[np.float64]
 Rows = NDArray[np.intp]

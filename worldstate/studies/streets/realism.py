@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from sklearn.ensemble import HistGradientBoostingClassifier
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.abduction.signature import hazard_statistic
-from worldstate.abduction.signature_training import PublishedClassifier
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.errors import InvalidArgumentError
-
-from .bootstrap import recording_draws
-from .metrics import auroc
-from .splits import recording_folds
+from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.training.splits import recording_folds
+from worldstate.studies.features.bootstrap import recording_draws
 
 Numbers = NDArray[np.float64]
 Interval = tuple[float, float]

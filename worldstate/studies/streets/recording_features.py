@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.abduction.any_signature import AnySignature
-from worldstate.abduction.ensemble import EnsembleModel
-from worldstate.adapters.feature_table import N_FEATURES
-from worldstate.adapters.site_signature import SiteSignature
-from worldstate.checks import check_shape
-from worldstate.evaluation.hop_stream import HopStream
-from worldstate.evaluation.npz_file import load_npz, save_npz
-from worldstate.evaluation.stream_statistic import stream_statistic
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.adapters.datasets.feature_table import N_FEATURES
+from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.ground.checks import check_shape
+from worldstate.operations.recordings.hop_stream import HopStream
+from worldstate.operations.recordings.stream_statistic import stream_statistic
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
-from worldstate.adapters.simulation.plan import Plan
-from worldstate.adapters.simulation.presets import Preset
-from worldstate.evaluation.twin_hearing import hear
-from worldstate.evaluation.twin_recording import TwinRecording, load_twin, save_twin
+from worldstate.adapters.simulation.dataset.plan import Plan
+from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.ground.parallel import in_processes
+
+from .front_end_run import hear
+from .recording_features import TwinRecording, load_twin, save_twin
 
 # What is heard of a recording depends on this code: a change of it is another number.
 VERSION = 4

@@ -14,11 +14,10 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from worldstate.adapters.feature_extraction import WINDOW_S
-from worldstate.adapters.feature_table import FeatureTable
-from worldstate.adapters.ovad_layout import FRAME_RATE_HZ
-from worldstate.adapters.parallel import in_processes
-from worldstate.adapters.sample_windows import window_ends_s
+from worldstate.adapters.datasets.feature_extraction import WINDOW_S
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.datasets.sample_windows import window_ends_s
 from worldstate.adapters.simulation import (
     SITES,
     Preset,
@@ -27,10 +26,8 @@ from worldstate.adapters.simulation import (
     preset,
     simulate_recording,
 )
-from worldstate.checks import in_range
-from worldstate.frontend.array import roof_array_56
-from worldstate.frontend.bins import band_bins
-from worldstate.frontend.feature import (
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_NFFT,
     FEATURE_SEGMENTS,
@@ -38,8 +35,11 @@ from worldstate.frontend.feature import (
     pair_sum,
     segment_feature,
 )
-from worldstate.frontend.phat import whiten
-from worldstate.frontend.threads import one_blas_thread
+from worldstate.frontend.spectra.bins import band_bins
+from worldstate.frontend.spectra.phat import whiten
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.checks import in_range
+from worldstate.ground.parallel import in_processes
 
 Numbers = NDArray[np.float64]
 

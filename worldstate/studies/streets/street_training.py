@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.any_signature import AnySignature
-from worldstate.adapters.feature_table import FeatureTable, read_features, write_features
+from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.simulation import SITES, Preset
-from worldstate.evaluation.simulated_windows import LAYOUT, simulated_windows
-from worldstate.evaluation.training import TrainingMethod, fit_signature, seen_by
-from worldstate.evaluation.twin_simulation import VERSION
+from worldstate.operations.training.training import TrainingMethod, fit_signature, seen_by
+
+from .simulated_streets import VERSION
+from .simulated_windows import LAYOUT, simulated_windows
 
 # 170 windows of each class of left and right together, front and none: the released set has 170, 170 and 158
 # once its 42 + 42 and 41 test windows are taken away.

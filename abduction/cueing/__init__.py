@@ -1,0 +1,1 @@
+"""From the statistic to an advisory: thresholds, sustained rule, calibrated risk."""

@@ -1,0 +1,1 @@
+"""Signature models: from a feature vector to log-likelihoods of the explanations."""

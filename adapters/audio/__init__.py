@@ -1,0 +1,1 @@
+"""Multichannel sound files."""

@@ -1,0 +1,1 @@
+"""Cameras, detectors, their detections, and how often they miss."""

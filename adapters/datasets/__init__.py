@@ -1,0 +1,1 @@
+"""Data sets in OVAD's layout and tables of feature windows."""

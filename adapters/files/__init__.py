@@ -1,0 +1,1 @@
+"""Arrays, models, checkpoints and tables on disk."""

@@ -1,0 +1,1 @@
+"""Simulated recordings, their truth and their files."""

@@ -1,0 +1,1 @@
+"""Who stands and drives where: junctions, occluders, vehicles, presets."""

@@ -1,0 +1,1 @@
+"""How sound gets from every source to every microphone."""

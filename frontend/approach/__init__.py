@@ -1,0 +1,1 @@
+"""Approach: looming, engine line, Doppler shift."""

@@ -1,0 +1,1 @@
+"""Where the microphones are, and the steering vectors that follow from it."""

@@ -1,0 +1,1 @@
+"""Noise of the own vehicle: learned, whitened, cancelled."""

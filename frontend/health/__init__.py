@@ -1,0 +1,1 @@
+"""Faults of microphones and of the stream."""

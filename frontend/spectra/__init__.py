@@ -1,0 +1,1 @@
+"""From samples to spectra: hops, short-time Fourier transform, bands, phase transform."""

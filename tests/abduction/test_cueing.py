@@ -1,0 +1,131 @@
+"""Sustained rule, Neyman-Pearson threshold, policies."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.abduction.cueing.cueing_policy import (
+    CueingPolicies,
+    CueingPolicy,
+    SustainedRule,
+    argmax_hazard,
+    sustained_alarm,
+    sustained_statistic,
+)
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
+from worldstate.ground.errors import InvalidArgumentError
+
+# Few distinct values, so that ties are common.
+scores = st.sampled_from(np.linspace(0, 1, 9).tolist())
+streams = st.lists(st.lists(scores, min_size=1, max_size=30), min_size=1, max_size=6)
+hops = st.integers(1, 5)
+PRIOR = (0.25, 0.25, 0.25, 0.25)
+
+
+@given(st.lists(st.booleans(), max_size=40), hops)
+def test_the_rule_step_by_step_is_the_rule_at_once(held, k):
+    rule, alarms = SustainedRule(k), []
+    for one in held:
+        rule = rule.advance(one)
+        alarms.append(rule.alarm)
+    by_hand = [t + 1 >= k and all(held[t + 1 - k : t + 1]) for t in range(len(held))]
+    assert alarms == by_hand
+    assert sustained_alarm(held, k).tolist() == by_hand
+
+
+@given(st.lists(scores, min_size=1, max_size=40), hops, scores)
+def test_the_sustained_statistic_decides_as_the_rule_does(stream, k, gamma):
+    by_rule = sustained_alarm(np.array(stream) >= gamma, k)
+    assert ((sustained_statistic(stream, k) >= gamma) == by_rule).all()
+
+
+def alarm_rate(recordings, gamma, k):
+    return np.concatenate([sustained_alarm(np.array(r) >= gamma, k) for r in recordings]).mean()
+
+
+@given(streams, st.floats(0, 0.99), hops)
+def test_law_4_the_budget_is_never_exceeded_and_never_wasted(recordings, alpha, k):
+    gamma = neyman_pearson_threshold(recordings, alpha, k)
+    assert alarm_rate(recordings, gamma, k) <= alpha + 1e-12
+    # The smallest: the next lower score that occurs would break the budget.
+    lower = [s for r in recordings for s in sustained_statistic(r, k) if s < gamma and np.isfinite(s)]
+    if lower:
+        assert alarm_rate(recordings, max(lower), k) > alpha
+
+
+@given(streams, st.floats(0, 0.99), hops)
+def test_a_threshold_for_single_windows_keeps_its_budget_when_sustained(recordings, alpha, k):
+    gamma = neyman_pearson_threshold(recordings, alpha, 1)
+    assert alarm_rate(recordings, gamma, k) <= alpha + 1e-12
+
+
+@given(streams, st.floats(0, 0.5), st.floats(0, 0.49))
+def test_a_larger_budget_never_raises_the_threshold(recordings, alpha, more):
+    assert neyman_pearson_threshold(recordings, alpha + more) <= neyman_pearson_threshold(recordings, alpha)
+
+
+def test_runs_do_not_cross_recordings():
+    apart = [[0.1, 0.9], [0.9, 0.1]]
+    together = [[0.1, 0.9, 0.9, 0.1]]
+    assert neyman_pearson_threshold(apart, 0.0, 2) < 0.9 < neyman_pearson_threshold(together, 0.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("recordings", "alpha", "k"),
+    [
+        ([], 0.1, 1),
+        ([[]], 0.1, 1),
+        ([[0.5, np.nan]], 0.1, 1),
+        ([[0.5]], 1.0, 1),
+        ([[0.5]], -0.1, 1),
+        ([[0.5]], 0.1, 0),
+    ],
+)
+def test_a_threshold_without_grounds_is_refused(recordings, alpha, k):
+    with pytest.raises(InvalidArgumentError):
+        neyman_pearson_threshold(recordings, alpha, k)
+
+
+def test_the_published_rule_takes_the_argmax():
+    probabilities = np.eye(4)[[0, 1, 2, 3]]
+    assert argmax_hazard(probabilities).tolist() == [False, True, False, True]
+
+
+@pytest.mark.parametrize("risk_map", [IsotonicMap((0.1, 0.9), (0.0, 1.0)), PlattMap(-2.0, 0.3)])
+def test_a_policy_reads_back_what_it_wrote(risk_map):
+    policy = CueingPolicy(0.78, 3, 0.02, PRIOR, risk_map, 1.0)
+    assert CueingPolicy.from_dict(policy.to_dict()) == policy
+
+
+def test_policies_are_found_by_budget():
+    made = [CueingPolicy(a, 1, a, PRIOR, PlattMap(-1.0, 0.0), b) for a in (0.01, 0.02) for b in (0.0, 1.0)]
+    policies = CueingPolicies(tuple(made))
+    assert policies.for_alpha(0.02, 1.0) is made[3]
+    with pytest.raises(InvalidArgumentError, match=r"0\.01, 0\.02"):
+        policies.for_alpha(0.03)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"gamma": float("nan")},
+        {"sustain_hops": 0},
+        {"sustain_hops": 2.5},
+        {"alpha": 1.0},
+        {"reference_prior": [0.5, 0.5]},
+        {"reference_prior": [0.5, 0.5, 0.5]},
+        {"miss_rate": 2.0},
+        {"risk_map": {"kind": "platt", "slope": 1.0, "offset": 0.0}},
+        {"risk_map": {"kind": "isotonic", "statistics": [0.5, 0.1], "risks": [0.0, 1.0]}},
+        {"risk_map": {"kind": "isotonic", "statistics": [0.1, 0.5], "risks": [0.0, 1.5]}},
+        {"risk_map": {"kind": "forest"}},
+        {"risk_map": None},
+        {"gamma": "0.5"},
+    ],
+)
+def test_damaged_policies_are_refused(change):
+    data = CueingPolicy(0.78, 3, 0.02, PRIOR, PlattMap(-1.0, 0.0)).to_dict()
+    with pytest.raises(InvalidArgumentError):
+        CueingPolicy.from_dict(data | change)

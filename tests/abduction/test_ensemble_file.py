@@ -1,0 +1,135 @@
+"""Model files that hold an ensemble: trained by the command, read back to the bit, damage refused by name."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.files.model_file import (
+    load_model,
+    model_from_dict,
+    model_to_dict,
+    read_model,
+    save_model,
+)
+from worldstate.ground.errors import InputFileError, WorldstateError
+from worldstate.operations.training.training import TrainingSettings, train_model
+from worldstate.studies.features.held_out import predict_held_out
+
+WRONG = [None, True, "text", [], {}, [None], -1.5, 10**400, float("nan"), float("inf"), "1.0", ["1.0"]]
+
+
+def made_up_table(seed=0, recordings=60):
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
+    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
+    rows = []
+    for number in range(recordings):
+        side = ("left", "right")[number // 6 % 2]
+        for label in ("none",) if number % 2 else (side, "front"):
+            levels = shape[label] + 0.7 * rng.normal(size=60) + 0.3 * (number % 3)
+            rows.append((np.exp(levels), label, f"{label}_{number}", f"SA{number % 3}", str(number)))
+    features, *labels = zip(*rows, strict=True)
+    return FeatureTable(np.array(features), *map(np.array, labels), (None,) * len(rows))
+
+
+@pytest.fixture(scope="module")
+def model():
+    chosen = TrainingSettings(repeats=1, method="worldstate")
+    return train_model(made_up_table(), chosen, dataset="made up", group="static")
+
+
+@pytest.fixture(scope="module")
+def default(model):
+    return model_to_dict(model)
+
+
+def test_written_and_read_back_to_the_bit(model, default, tmp_path):
+    save_model(tmp_path / "m", model)
+    again = read_model(tmp_path / "m")
+    assert model_to_dict(again) == default
+    signature, policies = load_model(tmp_path / "m")
+    assert isinstance(signature, EnsembleModel)
+    assert policies.for_alpha(0.02).reference_prior == signature.reference_prior
+    X = made_up_table(1).features
+    np.testing.assert_array_equal(signature.predict_proba(X), model.signature.predict_proba(X))
+
+
+def test_no_row_of_the_data_is_written(default):
+    rows = {np.float64(value).tobytes() for value in np.log(made_up_table().features).ravel()}
+    written = np.array(json.loads(json.dumps(default["signature"]["home"])))
+    assert not rows & {value.tobytes() for value in written}
+    for expert in default["signature"]["experts"]:
+        assert not rows & {np.float64(value).tobytes() for value in np.ravel(expert["weights"])}
+
+
+def test_it_predicts_other_recordings_of_its_sites(model):
+    table = made_up_table(seed=2)
+    other = FeatureTable(
+        table.features, table.labels, table.ids, table.environments,
+        np.char.add("x", table.recordings), table.t0_frames,
+    )  # fmt: skip
+    predictions = predict_held_out(model, other, alpha=0.05)[0.0]
+    assert (predictions.classes == other.labels).mean() > 0.8
+
+
+def places(value, here=()):
+    yield here
+    if isinstance(value, list):
+        value = dict(enumerate(value[:1]))
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from places(inner, (*here, key))
+
+
+def replaced(data, path, value):
+    data = copy.deepcopy(data)
+    inner = data
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return data
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data(), value=st.sampled_from(WRONG))
+def test_wrong_values_are_refused_or_harmless(default, data, value):
+    path = data.draw(st.sampled_from([place for place in places(default) if place[:1] == ("signature",)]))
+    try:
+        changed = model_from_dict(replaced(default, path, value), "bad.json")
+    except WorldstateError as error:
+        assert str(error).startswith("bad.json")
+    else:
+        json.dumps(model_to_dict(changed), allow_nan=False)
+        inputs = np.zeros((1, changed.signature.n_features))
+        assert np.isfinite(changed.signature.predict_proba(inputs)).all()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        ("home", 0),
+        ("class_prior", 0),
+        ("experts", 0),
+        ("experts", 0, "mean", 0),
+        ("experts", 0, "weights", 0, 0),
+    ],
+)
+@pytest.mark.parametrize("value", [None, "0.5", True, float("nan"), 10**400, [0.5]])
+def test_a_number_that_is_none_is_always_refused(default, path, value):
+    with pytest.raises(InputFileError):
+        model_from_dict(replaced(default, ("signature", *path), value), "bad.json")
+
+
+def test_experts_that_do_not_fit_are_refused(default):
+    many = replaced(default, ("signature", "experts"), default["signature"]["experts"] * 20)
+    short = replaced(default, ("signature", "home"), default["signature"]["home"][:-6])
+    unknown = replaced(default, ("signature", "experts", 0, "view"), "colour")
+    for data, problem in ((many, "experts"), (short, "empty"), (unknown, "view")):
+        with pytest.raises(InputFileError, match=problem):
+            model_from_dict(data, "bad.json")

@@ -1,0 +1,199 @@
+"""Eq. (lik): its integral against adaptive quadrature, its couplings, and a user's own classifier."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.stats import norm
+from sklearn.linear_model import LogisticRegression
+
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.grounding.class_descriptors import (
+    Coupling,
+    Descriptor,
+    car,
+    engine_line,
+    motorcycle,
+    tyre_noise_shape,
+)
+from worldstate.abduction.grounding.grounded_likelihood import (
+    BACKGROUNDS,
+    Background,
+    GroundedSettings,
+    Sector,
+    ground,
+)
+from worldstate.abduction.grounding.observation import GroundedObservation, Observable
+from worldstate.abduction.signature.classifier_signature import ClassifierSignature
+from worldstate.ground.errors import InvalidArgumentError
+
+SCORES = SignatureEvidence(("left", "right"), (0.7, -0.4), 0.1, -0.2)
+NAMES = ("line_spacing_hz", "tyre_shape_db", "doppler_ratio")
+
+
+def seen(**signature):
+    return GroundedObservation(signature={name: Observable(*value) for name, value in signature.items()})
+
+
+def test_without_measurements_the_classifier_s_evidence_passes_unchanged():
+    answer = ground(SCORES, GroundedObservation(), [car(), motorcycle()])
+    np.testing.assert_allclose(answer.evidence.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
+    assert answer.class_posterior == pytest.approx({"motor_vehicle": 0.9, "motorcycle": 0.1})
+    assert answer.best.direction == "left"
+
+
+@pytest.mark.parametrize("spacing_hz", [40.0, 70.0, 120.0])
+def test_the_integral_over_speed_is_that_of_adaptive_quadrature(spacing_hz):
+    coupling = engine_line()
+    vehicle = Descriptor("car", ("car",), 1.0, 8.0, 3.0, (coupling,))
+
+    def integrand(v):
+        density = norm.pdf(spacing_hz, coupling.expected([v])[:, 0], math.hypot(coupling.std, 2.0)).mean()
+        return density * norm.pdf(v, 8.0, 3.0)
+
+    mass = norm.cdf(30.0, 8.0, 3.0) - norm.cdf(-5.0, 8.0, 3.0)
+    oracle = quad(integrand, -5.0, 30.0, limit=400, points=[0.0, 2.0, 5.0, 10.0])[0] / mass
+    background = BACKGROUNDS["line_spacing_hz"]
+    relative = math.log(oracle) - norm.logpdf(spacing_hz, background.mean, background.std)
+    answer = ground(SCORES, seen(line_spacing_hz=(spacing_hz, 2.0)), [vehicle])
+    assert answer.evidence.hidden[0] - SCORES.hidden[0] == pytest.approx(relative, abs=0.01)
+    assert answer.evidence.visible - SCORES.visible == pytest.approx(relative, abs=0.01)
+    assert answer.evidence.none == SCORES.none
+
+
+def test_looming_marginalises_the_range_and_doppler_comes_first():
+    closing = GroundedObservation(inverse_tta_hz=Observable(0.4, 0.1))
+    leaving = GroundedObservation(inverse_tta_hz=Observable(-0.4, 0.1))
+    there, away = (ground(SCORES, one, [car()]) for one in (closing, leaving))
+    assert there.evidence.hidden[0] > SCORES.hidden[0] > away.evidence.hidden[0]
+    doppler = Observable(6.0, 0.5)
+    both = GroundedObservation(radial_speed_m_s=doppler, inverse_tta_hz=Observable(-0.4, 0.1))
+    alone = GroundedObservation(radial_speed_m_s=doppler)
+    assert ground(SCORES, both, [car()]) == ground(SCORES, alone, [car()])
+
+
+@given(st.floats(1.0, 20.0))
+def test_the_couplings_find_the_speed_that_made_them(speed):
+    vehicle = car()
+    signature = {
+        coupling.observable: Observable(float(coupling.expected([speed])[0, 0]), 0.05 * coupling.std)
+        for coupling in vehicle.couplings
+    }
+    flat = Descriptor("car", ("car",), 1.0, 10.0, 30.0, vehicle.couplings)
+    best = ground(SCORES, GroundedObservation(signature=signature), [flat]).best
+    assert best.radial_speed_m_s == pytest.approx(speed, abs=2.5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_coupling_can_be_switched_off_and_matters_when_on(name):
+    observation = seen(line_spacing_hz=(150.0, 1.0), tyre_shape_db=(12.0, 1.0), doppler_ratio=(1.12, 0.002))
+    off = ground(SCORES, observation, [car()], GroundedSettings(without=frozenset({name})))
+    rest = {key: value for key, value in observation.signature.items() if key != name}
+    unmeasured = ground(SCORES, GroundedObservation(signature=rest), [car()])
+    on = ground(SCORES, observation, [car()])
+    assert off == unmeasured
+    assert abs(on.evidence.hidden[0] - off.evidence.hidden[0]) > 0.1
+    none = ground(SCORES, observation, [car()], GroundedSettings(without=frozenset(NAMES)))
+    np.testing.assert_allclose(none.evidence.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
+
+
+def test_observables_that_contradict_each_other_are_less_likely_than_those_that_agree():
+    speed = 10.0
+    spacing, shape = (float(c.expected([speed])[0, 0]) for c in (engine_line(), tyre_noise_shape()))
+    agreeing = seen(line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.060, 0.002))
+    contradicting = seen(
+        line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.001, 0.002)
+    )
+    first, second = (ground(SCORES, one, [car()]).evidence.hidden[0] for one in (agreeing, contradicting))
+    assert first > second + 3.0
+
+
+@given(st.floats(-1.4, 1.4), st.floats(0.02, 0.5))
+def test_a_bearing_from_anywhere_says_nothing_of_hidden_but_something_of_visible(azimuth, std):
+    observation = GroundedObservation(bearing_rad=Observable(azimuth, std))
+    answer = ground(SCORES, observation, [car()])
+    assert answer.evidence.hidden == pytest.approx(SCORES.hidden, abs=1e-9)
+    assert abs(answer.best.azimuth_rad - azimuth) < np.radians(1.0)
+    ahead = ground(SCORES, GroundedObservation(bearing_rad=Observable(0.0, std)), [car()])
+    assert ahead.evidence.visible >= answer.evidence.visible - 1e-9
+
+
+@given(st.floats(-1.2, 1.2), st.floats(0.05, 0.3))
+def test_mirrored_measurements_mirror_the_answer(azimuth, std):
+    swapped = SignatureEvidence(("left", "right"), SCORES.hidden[::-1], SCORES.visible, SCORES.none)
+    settings = (GroundedSettings(hidden=Sector(sign * 0.7, 0.4)) for sign in (1.0, -1.0))
+    there, back = (
+        ground(scores, GroundedObservation(bearing_rad=Observable(sign * azimuth, std)), [car()], one)
+        for scores, sign, one in zip((SCORES, swapped), (1.0, -1.0), settings, strict=True)
+    )
+    assert there.evidence.hidden == pytest.approx(back.evidence.hidden[::-1], abs=1e-9)
+    assert {there.best.direction, back.best.direction} == {"left", "right"}
+
+
+def test_the_class_that_explains_the_observables_wins_and_names_its_co_evidence():
+    slow = Descriptor("bicycle", ("bicycle",), 1.0, 4.0, 1.0)
+    fast = Descriptor("car", ("car", "truck"), 1.0, 14.0, 2.0)
+    answer = ground(SCORES, GroundedObservation(radial_speed_m_s=Observable(14.0, 1.0)), [slow, fast])
+    assert answer.best.labels == ("car", "truck")
+    assert answer.class_posterior["car"] > 0.99
+    assert sum(answer.class_posterior.values()) == pytest.approx(1.0)
+
+
+def test_an_observable_of_a_user_s_own_needs_its_background():
+    rattle = Coupling("rattle_hz", (0.0, 20.0), ((0.0, 40.0),), 1.0)
+    tram = Descriptor("tram", ("train",), 1.0, 8.0, 3.0, (rattle,))
+    with pytest.raises(InvalidArgumentError, match="rattle_hz"):
+        ground(SCORES, seen(rattle_hz=(16.0, 1.0)), [tram])
+    settings = GroundedSettings(backgrounds={"rattle_hz": Background(20.0, 20.0)})
+    assert ground(SCORES, seen(rattle_hz=(16.0, 1.0)), [tram], settings).best.radial_speed_m_s == 8.0
+
+
+@pytest.mark.parametrize("speed", [3.0, 7.1, 12.9])
+def test_a_spread_finer_than_the_grid_still_finds_its_speed(speed):
+    answer = ground(SCORES, GroundedObservation(radial_speed_m_s=Observable(speed, 0.0)), [car()])
+    assert abs(answer.best.radial_speed_m_s - speed) <= 0.125 + 1e-9
+    assert np.isfinite(answer.evidence.log_likelihoods).all()
+
+
+def test_numbers_that_are_none_are_refused():
+    with pytest.raises(InvalidArgumentError, match="descriptors"):
+        ground(SCORES, GroundedObservation(), [])
+    with pytest.raises(InvalidArgumentError, match="descriptors"):
+        ground(SCORES, GroundedObservation(), [car(), car()])
+    with pytest.raises(InvalidArgumentError, match="std"):
+        Observable(1.0, -1.0)
+    with pytest.raises(InvalidArgumentError, match="rising"):
+        Coupling("x", (1.0, 1.0), ((0.0, 1.0),), 1.0)
+    with pytest.raises(InvalidArgumentError, match="each observable once"):
+        Descriptor("car", (), 1.0, 8.0, 1.0, (engine_line(), engine_line()))
+
+
+def test_a_scikit_learn_classifier_drops_in():
+    rng = np.random.default_rng(0)
+    y = rng.permutation(np.repeat(("none", "front", "right", "left"), 30))
+    X = rng.normal(size=(120, 5)) + np.searchsorted(np.unique(y), y)[:, None]
+    fitted = LogisticRegression().fit(X, y)
+    signature = ClassifierSignature(fitted)
+    columns = [fitted.classes_.tolist().index(name) for name in ("front", "left", "none", "right")]
+    np.testing.assert_allclose(signature.predict_proba(X), fitted.predict_proba(X)[:, columns], atol=1e-6)
+    p = signature.predict_proba(X[:1])[0]
+    expected = np.log(p[[1, 3, 0, 2]] / 0.25)
+    np.testing.assert_allclose(signature.evidence(X[0]).log_likelihoods, expected, atol=1e-12)
+    with pytest.raises(InvalidArgumentError, match="classes"):
+        ClassifierSignature(LogisticRegression().fit(X, y == "left"))
+    with pytest.raises(InvalidArgumentError, match="class_prior"):
+        ClassifierSignature(fitted, {"left": 1.0})
+
+
+def test_tyre_noise_at_the_reference_speed_is_the_directive_s():
+    """Category 1 of Directive 2015/996 at 70 km/h, 125 Hz and 1 kHz: A_R and A_P, power-summed."""
+    low, high = (10.0 * math.log10(10.0**a + 10.0**b) for a, b in ((8.57, 8.92), (9.73, 8.42)))
+    assert tyre_noise_shape().expected([70.0 / 3.6])[0, 0] == pytest.approx(high - low, abs=0.02)
+
+
+def test_tyre_noise_is_held_where_the_directive_ends():
+    slow, slower = tyre_noise_shape().expected([20.0 / 3.6 - 0.5, 1.0])[0]
+    assert slow == pytest.approx(slower, abs=0.1)

@@ -1,0 +1,150 @@
+"""Model files: what is written is read back to the bit; whatever is damaged is refused by name."""
+
+import copy
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.adapters.files.model_file import (
+    Model,
+    load_model,
+    model_from_dict,
+    model_to_dict,
+    read_model,
+    save_model,
+)
+from worldstate.ground.errors import InputFileError, SchemaVersionError, WorldstateError
+
+
+def published():
+    """The model that ships with the published classifier in its signature's place."""
+    rng, y = np.random.default_rng(0), np.repeat(CLASSES, 10)
+    X = rng.normal(size=(40, 60)) + np.arange(60) * np.repeat(np.arange(4), 10)[:, None]
+    return replace(read_model(), signature=PublishedClassifier(rng).fit(X, y).model_)
+
+
+DEFAULT = model_to_dict(published())
+
+
+def paths(value, here=()):
+    """All places in decoded JSON, one item of each list standing for the others."""
+    yield here
+    if isinstance(value, list):
+        value = dict(enumerate(value[:1]))
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from paths(inner, (*here, key))
+
+
+def replaced(path, value):
+    data = copy.deepcopy(DEFAULT)
+    inner = data
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return data
+
+
+PATHS = [path for path in paths(DEFAULT) if path]
+
+
+def test_the_default_model_ships_and_says_where_it_comes_from():
+    model = read_model()
+    assert isinstance(model.signature, EnsembleModel)
+    assert model.signature.n_features == 60
+    assert {p.alpha for p in model.policies.policies} == {0.01, 0.02, 0.05}
+    assert {p.miss_rate for p in model.policies.policies} == {0.0, 1.0}
+    assert "Schulz" in model.provenance.dataset
+    assert len(model.provenance.excluded_lists) == 2
+    signature, policies = load_model()
+    assert policies.for_alpha(0.02).reference_prior == signature.reference_prior
+    thresholds = [policies.for_alpha(alpha).gamma for alpha in (0.05, 0.02, 0.01)]
+    assert thresholds == sorted(thresholds)
+
+
+def test_written_and_read_back_to_the_bit(tmp_path):
+    path = tmp_path / "m"
+    save_model(path, published())
+    assert [p.name for p in tmp_path.iterdir()] == ["m"]
+    again = read_model(path)
+    assert isinstance(again, Model)
+    assert model_to_dict(again) == DEFAULT
+    X = np.random.default_rng(0).random((5, 60))
+    np.testing.assert_array_equal(again.signature.predict_proba(X), published().signature.predict_proba(X))
+
+
+def test_unknown_keys_are_ignored_and_another_major_version_is_not():
+    model_from_dict({**DEFAULT, "later": 1}, "m")
+    newer = {**DEFAULT, "schema": {"name": "worldstate.Model", "version": "1.8.0"}}
+    model_from_dict(newer, "m")
+    with pytest.raises(SchemaVersionError, match="m: expected"):
+        model_from_dict({**DEFAULT, "schema": {"name": "worldstate.Model", "version": "2.0.0"}}, "m")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40, deadline=None)
+@given(cut=st.floats(0, 0.999))
+def test_a_truncated_file_is_refused(tmp_path, cut):
+    text = json.dumps(DEFAULT)
+    path = tmp_path / "cut.json"
+    path.write_text(text[: int(cut * len(text))])
+    with pytest.raises(InputFileError, match=r"cut\.json"):
+        read_model(path)
+
+
+WRONG = [None, True, "text", [], {}, [None], -1.5, 10**400, float("nan"), float("inf"), "1.0", ["1.0"]]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(PATHS), st.sampled_from(WRONG))
+def test_wrong_values_are_refused_or_harmless(path, value):
+    try:
+        model = model_from_dict(replaced(path, value), "bad.json")
+    except WorldstateError as error:
+        assert str(error).startswith("bad.json")
+    else:
+        json.dumps(model_to_dict(model), allow_nan=False)
+        assert np.isfinite(model.signature.predict_proba(np.zeros((1, 60)))).all()
+
+
+@pytest.mark.parametrize(
+    "path", [("signature", "mean", 0), ("signature", "coefficients", 0, 0), ("policies", 0, "gamma")]
+)
+@pytest.mark.parametrize("value", [None, "0.5", True, float("nan"), 10**400, [0.5]])
+def test_a_number_that_is_none_is_always_refused(path, value):
+    with pytest.raises(InputFileError):
+        model_from_dict(replaced(path, value), "bad.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "null", "NaN", '{"a": NaN}', "[" * 100_000, "\x00", '{"schema": 1}', "1" * 10_000],
+)
+def test_what_is_no_model_is_refused(tmp_path, text):
+    path = tmp_path / "no.json"
+    path.write_text(text)
+    with pytest.raises(InputFileError, match=r"no\.json"):
+        read_model(path)
+
+
+def test_other_bytes_missing_and_huge_files_are_refused(tmp_path):
+    binary = tmp_path / "binary.json"
+    binary.write_bytes(b"\x80\x04\x95\xff\xfe")
+    huge = tmp_path / "huge.json"
+    with huge.open("wb") as file:
+        file.truncate(1 << 30)
+    for path in (binary, huge, tmp_path / "missing.json", tmp_path):
+        with pytest.raises(InputFileError, match=path.name):
+            read_model(path)
+
+
+def test_nothing_is_left_where_writing_fails(tmp_path):
+    with pytest.raises(InputFileError):
+        save_model(tmp_path / "nowhere" / "m.json", read_model())
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,151 @@
+"""Laws 1 to 4 of the one-step posterior, and gtsam as its oracle."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.posterior import abduce, log_lambda, statistic
+from worldstate.ground.errors import InvalidArgumentError
+
+nats = st.floats(-300, 300)
+open_unit = st.floats(1e-6, 1 - 1e-6)
+answers = st.one_of(
+    st.builds(Absent, open_unit),
+    st.builds(Absent, open_unit, st.floats(0, 0.5)),
+    st.builds(Present, open_unit, open_unit),
+    st.just(Unqueried("no camera")),
+)
+
+
+@st.composite
+def scenes(draw, scale=300.0, directions=None):
+    k = directions or draw(st.integers(1, 4))
+    levels = st.floats(-scale, scale)
+    hidden = draw(st.lists(levels, min_size=k, max_size=k))
+    evidence = SignatureEvidence(tuple("abcd"[:k]), tuple(hidden), draw(levels), draw(levels))
+    weights = np.array(draw(st.lists(st.floats(1e-3, 1), min_size=k + 2, max_size=k + 2)))
+    return weights / weights.sum(), evidence
+
+
+@given(scenes(), answers)
+def test_law_1_sums_to_one_and_stays_finite(scene, answer):
+    prior, evidence = scene
+    posterior = abduce(np.log(prior), evidence, answer)
+    assert np.isfinite(posterior.log_probabilities).all()
+    assert np.isfinite([posterior.log_lambda, posterior.log_evidence]).all()
+    assert posterior.probabilities.sum() == pytest.approx(1.0, abs=1e-12)
+    assert posterior.hidden_total + posterior.visible + posterior.none == pytest.approx(1.0, abs=1e-12)
+
+
+@given(scenes())
+def test_law_2_beta_one_is_neutral_and_beta_zero_removes_the_visible(scene):
+    prior, evidence = scene
+    unasked = abduce(np.log(prior), evidence, Unqueried("no camera"))
+    blind = abduce(np.log(prior), evidence, Absent(1.0))
+    assert blind == unasked
+    sharp = abduce(np.log(prior), evidence, Absent(0.0))
+    assert sharp.visible == 0.0
+    rest = np.delete(prior, -2), np.delete(evidence.log_likelihoods, -2)
+    joint = np.log(rest[0]) + rest[1]
+    expected = np.exp(joint - joint.max()) / np.exp(joint - joint.max()).sum()
+    np.testing.assert_allclose(np.delete(sharp.probabilities, -2), expected, atol=1e-12)
+
+
+@given(st.floats(0, 1), st.floats(0, 1), nats)
+def test_law_3_without_a_hidden_prior_absence_is_the_bernoulli_update(r, pd, level):
+    if r * pd > 1 - 1e-9:
+        return
+    evidence = SignatureEvidence(("left", "right"), (0.0, 0.0), level, level)
+    with np.errstate(divide="ignore"):
+        log_prior = np.log([0.0, 0.0, r, 1 - r])
+    posterior = abduce(log_prior, evidence, Absent(miss_rate=1 - pd))
+    assert posterior.visible == pytest.approx(r * (1 - pd) / (1 - r * pd), abs=1e-9)
+
+
+@given(scenes(scale=8, directions=2), scenes(scale=8, directions=2), open_unit)
+def test_law_4_the_statistic_is_a_monotone_map_of_lambda(scene, other, beta):
+    prior, evidence = scene
+    rival, answer = other[1], Absent(beta)
+    ratios = [log_lambda(np.log(prior), e, answer) for e in (evidence, rival)]
+    scores = [statistic(e, answer, prior) for e in (evidence, rival)]
+    assert (ratios[1] - ratios[0]) * (scores[1] - scores[0]) >= -1e-12
+    odds = np.log(prior[:2].sum() / prior[2:].sum())
+    assert scores[0] == pytest.approx(1 / (1 + np.exp(-(ratios[0] + odds))), abs=1e-9)
+
+
+@given(scenes(scale=20), answers, open_unit)
+def test_lambda_does_not_depend_on_how_probable_a_hidden_source_is(scene, answer, pi_hidden):
+    prior, evidence = scene
+    moved = prior.copy()
+    moved[:-2] *= pi_hidden / prior[:-2].sum()
+    moved[-2:] *= (1 - pi_hidden) / prior[-2:].sum()
+    expected = log_lambda(np.log(prior), evidence, answer)
+    assert log_lambda(np.log(moved), evidence, answer) == pytest.approx(expected, abs=1e-9)
+
+
+@given(scenes(scale=8, directions=2), open_unit, open_unit)
+def test_the_statistic_falls_as_the_channel_goes_blind(scene, beta, other):
+    prior, evidence = scene
+    sharp, dull = sorted((beta, other))
+    assert statistic(evidence, Absent(sharp), prior) >= statistic(evidence, Absent(dull), prior) - 1e-12
+
+
+@given(scenes(scale=12), answers)
+def test_gtsam_agrees_on_one_step(scene, answer):
+    prior, evidence = scene
+    hidden, visible, none = np.exp(answer.log_likelihoods())
+    factors = [
+        prior,
+        np.exp(evidence.log_likelihoods - evidence.log_likelihoods.max()),
+        np.array([hidden] * len(evidence.directions) + [visible, none]),
+    ]
+    key = (0, prior.size)
+    graph = gtsam.DiscreteFactorGraph()
+    for factor in factors:
+        graph.add(key, " ".join(f"{value:.17g}" for value in factor))
+    oracle = gtsam.DiscreteMarginals(graph).marginalProbabilities(key)
+    ours = abduce(np.log(prior), evidence, answer).probabilities
+    np.testing.assert_allclose(ours, oracle, atol=1e-9)
+
+
+four_weights = st.lists(st.floats(0.01, 1), min_size=4, max_size=4)
+
+
+@given(four_weights, four_weights)
+def test_a_classifier_gives_the_published_statistic_and_ours(posteriors, frequencies):
+    p, pi = (np.array(v) / np.sum(v) for v in (posteriors, frequencies))
+    ratio = np.log(p / pi)
+    evidence = SignatureEvidence(("left", "right"), tuple(ratio[:2]), ratio[2], ratio[3])
+    assert statistic(evidence, Unqueried("unused"), pi) == pytest.approx(p[0] + p[1])
+    for beta in (0.0, 0.04, 0.5):
+        expected = (p[0] + p[1]) / (p[0] + p[1] + beta * p[2] + p[3])
+        assert statistic(evidence, Absent(beta), pi) == pytest.approx(expected)
+
+
+def test_presence_speaks_for_the_visible_source():
+    evidence = SignatureEvidence(("left",), (0.0,), 0.0, 0.0)
+    posterior = abduce(np.log([0.4, 0.3, 0.3]), evidence, Present(miss_rate=0.04, clutter_rate=0.01))
+    found = 1 - 0.04 * 0.99
+    assert posterior.visible == pytest.approx(0.3 * found / (0.3 * found + 0.7 * 0.01))
+
+
+@pytest.mark.parametrize(
+    "log_prior",
+    [[0.0, 0.0], [0.0, 0.0, np.nan, 0.0], [0.0, 0.0, np.inf, 0.0], [-np.inf] * 4],
+)
+def test_a_bad_prior_is_named(log_prior):
+    evidence = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    with pytest.raises(InvalidArgumentError, match="log_prior"):
+        abduce(log_prior, evidence, Absent(0.1))
+
+
+def test_an_observation_that_nothing_explains_is_refused():
+    evidence = SignatureEvidence(("left",), (0.0,), 0.0, 0.0)
+    with pytest.raises(InvalidArgumentError, match="co-evidence"):
+        abduce([-np.inf, 0.0, -np.inf], evidence, Absent(0.0))
+    with pytest.raises(InvalidArgumentError, match="negative"):
+        statistic(evidence, Absent(0.0), (0.5, -0.1, 0.6))

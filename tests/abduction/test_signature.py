@@ -1,0 +1,178 @@
+"""The signature model against libsvm's own probabilities, and the coupling against its definition."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+
+from worldstate.abduction.co_evidence import Absent, Unqueried
+from worldstate.abduction.posterior import abduce, statistic
+from worldstate.abduction.signature.pairwise_coupling import class_pairs, couple
+from worldstate.abduction.signature.published_signature import CLASSES, SignatureModel, hazard_statistic
+from worldstate.abduction.signature.published_training import (
+    PublishedClassifier,
+    mirror_features,
+    mirror_hazards,
+)
+from worldstate.adapters.files.model_file import read_model
+from worldstate.ground.errors import InvalidArgumentError
+
+
+def windows(rng, n=240, spread=1.3):
+    """Four overlapping classes with the mirror symmetry of the real ones."""
+    labels = rng.permutation(np.repeat(CLASSES, n // 4))
+    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
+    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
+    return np.stack([shape[label] for label in labels]) + spread * rng.normal(size=(n, 60)), labels
+
+
+@pytest.fixture(scope="module")
+def trained():
+    X, y = windows(np.random.default_rng(1))
+    return X, y, PublishedClassifier(np.random.default_rng(2)).fit(X, y).model_
+
+
+@pytest.fixture(scope="module")
+def libsvm(trained):
+    if "probability" not in SVC().get_params():
+        pytest.skip("this scikit-learn has no probabilities of libsvm's own any more")
+    X, y, _ = trained
+    augmented, labels = mirror_hazards(X, y)
+    scaler = StandardScaler().fit(augmented)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        machine = SVC(kernel="linear", C=1.0, probability=True, random_state=0)
+        machine.fit(scaler.transform(augmented), labels)
+    return scaler, machine
+
+
+def test_agrees_with_libsvm_on_windows_not_trained_on(trained, libsvm):
+    scaler, machine = libsvm
+    X, _ = windows(np.random.default_rng(7), n=1000)
+    oracle, ours = machine.predict_proba(scaler.transform(X)), trained[2].predict_proba(X)
+    assert machine.classes_.tolist() == list(CLASSES)
+    # Both draw the folds of their sigmoids at random.
+    assert np.abs(oracle - ours).mean() < 0.02
+    assert (oracle.argmax(axis=1) == ours.argmax(axis=1)).mean() > 0.97
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_with_libsvm_s_sigmoids_only_its_tolerance_is_left(trained, libsvm):
+    scaler, machine = libsvm
+    numbers = trained[2].to_dict() | {"slopes": machine.probA_.tolist(), "offsets": machine.probB_.tolist()}
+    same = SignatureModel.from_dict(numbers)
+    X, _ = windows(np.random.default_rng(8), n=1000)
+    # libsvm's iteration stops at an error of 0.005 / 4.
+    np.testing.assert_allclose(same.predict_proba(X), machine.predict_proba(scaler.transform(X)), atol=5e-3)
+
+
+def test_decision_values_are_those_of_the_machine(trained, libsvm):
+    scaler, machine = libsvm
+    machine.decision_function_shape = "ovo"
+    oracle = machine.decision_function(scaler.transform(trained[0]))
+    np.testing.assert_allclose(trained[2].decision_values(trained[0]), oracle, atol=1e-9)
+
+
+weights = st.lists(st.floats(1e-3, 1), min_size=4, max_size=4)
+
+
+@given(weights)
+def test_consistent_pairs_give_back_their_probabilities(values):
+    p = np.array(values) / np.sum(values)
+    pairs = np.array([[p[i] / (p[i] + p[j]) for i, j in class_pairs(4)]])
+    np.testing.assert_allclose(couple(pairs, 4)[0], p, atol=1e-6)
+
+
+@given(st.lists(st.floats(0, 1), min_size=6, max_size=6))
+def test_any_pairs_give_a_distribution(values):
+    p = couple(np.array([values]), 4)[0]
+    assert p.sum() == pytest.approx(1.0, abs=1e-12)
+    assert (p > 0).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_coupling_minimises_what_it_says(seed):
+    pairs = np.random.default_rng(seed).uniform(0.02, 0.98, 6)
+
+    def disagreement(p):
+        return sum((p[i] * (1 - r) - p[j] * r) ** 2 for r, (i, j) in zip(pairs, class_pairs(4), strict=True))
+
+    oracle = minimize(
+        disagreement,
+        np.full(4, 0.25),
+        method="SLSQP",
+        bounds=[(0, 1)] * 4,
+        constraints={"type": "eq", "fun": lambda p: p.sum() - 1},
+        options={"ftol": 1e-14},
+    )
+    np.testing.assert_allclose(couple(pairs[None], 4)[0], oracle.x, atol=1e-5)
+
+
+def test_the_posterior_at_the_training_prior_is_the_classifier_s(trained):
+    X, _, model = trained
+    left, right, visible, none = 1, 3, 0, 2
+    for x, p in zip(X[:20], model.predict_proba(X[:20]), strict=True):
+        posterior = abduce(np.log(model.reference_prior), model.evidence(x), Unqueried("no camera"))
+        np.testing.assert_allclose(posterior.probabilities, p[[left, right, visible, none]], atol=1e-9)
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.04, 0.5, 1.0])
+def test_the_statistic_of_many_windows_is_that_of_each(trained, beta):
+    X, _, model = trained
+    at_once = hazard_statistic(model.predict_proba(X[:20]), beta)
+    one_by_one = [statistic(model.evidence(x), Absent(beta), model.reference_prior) for x in X[:20]]
+    np.testing.assert_allclose(at_once, one_by_one, atol=1e-9)
+
+
+def test_the_mirror_swaps_sides_and_is_its_own_inverse():
+    X, y = windows(np.random.default_rng(3))
+    np.testing.assert_array_equal(mirror_features(mirror_features(X)), X)
+    features, labels = mirror_hazards(X, y)
+    hazards = np.isin(y, ("left", "right"))
+    assert len(labels) == len(y) + hazards.sum()
+    assert (labels == "left").sum() == (labels == "right").sum() == hazards.sum()
+    first = features[len(y)].reshape(2, 30)
+    np.testing.assert_array_equal(first, X[hazards][0].reshape(2, 30)[:, ::-1])
+
+
+def test_the_same_seed_gives_the_same_model():
+    X, y = windows(np.random.default_rng(4))
+    first, second = (PublishedClassifier(np.random.default_rng(5)).fit(X, y).model_ for _ in range(2))
+    assert first.to_dict() == second.to_dict()
+
+
+def test_a_model_reads_back_to_the_bit(trained):
+    X, _, model = trained
+    again = SignatureModel.from_dict(model.to_dict())
+    np.testing.assert_array_equal(again.predict_proba(X), model.predict_proba(X))
+
+
+def test_features_that_never_change_do_no_harm():
+    X, y = windows(np.random.default_rng(6))
+    X[:, 5] = X[:, 24] = 0.3
+    assert np.isfinite(PublishedClassifier(np.random.default_rng(0)).fit(X, y).predict_proba(X)).all()
+
+
+def test_likelihoods_stay_finite_far_from_all_that_was_seen():
+    model = read_model().signature
+    for level in (-1e6, 0.0, 1.0, 1e6):
+        assert np.isfinite(model.evidence(np.full(60, level)).log_likelihoods).all()
+
+
+@pytest.mark.parametrize("X", [np.zeros((3, 59)), np.zeros(60), np.full((1, 60), np.nan)])
+def test_other_features_are_refused(X):
+    with pytest.raises(InvalidArgumentError, match="X"):
+        read_model().signature.predict_proba(X)
+
+
+@pytest.mark.parametrize(
+    "labels", [["left", "right"] * 20, ["left", "none"] * 20, ["front", "none", "left", "up"] * 10]
+)
+def test_training_needs_its_classes(labels):
+    with pytest.raises(InvalidArgumentError, match="classes"):
+        PublishedClassifier(np.random.default_rng(0)).fit(np.zeros((40, 60)), labels)

@@ -1,0 +1,175 @@
+"""The ensemble for unseen junctions: mirror law, references from elsewhere, optimal coefficients."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import log_softmax
+
+from worldstate.abduction.signature.ensemble import MIRRORED_CLASSES, EnsembleModel
+from worldstate.abduction.signature.ensemble_training import RECIPES, Recipe, SiteEnsembleClassifier
+from worldstate.abduction.signature.expert import VIEWS, expert_views
+from worldstate.abduction.signature.mirror import mirror_features
+from worldstate.abduction.signature.pattern_features import shape_features
+from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.training.site_references import with_site_references
+
+
+def windows(rng, n=200, spread=0.8):
+    """Four overlapping classes at two sites of different level, with the sites' references behind."""
+    labels = rng.permutation(np.repeat(CLASSES, n // 4))
+    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
+    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
+    levels = np.stack([shape[label] for label in labels]) + spread * rng.normal(size=(n, 60))
+    site = rng.integers(2, size=n)
+    levels += 0.7 * site[:, None]
+    references = np.stack([site_reference(levels[site == s]).row for s in (0, 1)])[site]
+    return np.hstack([np.exp(levels), references]), labels
+
+
+@pytest.fixture(scope="module")
+def trained():
+    X, y = windows(np.random.default_rng(1))
+    return X, y, SiteEnsembleClassifier().fit(X, y).model_
+
+
+def mirrored(X):
+    return mirror_features(X, X.shape[1] // 30)
+
+
+def test_mirroring_the_world_exchanges_the_sides(trained):
+    model = trained[2]
+    X, _ = windows(np.random.default_rng(2))
+    np.testing.assert_array_equal(
+        model.predict_proba(mirrored(X))[:, MIRRORED_CLASSES], model.predict_proba(X)
+    )
+    there, back = model.evidence(X[0]), model.evidence(mirrored(X)[0])
+    assert there.hidden == back.hidden[::-1]
+    # Without a reference too: that of the training sites is symmetric.
+    plain = X[:, :60]
+    np.testing.assert_allclose(
+        model.predict_proba(mirrored(plain))[:, MIRRORED_CLASSES], model.predict_proba(plain), atol=1e-9
+    )
+
+
+@given(st.integers(0, 1000), st.floats(-2.0, 2.0))
+def test_a_louder_site_with_its_own_reference_changes_nothing(seed, offset):
+    X, y = windows(np.random.default_rng(3))
+    model = SiteEnsembleClassifier((Recipe("mean", 0.1), Recipe("median", 0.1))).fit(X, y).model_
+    x = X[seed % len(X)].copy()
+    louder = np.concatenate([x[:60] * np.exp(offset), x[60:] + offset])
+    np.testing.assert_allclose(model.predict_proba([louder]), model.predict_proba([x]), rtol=1e-9)
+
+
+def test_the_reference_of_another_site_matters(trained):
+    X, _, model = trained
+    moved = model.at_site(model.home.shifted(np.full(60, 0.5)))
+    assert np.abs(moved.predict_proba(X[:, :60]) - model.predict_proba(X[:, :60])).max() > 0.05
+    behind = np.hstack([X[:, :60], np.tile(moved.home.row, (len(X), 1))])
+    np.testing.assert_allclose(model.predict_proba(behind), moved.predict_proba(X[:, :60]), rtol=1e-12)
+
+
+def test_the_coefficients_are_the_optimum_of_the_penalised_likelihood(trained):
+    X, y, model = trained
+    codes = np.searchsorted(CLASSES, y)
+    both = np.vstack([X, mirrored(X)])
+    codes = np.concatenate([codes, np.array(MIRRORED_CLASSES)[codes]])
+    for recipe, expert in zip(RECIPES, model.experts, strict=True):
+        seen = expert_views([expert.view], log_levels(both[:, :60]), both[:, 60:])[expert.view]
+        standard = (seen - expert.mean) / expert.scale
+
+        def loss(weights, standard=standard, expert=expert, ridge=recipe.ridge):
+            log_p = log_softmax(standard @ weights.T + expert.intercepts, axis=1)
+            return -log_p[np.arange(len(codes)), codes].mean() + ridge / 2 * (weights**2).sum()
+
+        rng, best = np.random.default_rng(0), loss(expert.weights)
+        for _ in range(20):
+            step = rng.normal(size=expert.weights.shape) * 0.01
+            assert loss(expert.weights + step) > best
+
+
+def test_shape_features_mirror_as_they_should():
+    levels = np.random.default_rng(4).normal(size=(50, 60))
+    ours, theirs = shape_features(levels), shape_features(mirror_features(levels))
+    for segment in (0, 13):
+        np.testing.assert_allclose(ours[:, segment + 4], theirs[:, segment + 6])
+        signed = [segment + 7, segment + 8]
+        np.testing.assert_allclose(ours[:, signed], -theirs[:, signed])
+    rest = [c for c in range(31) if c % 13 not in (4, 6, 7, 8) or c >= 26]
+    np.testing.assert_allclose(ours[:, rest], theirs[:, rest], atol=1e-12)
+
+
+def table(labels, environments, recordings, features):
+    n = len(labels)
+    return FeatureTable(
+        features, *(np.array(column) for column in (labels, labels, environments, recordings)), (None,) * n
+    )
+
+
+def test_a_reference_never_holds_the_recording_that_is_scored_nor_another_site_nor_a_label():
+    rng = np.random.default_rng(5)
+    n = 40
+    labels = rng.choice(CLASSES, n).tolist()
+    sites = rng.choice(["SA1", "SB1"], n).tolist()
+    recordings = rng.integers(8, size=n).astype(str).tolist()
+    features = rng.uniform(0.1, 1.0, (n, 60))
+    before = with_site_references(table(labels, sites, recordings, features)).features[:, 60:]
+    relabelled = with_site_references(table(labels[::-1], sites, recordings, features))
+    np.testing.assert_array_equal(relabelled.features[:, 60:], before)
+    for i in range(0, n, 5):
+        louder = features.copy()
+        louder[i] *= 3.0
+        after = with_site_references(table(labels, sites, recordings, louder)).features[:, 60:]
+        same_recording = np.array([(sites[j], recordings[j]) == (sites[i], recordings[i]) for j in range(n)])
+        other_site = np.array([sites[j] != sites[i] for j in range(n)])
+        np.testing.assert_array_equal(after[same_recording | other_site], before[same_recording | other_site])
+        assert (np.abs(after - before).max(axis=1) > 0)[~(same_recording | other_site)].all()
+
+
+def test_a_site_with_one_recording_has_no_reference():
+    with pytest.raises(InvalidArgumentError, match="SA1/0"):
+        with_site_references(table(["none"] * 2, ["SA1"] * 2, ["0", "0"], np.ones((2, 60))))
+
+
+def test_quiet_is_the_mean_of_the_quietest_third():
+    levels = np.arange(20.0)[:, None] + np.zeros((20, 2))
+    reference = site_reference(levels)
+    assert reference.quiet[0] == pytest.approx(levels[:7, 0].mean())
+    assert (reference.mean[0], reference.median[0]) == (9.5, 9.5)
+    np.testing.assert_array_equal(SiteReference.from_row(reference.row).row, reference.row)
+
+
+def test_a_model_reads_back_to_the_bit(trained):
+    X, _, model = trained
+    again = EnsembleModel.from_dict(json.loads(json.dumps(model.to_dict(), allow_nan=False)))
+    np.testing.assert_array_equal(again.predict_proba(X), model.predict_proba(X))
+
+
+def test_nothing_is_drawn(trained):
+    X, y, model = trained
+    assert SiteEnsembleClassifier().fit(X, y).model_.to_dict() == model.to_dict()
+
+
+def test_likelihoods_stay_finite_far_from_all_that_was_seen(trained):
+    for level in (0.0, 1e-30, 1.0, 1e30):
+        assert np.isfinite(trained[2].evidence(np.full(60, level)).log_likelihoods).all()
+
+
+@pytest.mark.parametrize("X", [np.zeros((3, 59)), np.zeros(60), np.full((1, 60), np.nan), np.zeros((1, 180))])
+def test_other_features_are_refused(trained, X):
+    with pytest.raises(InvalidArgumentError, match="X"):
+        trained[2].predict_proba(X)
+
+
+def test_training_needs_references_and_its_classes():
+    X, y = windows(np.random.default_rng(6))
+    with pytest.raises(InvalidArgumentError, match="reference"):
+        SiteEnsembleClassifier().fit(X[:, :61], y)
+    with pytest.raises(InvalidArgumentError, match="classes"):
+        SiteEnsembleClassifier().fit(X, np.where(y == "none", "left", y))
+    assert set(VIEWS) >= {recipe.view for recipe in RECIPES}

@@ -1,0 +1,166 @@
+"""The acoustic adapter: block sizes do not matter, and sound, camera and signature meet at one stamp."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.adapters.acoustic import AcousticAdapter, AcousticSettings
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.measurement.measurement import Approach, Bearing, Measurement
+from worldstate.measurement.protocols import MeasurementAdapter
+
+RATE_HZ = 16_000
+SPEED_OF_SOUND_M_S = 343.0
+ARRAY = MicrophoneArray(
+    np.column_stack([np.zeros(12), np.linspace(0.4, -0.4, 12), np.tile([0.0, 0.1, 0.25], 4)])
+)
+
+
+class Level:
+    """A model that says what it is told, with the feature's mean as the none likelihood."""
+
+    def __init__(self, left: float = 0.0, right: float = 0.0) -> None:
+        self.hidden = (left, right)
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return SignatureEvidence(("left", "right"), self.hidden, 0.0, float(np.mean(feature)))
+
+
+def plane_wave(azimuth_rad: float, seconds: float, gain_per_s: float = 0.0, seed: int = 3) -> np.ndarray:
+    """Broadband sound from far away, shape (n, M), with a little noise of every microphone's own."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * RATE_HZ)
+    direction = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
+    advance_s = ARRAY.positions_m @ direction / SPEED_OF_SOUND_M_S
+    frequencies = np.fft.rfftfreq(n, 1 / RATE_HZ)
+    spectrum = np.fft.rfft(rng.standard_normal(n))
+    turns = np.exp(2j * np.pi * frequencies[:, None] * advance_s)
+    shifted = np.fft.irfft(spectrum[:, None] * turns, n, axis=0)
+    grows = np.exp(gain_per_s * np.arange(n) / RATE_HZ)[:, None]
+    return (0.05 * (shifted * grows + 0.05 * rng.standard_normal((n, 12)))).astype(np.float32)
+
+
+def camera_log(azimuth_rad: float | None) -> DetectionLog:
+    """A car that shakes enough not to be parked, centred on an azimuth, or empty frames."""
+    frames = []
+    columns = [] if azimuth_rad is None else [float(PinholeCamera().column(azimuth_rad))]
+    for i in range(40):
+        boxes = [[c + 8.0 * (i % 3) - 60, 500, c + 8.0 * (i % 3) + 60, 650] for c in columns]
+        labels = ("car",) * len(boxes)
+        frames.append(DetectionFrame(np.array(boxes, float).reshape(-1, 4), np.full(len(boxes), 0.9), labels))
+    return DetectionLog.at_rate(frames, 10.0)
+
+
+def same(one: Measurement, other: Measurement) -> bool:
+    assert isinstance(one.bearing, Bearing)
+    assert isinstance(other.bearing, Bearing)
+    return (
+        one.stamp_ns == other.stamp_ns
+        and np.allclose(one.signature.log_likelihoods, other.signature.log_likelihoods, rtol=1e-5)
+        and math.isclose(one.bearing.azimuth_rad, other.bearing.azimuth_rad, rel_tol=1e-5, abs_tol=1e-6)
+    )
+
+
+def test_is_a_measurement_adapter() -> None:
+    adapter: MeasurementAdapter[np.ndarray] = AcousticAdapter(ARRAY, RATE_HZ, Level())
+    assert adapter.source == "acoustic"
+    assert adapter.measure(np.zeros((0, 12), np.float32)) == []
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=8, deadline=None)
+def test_block_sizes_do_not_matter(seed: int) -> None:
+    sound = plane_wave(0.3, 1.6)
+    cuts = np.sort(np.random.default_rng(seed).integers(0, len(sound), 9))
+    whole = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)
+    adapter = AcousticAdapter(ARRAY, RATE_HZ, Level())
+    pieces = [m for block in np.split(sound, cuts) for m in adapter.measure(block)]
+    assert len(whole) == len(pieces) == 7
+    assert all(same(a, b) for a, b in zip(whole, pieces, strict=True))
+
+
+@pytest.mark.parametrize("start_ns", [0, 1_700_000_000_000_000_000])
+def test_a_measurement_every_hop_after_the_first_second(start_ns: int) -> None:
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Level(), start_ns=start_ns).measure(plane_wave(0.3, 1.3))
+    assert [m.stamp_ns - start_ns for m in measured] == [nanoseconds(t) for t in (1.0, 1.1, 1.2, 1.3)]
+    assert all(m.source == "acoustic" for m in measured)
+
+
+@pytest.mark.parametrize("azimuth_rad", [-0.5, 0.0, 0.5])
+def test_hears_where_the_sound_is_and_asks_there(azimuth_rad: float) -> None:
+    sound = plane_wave(azimuth_rad, 1.5)
+    seen = VisionQuery(PinholeCamera(), camera_log(azimuth_rad))
+    empty = VisionQuery(PinholeCamera(), camera_log(None))
+    elsewhere = VisionQuery(PinholeCamera(), camera_log(-0.5 if azimuth_rad >= 0 else 0.5))
+    for vision, answer in ((seen, Present), (empty, Absent), (elsewhere, Absent)):
+        measured = AcousticAdapter(ARRAY, RATE_HZ, Level(), vision).measure(sound)
+        assert [type(m.co_evidence) for m in measured] == [answer] * 6
+        for m in measured:
+            assert isinstance(m.bearing, Bearing)
+            assert m.bearing.azimuth_rad == pytest.approx(azimuth_rad, abs=0.03)
+            assert len(m.sightings) == (vision is not empty)
+
+
+def test_a_sound_beside_the_view_is_not_asked_about() -> None:
+    vision = VisionQuery(PinholeCamera(), camera_log(None))
+    answers = AcousticAdapter(ARRAY, RATE_HZ, Level(), vision).measure(plane_wave(1.1, 1.2))
+    assert {m.co_evidence for m in answers} == {Unqueried("sector outside the field of view")}
+
+
+def test_a_coarse_bearing_takes_its_side_from_the_signature() -> None:
+    vision = VisionQuery(PinholeCamera(), camera_log(0.4))
+    coarse = AcousticSettings(coarse_std_rad=0.0)
+    sound = plane_wave(-0.3, 1.0)
+    for model, answer in ((Level(left=1.0), Present), (Level(right=1.0), Absent), (Level(), Present)):
+        (measured,) = AcousticAdapter(ARRAY, RATE_HZ, model, vision, settings=coarse).measure(sound)
+        assert isinstance(measured.co_evidence, answer)
+
+
+def test_without_prominence_there_is_no_bearing() -> None:
+    strict = AcousticSettings(min_prominence=1e6)
+    (measured,) = AcousticAdapter(ARRAY, RATE_HZ, Level(), settings=strict).measure(plane_wave(0.3, 1.0))
+    assert isinstance(measured.bearing, NotUsable)
+    assert "1000000.00" in measured.bearing.reason
+
+
+def test_silence_has_neither_bearing_nor_approach() -> None:
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(np.zeros((20_000, 12), np.float32))
+    assert measured
+    assert all(isinstance(m.bearing, NotUsable) and isinstance(m.approach, NotUsable) for m in measured)
+
+
+def test_growing_sound_approaches() -> None:
+    for gain_per_s in (0.8, -0.8):
+        measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(plane_wave(0.2, 2.0, gain_per_s))
+        rates = [m.approach.inverse_tta_hz for m in measured if isinstance(m.approach, Approach)]
+        assert len(rates) > 5
+        assert all(np.sign(rate) == np.sign(gain_per_s) for rate in rates)
+
+
+def test_keeps_the_last_frame_for_plots() -> None:
+    adapter = AcousticAdapter(ARRAY, RATE_HZ, Level())
+    assert adapter.last_frame is None
+    measured = adapter.measure(plane_wave(0.3, 1.2))
+    assert adapter.last_frame is not None
+    assert adapter.last_frame.stamp_ns == measured[-1].stamp_ns
+
+
+def test_refuses_what_does_not_fit() -> None:
+    adapter = AcousticAdapter(ARRAY, RATE_HZ, Level())
+    with pytest.raises(InvalidArgumentError, match=r"\(any, 12\)"):
+        adapter.measure(np.zeros((100, 11), np.float32))
+    with pytest.raises(InvalidArgumentError, match="finite"):
+        adapter.measure(np.full((100, 12), np.nan, np.float32))
+    with pytest.raises(InvalidArgumentError, match="min_prominence"):
+        AcousticSettings(min_prominence=0.5)

@@ -1,0 +1,152 @@
+"""Labelled recordings to feature windows: the command, where sound is looked for, damage by line."""
+
+import argparse
+import csv
+import json
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.datasets.feature_table import read_features
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.cli.users import extract_features
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import published_feature
+from worldstate.ground.errors import InputFileError
+
+RATE = 16_000
+ARRAY = MicrophoneArray([[0.0, 0.3, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
+HEADER = ["ID", "Class", "Environment", "Recording ID", "File", "End", "T0"]
+ROWS = [
+    ["1_00_0001", "left", "SA1", "34", "street/a.wav", "1.5", "70"],
+    ["0_00_0001", "front", "SA1", "34", "street/a.wav", "", "70"],
+    ["2_00_0007", "none", "SA1", "7", "", "", ""],
+    ["3_00_0009", "right", "SB1", "9", "", "1.0", ""],
+]
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    rng = np.random.default_rng(0)
+    root = tmp_path / "data"
+    for name, seconds in (
+        ("street/a.wav", 2.0),
+        ("SA1/none/2_00_0007/out_multi.wav", 1.0),
+        ("3_00_0009.wav", 1.2),
+    ):
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sound = 0.1 * rng.standard_normal((round(seconds * RATE), 3))
+        soundfile.write(path, sound, RATE, subtype="PCM_16")
+    write_array_xml(tmp_path / "mics.xml", ARRAY)
+    return root
+
+
+def write_labels(path, rows, header=HEADER):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return path
+
+
+def command(dataset, labels, out):
+    parser = argparse.ArgumentParser()
+    extract_features.add_parser(parser.add_subparsers(required=True))
+    listed = [] if labels is None else ["--labels", labels]
+    words = [dataset, *listed, "--array", dataset.parent / "mics.xml", "--out", out, "--json"]
+    arguments = parser.parse_args(["extract-features", *map(str, words)])
+    return arguments.run(arguments)
+
+
+def test_each_window_is_the_second_before_its_end(dataset, tmp_path, capsys):
+    out = tmp_path / "features.csv"
+    assert command(dataset, write_labels(tmp_path / "l.csv", ROWS), out) == 0
+    assert json.loads(capsys.readouterr().out)["n_windows"] == 4
+    table = read_features(out)
+    assert table.labels.tolist() == ["left", "front", "none", "right"]
+    assert table.t0_frames == (70, 70, None, None)
+    assert table.recordings.tolist() == ["34", "34", "7", "9"]
+    street, _ = soundfile.read(dataset / "street" / "a.wav", dtype="float32")
+    other, _ = soundfile.read(dataset / "3_00_0009.wav", dtype="float32")
+    for row, sound in ((0, street[8000:24_000]), (1, street[16_000:]), (3, other[:RATE])):
+        np.testing.assert_array_equal(table.features[row], published_feature(sound, ARRAY, RATE))
+
+
+def test_only_the_labels_are_needed(dataset, tmp_path):
+    labels = write_labels(tmp_path / "l.csv", [row[:4] for row in ROWS[2:]], HEADER[:4])
+    command(dataset, labels, tmp_path / "f.csv")
+    assert len(read_features(tmp_path / "f.csv")) == 2
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "problem"),
+    [
+        ("Class", "up", "line 3: expected a class"),
+        ("Environment", "", "line 3: expected a value of Environment"),
+        ("End", "soon", "line 3"),
+        ("End", "nan", "line 3: expected End"),
+        ("End", "0.5", "expected a second of sound before 0.5 s"),
+        ("End", "9", "expected a second of sound before 9 s"),
+        ("T0", "x", "line 3"),
+        ("File", "../secret.wav", "line 3: expected a file inside"),
+        ("File", "/etc/hosts", "line 3: expected a file inside"),
+        ("File", "nowhere.wav", "line 3: expected a file nowhere.wav"),
+    ],
+)
+def test_what_is_wrong_is_named(dataset, tmp_path, column, value, problem):
+    rows = [list(row) for row in ROWS]
+    rows[1][HEADER.index(column)] = value
+    with pytest.raises(InputFileError, match=problem):
+        command(dataset, write_labels(tmp_path / "l.csv", rows), tmp_path / "f.csv")
+    assert not (tmp_path / "f.csv").exists()
+
+
+def test_another_array_is_refused(dataset, tmp_path):
+    write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]))
+    with pytest.raises(InputFileError, match="channels"):
+        command(dataset, write_labels(tmp_path / "l.csv", ROWS), tmp_path / "f.csv")
+
+
+LOG = """ID,Environment,Class,T0
+1_00_0001,SA1,left,12
+2_00_0002,SA1,none,20
+3_06_0003,DA2,right,13
+1_02_0004,SB1,left,21
+"""
+
+
+def test_without_labels_windows_lie_where_the_released_program_cuts_them(tmp_path, capsys):
+    root, rng = tmp_path / "ovad", np.random.default_rng(1)
+    sounds = {}
+    for row in csv.DictReader(LOG.splitlines()):
+        path = root / row["Environment"] / row["Class"] / row["ID"] / "out_multi.wav"
+        path.parent.mkdir(parents=True)
+        soundfile.write(path, 0.1 * rng.standard_normal((round(3.5 * RATE), 3)), RATE, subtype="PCM_16")
+        sounds[row["ID"]] = soundfile.read(path, dtype="float32")[0]
+    (root / "DataLog.csv").write_text(LOG)
+    write_array_xml(tmp_path / "mics.xml", ARRAY)
+    assert command(root, None, tmp_path / "f.csv") == 0
+    assert json.loads(capsys.readouterr().out)["n_left_out"] == 1  # the last one's front, which ends at 3.6 s
+    table = read_features(tmp_path / "f.csv")
+    found = dict(zip(table.ids, zip(table.labels, table.features, strict=True), strict=True))
+    expected = {
+        "1_00_0001": ("left", "1_00_0001", 1.2), "0_00_0000": ("front", "1_00_0001", 2.7),
+        "2_00_0002": ("none", "2_00_0002", 2.0), "3_06_0003": ("right", "3_06_0003", 1.8),
+        "0_06_0001": ("front", "3_06_0003", 3.3), "1_02_0004": ("left", "1_02_0004", 2.1),
+    }  # fmt: skip
+    assert found.keys() == expected.keys()
+    for name, (label, recording, end_s) in expected.items():
+        cut = sounds[recording][round((end_s - 1.0) * RATE) : round(end_s * RATE)]
+        assert found[name][0] == label
+        np.testing.assert_allclose(found[name][1], published_feature(cut, ARRAY, RATE), rtol=1e-5)
+    assert table.recordings.tolist() == ["0", "0", "1", "2", "2", "3"]
+
+
+def test_a_data_set_of_recordings_too_short_is_refused(tmp_path):
+    path = tmp_path / "SA1" / "left" / "1_00_0001" / "out_multi.wav"
+    path.parent.mkdir(parents=True)
+    soundfile.write(path, 0.1 * np.random.default_rng(0).standard_normal((round(1.2 * RATE), 3)), RATE)
+    (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n1_00_0001,SA1,left,4\n")
+    write_array_xml(tmp_path.parent / "mics.xml", ARRAY)
+    with pytest.raises(InputFileError, match=r"DataLog\.csv.*2 are cut off"):
+        command(tmp_path, None, tmp_path / "f.csv")

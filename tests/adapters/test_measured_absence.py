@@ -1,0 +1,319 @@
+"""Absence measured: staged degradation, the camera's own health, miss rates on disk, the command."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+from street_frames import HEIGHT, WIDTH, reference, street
+
+from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.adapters.camera.camera_health import (
+    CameraHealth,
+    DegradationLog,
+    HealthMonitor,
+    degradation_log,
+    learn_health,
+)
+from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, STRENGTHS, degrade, level_of, strength
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.image_quality import ImageQuality, image_quality
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
+from worldstate.adapters.camera.motion_detector import MotionDetector
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.video import open_video
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+from worldstate.ground.values import nanoseconds
+from worldstate.measurement.measurement import Bearing
+from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, Scene, measure_absence
+
+GREY = next(street(1))
+
+
+def write_video(path, frames):
+    import cv2
+
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def write_reference(path, log):
+    rows = [
+        {"boxes": f.boxes_px.tolist(), "scores": f.scores.tolist(), "classes_str": list(f.labels)}
+        for f in log.frames
+    ]
+    path.write_text(json.dumps({"detections_per_frame": rows}))
+    return path
+
+
+@given(st.sampled_from(sorted(STRENGTHS)), st.floats(0.0, 1.0))
+def test_level_and_strength_are_each_others_inverse(family, d):
+    assert level_of(family, strength(family, d)) == pytest.approx(d, abs=1e-9)
+
+
+@pytest.mark.parametrize(("d", "sigma_px"), [(0.25, 2.0), (0.5, 4.0), (0.75, 8.0), (1.0, 16.0)])
+def test_blur_is_that_of_its_definition(d, sigma_px):
+    blurred = degrade(GREY, "blur", d, np.random.default_rng(0)).astype(float)
+    expected = np.stack(
+        [gaussian_filter(GREY[:, :, i].astype(float), sigma_px, mode="mirror") for i in range(3)], -1
+    )
+    # OpenCV rounds twice, once a direction.
+    assert np.abs(blurred - expected).max() <= 2.5
+    assert np.abs(blurred - expected).mean() <= 0.5
+
+
+@given(st.floats(0.0, 1.0))
+@settings(deadline=None, max_examples=25)
+@example(2.9e-173)
+@example(5e-324)
+@example(0.01)
+def test_any_strength_of_any_family_gives_an_image(d):
+    for family in FAMILIES:
+        assert degrade(GREY[:64, :96], family, d, np.random.default_rng(0)).shape == (64, 96, 3)
+
+
+def test_the_stages_are_those_of_their_definition():
+    rng = np.random.default_rng(0)
+    assert np.array_equal(degrade(GREY, "darkness", 1.0, rng), np.round(GREY * 0.06).astype(np.uint8))
+    noise = degrade(np.full((200, 200, 3), 128, dtype=np.uint8), "noise", 0.5, rng) - 128.0
+    assert noise.std() == pytest.approx(25.0, rel=0.02)
+    assert abs(noise.mean()) < 0.3
+    assert degrade(GREY, "all", 0.0, rng) is GREY
+
+
+def test_the_same_seed_degrades_alike_and_damaged_frames_are_refused():
+    one, two = (degrade(GREY, "all", 0.75, np.random.default_rng(5)) for _ in range(2))
+    assert np.array_equal(one, two)
+    for frame, family, d in ((GREY / 2, "blur", 0.5), (GREY, "fog", 0.5), (GREY, "blur", 1.5)):
+        with pytest.raises(InvalidArgumentError):
+            degrade(frame, family, d, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def health():
+    return learn_health(
+        [frame for i, frame in enumerate(street(12, seed=3)) if i % 5 == 0], np.random.default_rng(0)
+    )
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.sampled_from(["blur", "darkness", "noise"]), st.floats(0.0, 1.0), st.integers(0, 3))
+def test_d_is_read_from_another_image_of_the_same_camera(health, family, d, seed):
+    """The scale was learned in one street; blur is read from texture and so the least certain in another."""
+    frame = next(street(1, seed=3 if family == "blur" else seed))
+    seen = health.estimate(image_quality(degrade(frame, family, d, np.random.default_rng(seed))))
+    assert seen.by_family[family] == pytest.approx(d, abs=0.1)
+    others = [level for name, level in seen.by_family.items() if name != family]
+    assert max(others) <= 0.3
+
+
+def test_health_grows_with_every_family_and_never_falls(health):
+    for family in STRENGTHS:
+        seen = [
+            health.estimate(image_quality(degrade(GREY, family, d, np.random.default_rng(0)))).by_family[
+                family
+            ]
+            for d in LEVELS
+        ]
+        assert (np.diff(seen) > 0.1).all()
+
+
+def test_the_reference_follows_the_evening_but_not_a_lens_that_soils_for_ever(health):
+    monitor, clean = HealthMonitor(health, follow_s=60.0), image_quality(GREY)
+    dusk = [
+        monitor.update(
+            i * 10**9, ImageQuality(clean.brightness * (1 - 0.25 * i / 600), clean.noise, clean.sharpness)
+        )
+        for i in range(600)
+    ]
+    assert max(seen.darkness for seen in dusk) < 0.15
+    assert image_quality(GREY).brightness * 0.75 == pytest.approx(monitor.reference.brightness, rel=0.1)
+    soiling = [
+        monitor.update(
+            (600 + i) * 10**9, ImageQuality(clean.brightness, clean.noise, clean.sharpness * 0.5 ** (i / 600))
+        )
+        for i in range(1800)
+    ]
+    assert soiling[-1].blur > 0.25
+    assert monitor.reference.sharpness[0] >= health.sharpness[0] / 1.5 - 1e-9
+
+
+def synthetic_rates(beta=((0, 10, 30, 60, 99), (5, 20, 50, 80, 100)), clutter=(0, 1, 5, 20, 60)):
+    counts = FamilyCounts(((100,) * 5,) * 2, beta, (100,) * 5, clutter)
+    hardly = FamilyCounts(((100,) * 5,) * 2, ((0, 1, 2, 3, 10),) * 2, (100,) * 5, (0,) * 5)
+    return MissRates((0.0, 15.0, 37.0), {"noise": counts, "blur": hardly}, {"detector": "x"})
+
+
+def test_a_blur_that_the_detector_hardly_minds_is_no_strong_degradation(health):
+    rates = synthetic_rates()
+    blurred = health.estimate(image_quality(degrade(GREY, "blur", 1.0, np.random.default_rng(0))))
+    noisy = health.estimate(image_quality(degrade(GREY, "noise", 1.0, np.random.default_rng(0))))
+    assert blurred.worst > 0.9
+    assert rates.level(blurred) < 0.3
+    assert rates.level(noisy) > 0.9
+    for seen in (blurred, noisy):
+        expected = max(rates.tables.get(name, rates.table)(0.0, d) for name, d in seen.by_family.items())
+        assert rates.table(0.0, rates.level(seen)) == pytest.approx(expected, abs=0.01)
+
+
+counts = st.lists(st.integers(0, 40), min_size=5, max_size=5)
+
+
+@given(counts, counts, st.floats(1.0, 5.0))
+def test_rates_from_any_counts_are_monotone_probabilities_and_survive_the_disk(first, second, repeats):
+    looks = ((40,) * 5,) * 2
+    family = FamilyCounts(looks, (tuple(first), tuple(second)), (40,) * 5, tuple(first))
+    rates = MissRates((0.0, 10.0, 37.0), {"all": family}, {"a": "b"}, repeats=repeats)
+    beta = family.miss_rates(repeats)
+    assert (np.diff(beta, axis=0) >= 0).all()
+    assert (np.diff(beta, axis=1) >= 0).all()
+    assert 0.0 < beta.min() <= beta.max() < 1.0
+    again = MissRates.from_dict(json.loads(json.dumps(rates.to_dict())))
+    assert again.table == rates.table
+    assert again.to_dict() == rates.to_dict()
+
+
+def test_damaged_files_are_typed_errors(tmp_path):
+    path = tmp_path / "beta.json"
+    save_miss_rates(path, synthetic_rates())
+    whole = path.read_text()
+    good = json.loads(whole)
+    for i in range(0, len(whole) - 2, 97):
+        path.write_text(whole[:i])
+        with pytest.raises(InputFileError, match=r"beta\.json"):
+            load_miss_rates(path)
+    looks = good["families"]["noise"]["looks"]
+    for key, value in {
+        "azimuth_deg": [0.0], "repeats": 0, "families": {}, "health": [], "provenance": {"a": 1},
+    }.items():  # fmt: skip
+        path.write_text(json.dumps(good | {key: value}))
+        with pytest.raises(InputFileError, match=r"beta\.json"):
+            load_miss_rates(path)
+    for wrong in (looks[:1], [["1"] * 5] * 2, [[1e999] * 5] * 2):
+        family = good["families"]["noise"] | {"looks": wrong}
+        path.write_text(json.dumps(good | {"families": {"noise": family}}))
+        with pytest.raises(InputFileError, match=r"beta\.json"):
+            load_miss_rates(path)
+    path.write_text(json.dumps(good | {"schema": {"name": "worldstate.MissRates", "version": "2.0.0"}}))
+    with pytest.raises(SchemaVersionError):
+        load_miss_rates(path)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(InputFileError, match="UTF-8"):
+        load_miss_rates(path)
+
+
+def test_vision_follows_the_camera_without_being_told(health):
+    """The same empty log before and after the lens fails: only the images say so, and beta follows."""
+    rates = synthetic_rates()
+    stamped = []
+    for i, frame in enumerate(street(20, seed=3, car=False)):
+        stamped.append(
+            (nanoseconds(i / 10), degrade(frame, "noise", float(i >= 10), np.random.default_rng(i)))
+        )
+    d = degradation_log(stamped, health, rates.level)
+    empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    box = DetectionFrame(np.array([[300.0, 100.0, 340.0, 300.0]]), np.array([0.9]), ("car",))
+    camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+    answers = []
+    for shown in (empty, box):
+        log = DetectionLog.at_rate([shown] * 20, 10.0)
+        query = VisionQuery(camera, log, rates.table, d, clutter=rates.clutter_rate)
+        answers += [query.ask(nanoseconds(t), Bearing(0.0, 0.05)) for t in (0.5, 1.5)]
+    before, after, found, doubtful = answers
+    assert isinstance(before, Absent)
+    assert before.miss_rate < 0.1 < 0.9 < after.miss_rate
+    assert isinstance(found, Present)
+    assert found.clutter_rate == pytest.approx(rates.clutter_rate(0.0), rel=0.2)
+    assert doubtful.clutter_rate == pytest.approx(rates.clutter_rate(1.0), rel=0.1)
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.001, 0.999))
+def test_present_and_absent_share_one_model_of_miss_and_clutter(beta, clutter):
+    """Whatever holds, the channel answers one or the other: their likelihoods sum to one."""
+    total = np.exp(Present(beta, clutter).log_likelihoods()) + np.exp(Absent(beta, clutter).log_likelihoods())
+    assert total == pytest.approx([1.0, 1.0, 1.0])
+    rng = np.random.default_rng(0)
+    found = (rng.random(4000) >= beta) | (rng.random(4000) < clutter)
+    assert np.exp(Present(beta, clutter).log_likelihoods())[1] == pytest.approx(found.mean(), abs=0.04)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("video")
+    video = open_video(write_video(folder / "street.mp4", street(26, speed_px=16.0)))
+    camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+    return Scene(video, reference(26, 16.0), camera)
+
+
+def test_beta_rises_from_a_tenth_to_nine_tenths(scene):
+    settings_ = AbsenceSettings(families=("noise",), repeats=1.0)
+    rates = measure_absence([scene], MotionDetector, np.random.default_rng(0), settings_)
+    assert rates.table(0.0, 0.0) <= 0.10
+    assert rates.table(0.0, 1.0) >= 0.90
+    assert rates.health is not None
+    looks = np.array(rates.families["noise"].looks)
+    there = sum(len(frame) for frame in scene.reference.frames[10:])
+    assert (looks.sum(axis=0) == there).all()
+    assert np.array(rates.families["noise"].sectors).min() > 0
+
+
+def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_clutter(scene):
+    class Blind:
+        def detect(self, frame):
+            return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+
+    class Raving:
+        def detect(self, frame):
+            everywhere = np.array([[x, 0.0, x + 40.0, 60.0] for x in range(0, WIDTH - 40, 40)])
+            return DetectionFrame(everywhere, np.ones(len(everywhere)), ("car",) * len(everywhere))
+
+    chosen = AbsenceSettings(families=("darkness",), warm_up=20)
+    for make, clutter in ((Blind, 0.0), (Raving, 1.0)):
+        rates = measure_absence([scene], make, np.random.default_rng(0), chosen)
+        family = rates.families["darkness"]
+        assert np.array_equal(family.looks, family.misses)
+        assert np.array(family.clutter) == pytest.approx(clutter * np.array(family.sectors))
+
+
+def test_the_command_writes_table_and_figure(tmp_path, capsys):
+    out, figure = tmp_path / "beta.json", tmp_path / "beta.png"
+    video = write_video(tmp_path / "street.mp4", street(14, speed_px=16.0))
+    boxes = write_reference(tmp_path / "boxes.json", reference(14, 16.0))
+    arguments = ["measure-absence", str(video), "--reference", str(boxes), "--out", str(out)]
+    assert main([*arguments, "--figure", str(figure), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    rates = load_miss_rates(out)
+    assert set(rates.families) == set(FAMILIES)
+    assert summary["beta_harshest_boresight"] == pytest.approx(rates.table(0.0, 1.0))
+    assert rates.provenance["detector"] == "motion"
+    assert figure.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_bad_input_of_the_command_is_one_line(tmp_path, capsys):
+    text = tmp_path / "text.mp4"
+    text.write_text("no video")
+    for path in (tmp_path / "missing.mp4", text, tmp_path):
+        assert main(["measure-absence", str(path), "--out", str(tmp_path / "beta.json")]) == 2
+        captured = capsys.readouterr()
+        assert str(path.name) in captured.err
+    assert main(["measure-absence", str(text), "--detector", "onnx", "--out", str(tmp_path / "b.json")]) == 2
+    assert "--onnx-model" in capsys.readouterr().err
+    assert not (tmp_path / "beta.json").exists()
+
+
+def test_health_and_degradation_refuse_what_they_cannot_be():
+    with pytest.raises(InvalidArgumentError, match="image"):
+        learn_health([], np.random.default_rng(0))
+    with pytest.raises(InvalidArgumentError):
+        CameraHealth(100.0, (1.0, 2.0, 1.0, 1.0, 1.0), (0.0,) * 5)
+    with pytest.raises(InvalidArgumentError):
+        DegradationLog(np.array([0, 0]), np.array([0.0, 0.0]))
+    with pytest.raises(InvalidArgumentError):
+        image_quality(np.zeros((4, 4), dtype=np.uint8))

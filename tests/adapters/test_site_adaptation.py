@@ -1,0 +1,185 @@
+"""The site learned by the running chain: switched, checkpointed, harmless on mostly empty streets."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.posterior import statistic
+from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
+from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
+from worldstate.abduction.signature.site_reference import site_reference
+from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
+from worldstate.adapters.listen import listen_steps, measure_steps, open_source
+from worldstate.cli.main import main
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+
+CLASSES = ("front", "left", "none", "right")
+AZIMUTH = np.tile(np.linspace(-1, 1, 30), 2)
+SHAPES = {"front": 1 + AZIMUTH**2, "none": 0 * AZIMUTH, "left": 0.7 - AZIMUTH, "right": 0.7 + AZIMUTH}
+
+
+def windows(rng, labels, site=0.0, spread=0.7):
+    """Log-levels at a site whose street adds `site`; the louder of street and vehicle is heard."""
+    vehicle = np.stack([SHAPES[label] for label in labels])
+    return np.logaddexp(site, vehicle) + spread * rng.normal(size=vehicle.shape)
+
+
+def made_up_sites(rng, n_sites=6, n=80):
+    X, y = [], []
+    for _ in range(n_sites):
+        labels = rng.permutation(np.repeat(CLASSES, n // 4))
+        levels = windows(rng, labels, street(rng))
+        X.append(np.hstack([np.exp(levels), np.tile(site_reference(levels).row, (n, 1))]))
+        y.append(labels)
+    return np.vstack(X), np.concatenate(y)
+
+
+def street(rng):
+    bumps = np.tile(np.interp(np.arange(30), [0, 10, 20, 29], rng.normal(0.0, 0.4, 4)), 2)
+    return bumps + rng.normal(0.0, 0.3)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return SiteEnsembleClassifier().fit(*made_up_sites(np.random.default_rng(0))).model_
+
+
+@pytest.fixture(scope="module")
+def heard(approach, model):
+    """Frames and source of one approach, its site learned while listening."""
+    source = replace(open_source(approach.folder, array=approach.array_path), model=model)
+    return source, [frame for frame, _ in measure_steps(source)]
+
+
+def test_the_switch(approach, model):
+    on, off = (open_source(approach.folder, site_adaptation=flag) for flag in (True, False))
+    assert isinstance(replace(on, model=model).signature(), SiteSignature)
+    assert replace(off, model=model).signature() is model
+    published = object()
+    assert replace(on, model=published).signature() is published
+
+
+def test_every_pass_over_a_source_learns_anew(heard):
+    source, frames = heard
+    first, second = source.signature(), source.signature()
+    first.evidence(frames[0].feature)
+    assert second.estimate.heard_s == 0.0
+
+
+def test_the_forgetting_time_is_handed_on(approach):
+    assert open_source(approach.folder, forgetting_s=7.0).site_settings == SiteEstimateSettings(7.0)
+    with pytest.raises(InvalidArgumentError, match="forgetting_s"):
+        open_source(approach.folder, forgetting_s=0.0)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 45])
+def test_a_checkpoint_of_the_chain_continues_bit_for_bit(heard, cut, tmp_path):
+    source, frames = heard
+    whole = [step.state for step in listen_steps(source)]
+
+    def chain(world, site, part):
+        signature = SiteSignature(source.model, source.site_settings, estimate=site)
+        adapter = AcousticAdapter(source.array, 48_000.0, signature)
+        states = []
+        for frame in part:
+            measurement = adapter.interpret(frame)
+            world = world.predict_to(measurement.stamp_ns).update(measurement)
+            states.append(world.state)
+        return Checkpoint(world, signature.estimate), states
+
+    start = Checkpoint(WorldFilter(context=source.context, policy=source.policy))
+    _, expected = chain(start.world, None, frames)
+    before, _ = chain(start.world, None, frames[:cut])
+    save_checkpoint(tmp_path / "c.json", before)
+    again = read_checkpoint(tmp_path / "c.json")
+    _, got = chain(again.world, again.site, frames[cut:])
+    assert [state.to_json() for state in got] == [state.to_json() for state in expected[cut:]]
+    assert len(whole) == len(expected)
+
+
+def test_a_site_known_beforehand_is_taken_up(heard):
+    source, window = heard[0], np.exp(heard[0].model.empty)
+    louder = SiteEstimate(source.model.empty + AZIMUTH, heard_s=300.0)
+    assert replace(source, site=louder).signature().evidence(window) != source.signature().evidence(window)
+    with pytest.raises(InvalidArgumentError, match="estimate"):
+        replace(source, site=SiteEstimate.start(59)).signature()
+
+
+def test_a_filter_s_own_checkpoint_reads_as_one_without_a_site():
+    assert Checkpoint.from_dict(WorldFilter().to_dict()).site is None
+
+
+def test_another_major_version_is_named_with_its_file(tmp_path):
+    schema = {"name": "worldstate.Filter", "version": "9.0.0"}
+    value = Checkpoint(WorldFilter()).to_dict() | {"schema": schema}
+    (tmp_path / "c.json").write_text(json.dumps(value))
+    with pytest.raises(SchemaVersionError, match=r"c\.json"):
+        read_checkpoint(tmp_path / "c.json")
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_damaged_checkpoints_are_refused_by_name(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("fuzz") / "c.json"
+    value = Checkpoint(WorldFilter(), SiteEstimate.start(4)).to_dict()
+    at = value["site"]
+    wrong = st.sampled_from([True, "text", [], {}, [None], -1.5, 10**400, "1.0", ["1.0"]])
+    kind = data.draw(st.sampled_from(["level", "heard_s", "site", "truncated", "bytes", "missing"]))
+    if kind == "site":
+        value["site"] = data.draw(wrong)
+    elif kind in at:
+        at[kind] = data.draw(wrong)
+    text = json.dumps(value).encode()
+    if kind == "truncated":
+        text = text[: data.draw(st.integers(0, len(text) - 2))]
+    path.write_bytes(b"\xff\xfe" if kind == "bytes" else text)
+    if kind == "missing":
+        path.unlink()
+    if kind == "level" and at["level"] == []:
+        return  # No feature at all: an estimate that no model takes.
+    with pytest.raises(InputFileError, match=r"c\.json"):
+        read_checkpoint(path)
+
+
+def decided(model, gamma, stream):
+    """Decisions on a stream, site learned and not; the first is asked as the chain asks it."""
+    signature = SiteSignature(model, hop_s=1.0)
+    pairs = [(signature.evidence(window), model.evidence(window)) for window in stream]
+    answer, prior = Absent(0.0), model.reference_prior
+    return np.array([[statistic(one, answer, prior) >= gamma for one in pair] for pair in pairs])
+
+
+def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model):
+    rng = np.random.default_rng(100)
+    X, y = made_up_sites(rng)
+    calm = hazard_statistic(model.predict_proba(X), 0.0)[y == "none"]
+    gamma = neyman_pearson_threshold(list(calm[:, None]), 0.02)
+    decisions, hazards = [], []
+    for site in [np.zeros(60), *(street(rng) for _ in range(4))]:
+        labels = np.where(rng.random(300) < 0.95, "none", "left")
+        decisions.append(decided(model, gamma, np.exp(windows(rng, labels, site))))
+        hazards.append(labels == "left")
+    on, off = np.concatenate(decisions).T
+    hazard = np.concatenate(hazards)
+    assert hazard.sum() > 50
+    assert on[hazard].mean() >= off[hazard].mean() - 0.05
+    assert on[~hazard].mean() <= off[~hazard].mean() + 0.01
+
+
+def test_run_has_the_switch(approach, capsys):
+    peaks = []
+    for option in (["--site-adaptation"], ["--no-site-adaptation"], ["--forgetting", "5"]):
+        assert main(["run", str(approach.folder), *option, "--json"]) == 0
+        peaks.append(json.loads(capsys.readouterr().out)["peak_risk"])
+    assert all(0.0 <= peak <= 1.0 for peak in peaks)
+    assert main(["run", str(approach.folder), "--forgetting", "-1"]) == 2

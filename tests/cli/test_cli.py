@@ -1,0 +1,89 @@
+"""The command line as a user meets it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.cli.main import COMMANDS, build_parser, main
+
+
+def help_of(command: str, capsys) -> str:
+    with pytest.raises(SystemExit) as stop:
+        build_parser().parse_args([command, "--help"])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself_with_an_example(name, capsys):
+    command = name.rpartition(".")[2].replace("_", "-")
+    text = help_of(command, capsys)
+    assert "example" in text
+    assert f"worldstate {command}" in text
+    assert "--json" in text
+
+
+def one_line_of(capsys) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1, captured.err
+    return lines[0]
+
+
+def test_missing_sound_file_is_one_line_and_exit_2(tmp_path, capsys):
+    missing = tmp_path / "nothing.wav"
+    assert main(["run", str(missing), "--out", str(tmp_path / "states.jsonl")]) == 2
+    assert "nothing.wav" in one_line_of(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_few_channels_names_both_counts(tmp_path, capsys):
+    sound = tmp_path / "mono.wav"
+    soundfile.write(sound, np.random.default_rng(0).normal(0, 0.1, (48000, 2)), 48000)
+    assert main(["run", str(sound), "--out", str(tmp_path / "states.jsonl")]) == 2
+    line = one_line_of(capsys)
+    assert "mono.wav" in line
+    assert "56" in line
+    assert "2" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["mono.wav"]
+
+
+def test_unknown_budget_names_the_ones_there_are(tmp_path, capsys):
+    sound = tmp_path / "sound.wav"
+    sound.write_bytes(b"")
+    assert main(["run", str(sound), "--alpha", "0.33"]) == 2
+    assert "0.02" in one_line_of(capsys)
+
+
+def test_console_command_is_installed():
+    command = Path(sys.executable).parent / "worldstate"
+    done = subprocess.run([command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("worldstate ")
+
+
+@pytest.mark.xdist_group("approach")
+def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
+    states = tmp_path / "states.jsonl"
+    outputs = ["--out", str(states), "--figure", str(tmp_path / "t.png"), "--json"]
+    assert main(["run", str(approach.folder), *outputs]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    snapshots = [json.loads(line) for line in states.read_text().splitlines()]
+    assert len(snapshots) == summary["hops"]
+    stamps = [snapshot["stamp_ns"] for snapshot in snapshots]
+    assert np.allclose(np.diff(stamps), 1e8, atol=3e4)
+    assert (tmp_path / "t.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.xdist_group("approach")
+def test_own_array_and_sound_give_the_same_as_the_folder(approach, tmp_path, capsys):
+    by_folder, by_parts = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    assert main(["run", str(approach.folder), "--out", str(by_folder)]) == 0
+    parts = ["--array", str(approach.array_path), "--detections", str(approach.detections_path)]
+    assert main(["run", str(approach.audio_path), *parts, "--out", str(by_parts)]) == 0
+    assert by_folder.read_text() == by_parts.read_text()

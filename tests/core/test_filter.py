@@ -1,0 +1,651 @@
+"""The filter end to end on scripted measurements: births, hand-over, two vehicles, blindness, laws."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Approach, Bearing, Context, FilterSettings, Measurement, Sighting, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.posterior import statistic
+from worldstate.belief.acoustic_update import hear
+from worldstate.belief.existence import after_empty_look, after_sighting
+from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
+from worldstate.ground.values import NotUsable
+from worldstate.state import Priors, Rates
+
+QUIET = (0.1, 0.1, 0.1, 0.7)
+LEFT = (0.80, 0.06, 0.06, 0.08)
+RIGHT = (0.06, 0.80, 0.06, 0.08)
+FRONT = (0.1, 0.1, 0.75, 0.05)
+SILENT = NotUsable("not scripted")
+POLICY = CueingPolicy(0.85, 3, 0.02, (0.25,) * 4, IsotonicMap((0.0, 0.5, 1.0), (0.0, 0.3, 0.95)))
+
+
+def signature(left, right, front, none):
+    logs = np.log(np.array([left, right, front, none]) / 0.25).tolist()
+    return SignatureEvidence(("left", "right"), (logs[0], logs[1]), logs[2], logs[3])
+
+
+def measured(time_s, classes, *sightings, answer=None, bearing=SILENT, approach=SILENT):
+    moving = any(sighting.moving for sighting in sightings)
+    answer = answer or (Present(0.04) if moving else Absent(0.04))
+    return Measurement(round(time_s * 1e9), signature(*classes), answer, bearing, approach, sightings)
+
+
+def car(azimuth_rad, label="car", moving=True):
+    return Sighting(azimuth_rad, 0.02, label, 0.9, 0.05, moving)
+
+
+def run(world, measurements):
+    states = []
+    for measurement in measurements:
+        world = world.update(measurement)
+        states.append(world.state)
+    return world, states
+
+
+def start(**options):
+    return WorldFilter(policy=POLICY, **options)
+
+
+def hops(first_s, last_s):
+    return np.round(np.arange(first_s, last_s - 1e-9, 0.1), 3).tolist()
+
+
+def approach_from_left(t0_s=5.0):
+    """Quiet, heard hidden on the left for three seconds, seen for two while it crosses, gone."""
+    for t in hops(1.0, 2.0):
+        yield measured(t, QUIET)
+    for t in hops(2.0, t0_s):
+        yield measured(t, LEFT, bearing=Bearing(0.6, 0.06, 1.3), approach=Approach(0.4, 0.25))
+    for t in hops(t0_s, t0_s + 2.0):
+        azimuth = 0.55 - 0.5 * (t - t0_s)
+        yield measured(t, FRONT, car(azimuth), bearing=Bearing(azimuth, 0.06, 1.6))
+    for t in hops(t0_s + 2.0, t0_s + 18.0):
+        yield measured(t, QUIET)
+
+
+def mirrored(measurement):
+    """The same world seen in a mirror."""
+
+    def flip(value):
+        return value if isinstance(value, NotUsable) else replace(value, azimuth_rad=-value.azimuth_rad)
+
+    heard = measurement.signature
+    return replace(
+        measurement,
+        signature=replace(heard, hidden=heard.hidden[::-1]),
+        bearing=flip(measurement.bearing),
+        sightings=tuple(flip(sighting) for sighting in reversed(measurement.sightings)),
+    )
+
+
+def test_hidden_then_visible_with_the_same_id():
+    _, states = run(start(), approach_from_left())
+    hidden = [s for s in states if any(e.status == "hidden" for e in s.entities)]
+    assert hidden[0].stamp_ns < 4.0e9
+    (entity,) = hidden[0].entities
+    assert (entity.direction, entity.range_m, entity.position_m) == ("left", None, None)
+    assert entity.azimuth_rad > 0
+    assert entity.azimuth_std_rad > 0.17
+    visible = [s for s in states if any(e.status == "visible" for e in s.entities)]
+    assert visible[0].stamp_ns == 5_000_000_000
+    assert {e.id for s in states for e in s.entities} == {entity.id}
+    (seen,) = visible[3].entities
+    assert seen.existence_probability > 0.95
+    assert seen.azimuth_rad == pytest.approx(0.4, abs=0.03)
+    assert [c.label for c in seen.classification] == ["car"]
+    assert states[-1].entities == ()
+
+
+def test_the_advisory_leads_names_the_side_and_points_at_the_entity():
+    _, states = run(start(), approach_from_left())
+    raised = [(s.stamp_ns, cue) for s in states for cue in s.cues if cue.advisory]
+    assert raised[0][0] == 2_200_000_000  # the third hop at or above gamma
+    assert raised[-1][0] < 5_000_000_000
+    assert {cue.direction for _, cue in raised} == {"left"}
+    assert all(cue.entity_id is not None and cue.alpha == 0.02 for _, cue in raised)
+
+
+def test_a_tie_names_both_sides():
+    """Rounding must not choose a side: the mirrored world would choose the other one."""
+    even = (0.45, 0.45, 0.05, 0.05)
+    for classes in (even, (0.45 + 1e-15, 0.45 - 1e-15, 0.05, 0.05)):
+        world, _ = run(start(), [measured(t, classes) for t in hops(1.0, 1.5)])
+        assert {cue.direction: cue.advisory for cue in world.state.cues} == {"left": True, "right": True}
+
+
+def test_relations_follow_the_entity():
+    _, states = run(start(), approach_from_left())
+    at = {s.stamp_ns: s for s in states}
+    hidden = {r.kind: r for r in at[4_500_000_000].relations}
+    assert hidden["occluded_by"].dst == "corner_left"
+    assert hidden["approaching"].dst == "ego"
+    assert hidden["approaching"].probability > 0.85
+    assert "emerged_from" in {r.kind for r in at[5_300_000_000].relations}
+    assert at[4_500_000_000].graph().has_edge(hidden["occluded_by"].src, "corner_left")
+
+
+def test_looming_becomes_time_to_arrival_and_its_lack_is_unknown():
+    world, _ = run(start(), [measured(t, LEFT, approach=Approach(0.5, 0.2)) for t in hops(1.0, 4.0)])
+    (entity,) = world.state.entities
+    assert entity.inverse_tta_hz == pytest.approx(0.5, abs=0.15)
+    assert entity.tta_s == pytest.approx(1 / entity.inverse_tta_hz)
+    world, _ = run(start(), [measured(t, LEFT, approach=Approach(-0.4, 0.2)) for t in hops(1.0, 4.0)])
+    assert world.state.entities[0].tta_s is None
+    assert {r.kind: r.probability for r in world.state.relations}["approaching"] < 0.5
+    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    (entity,) = world.state.entities
+    assert (entity.inverse_tta_hz, entity.tta_s) == (None, None)
+
+
+def test_an_assumed_approach_is_not_published():
+    world = start(settings=FilterSettings(hidden_std=(0.15, 0.1, 0.6)))
+    world, _ = run(world, [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    (entity,) = world.state.entities
+    assert (entity.inverse_tta_hz, entity.tta_s, world.state.cues[0].horizon_s) == (None, None, None)
+
+
+def test_an_old_approach_rate_fades():
+    """Heard to close at 0.8 1/s, then seen for three seconds and not heard to approach."""
+    script = [measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(0.4)) for t in hops(4.0, 7.0)]
+    _, states = run(start(), script)
+    assert states[29].entities[0].tta_s < 2.0
+    assert states[-1].entities[0].tta_s is None
+    assert abs(states[-1].entities[0].inverse_tta_hz) < 0.4
+
+
+def test_a_hidden_azimuth_says_that_it_may_be_biased():
+    peak = Bearing(0.6, 0.06, 1.4)
+    world, _ = run(start(), [measured(t, LEFT, bearing=peak) for t in hops(1.0, 6.0)])
+    spread = world.memory.tracks[0].motion.azimuth_std_rad
+    bias = world.settings.hidden_bias_std_rad
+    assert world.state.entities[0].azimuth_std_rad == pytest.approx(math.hypot(spread, bias))
+    assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, bias))
+
+
+def test_the_sound_from_before_a_hand_over_brings_forth_nobody():
+    off = Unqueried("sector out of view")
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script += [measured(t, LEFT, car(0.5), answer=off) for t in hops(4.0, 4.9)]
+    _, states = run(start(), script)
+    assert any(cue.advisory for cue in states[-1].cues)
+    assert [e.status for e in states[-1].entities] == ["visible"]
+
+
+def test_the_side_comes_from_the_signature_and_not_from_the_peak():
+    """Most peaks of a hidden vehicle stand on images in the walls of the other side."""
+    wrong = Bearing(-0.9, 0.06, 1.4)
+    world, _ = run(start(), [measured(t, LEFT, bearing=wrong) for t in hops(1.0, 4.0)])
+    (entity,) = world.state.entities
+    assert entity.direction == "left"
+    assert entity.azimuth_rad > 0.5
+
+
+def test_vision_unqueried_throughout():
+    """Moving ego, no camera: hidden, then heard in line of sight, one entity, never called visible."""
+    off = Unqueried("no detections")
+    script = [measured(t, QUIET, answer=off) for t in hops(1.0, 2.0)]
+    script += [measured(t, LEFT, answer=off) for t in hops(2.0, 5.0)]
+    script += [measured(t, FRONT, answer=off, bearing=Bearing(0.2, 0.06, 1.6)) for t in hops(5.0, 8.0)]
+    script += [measured(t, QUIET, answer=off) for t in hops(8.0, 14.0)]
+    _, states = run(start(), script)
+    assert len({e.id for s in states for e in s.entities}) == 1
+    status = {e.status for s in states for e in s.entities}
+    assert status == {"hidden", "emerged"}
+    assert all(e.visibility.answer == "unqueried" for s in states for e in s.entities)
+    emerged = next(e for s in states if s.stamp_ns == 7_900_000_000 for e in s.entities)
+    assert emerged.azimuth_rad == pytest.approx(0.2, abs=0.1)
+    assert states[-1].entities == ()
+
+
+def test_two_vehicles_one_seen_and_one_hidden():
+    """A vehicle in plain view does not explain away another one, as long as the bearing leads elsewhere."""
+    script = [measured(t, RIGHT) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(-0.5 + 0.02 * (t - 4.0))) for t in hops(4.0, 6.0)]
+    script += [measured(t, LEFT, car(-0.46), answer=Absent(0.04)) for t in hops(6.0, 9.0)]
+    script += [measured(t, LEFT, car(-0.46), car(0.5 - 0.3 * (t - 9.0), "truck")) for t in hops(9.0, 10.0)]
+    _, states = run(start(), script)
+    at = {s.stamp_ns: s for s in states}
+    first = {e.id for e in at[3_900_000_000].entities}
+    both = at[8_900_000_000].entities
+    assert [(e.status, e.direction) for e in both] == [("visible", "right"), ("hidden", "left")]
+    end = at[9_900_000_000].entities
+    assert [(e.status, e.direction) for e in end] == [("visible", "right"), ("visible", "left")]
+    assert [e.id for e in end] == [e.id for e in both]
+    assert end[0].id in first
+
+
+def test_two_hidden_vehicles_hand_over_to_their_own_sides():
+    both = (0.45, 0.45, 0.04, 0.06)
+    world = start(settings=FilterSettings(birth_probability=0.4, death_probability=0.1))
+    script = [measured(t, both) for t in hops(1.0, 4.0)]
+    script += [measured(t, both, car(0.5), car(-0.5)) for t in hops(4.0, 4.5)]
+    _, states = run(world, script)
+    before = {e.direction: e.id for e in states[-6].entities}
+    assert set(before) == {"left", "right"}
+    assert {("left" if e.azimuth_rad > 0 else "right"): e.id for e in states[-1].entities} == before
+
+
+def test_a_vehicle_heard_on_the_wrong_side_is_still_the_one_heard():
+    """One vehicle that the signature misplaces is likelier than two of which one is silent."""
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(4.0, FRONT, car(-0.5))]
+    _, states = run(start(), script)
+    (before,), (after,) = states[-2].entities, states[-1].entities
+    assert (before.status, after.status, before.id) == ("hidden", "visible", after.id)
+    assert after.direction == "right"
+
+
+def test_a_missed_frame_just_after_hand_over_is_no_new_hazard():
+    """The window still holds the sound from before; the source that came into view explains it."""
+    loud = (0.97, 0.01, 0.01, 0.01)
+    script = [measured(t, loud) for t in hops(1.0, 3.0)] + [measured(3.0, loud, car(0.5))]
+    world, _ = run(start(), script)
+    assert world.explanation.visible > 0.9
+    missed = world.update(measured(3.1, loud, answer=Absent(0.1)))
+    assert missed.explanation.visible > missed.explanation.hidden_total
+
+
+def test_a_faint_belief_is_not_handed_over():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, QUIET) for t in hops(4.0, 5.0)]
+    settings_ = FilterSettings(death_probability=1e-3)
+    world, states = run(WorldFilter(policy=POLICY, settings=settings_), script)
+    while states[-1].entities and states[-1].entities[0].existence_probability > 0.18:
+        world = world.update(measured(world.stamp_ns / 1e9 + 0.1, QUIET))
+        states.append(world.state)
+    (faint,) = states[-1].entities
+    world = world.update(measured(world.stamp_ns / 1e9 + 0.1, QUIET, car(-0.5)))
+    assert {e.status: e.id == faint.id for e in world.state.entities}["visible"] is False
+
+
+def test_a_false_alarm_dies():
+    script = [measured(t, QUIET) for t in hops(1.0, 2.0)]
+    script += [measured(t, LEFT) for t in hops(2.0, 2.5)]
+    script += [measured(t, QUIET) for t in hops(2.5, 6.0)]
+    _, states = run(start(), script)
+    assert any(s.entities for s in states)
+    assert states[-1].entities == ()
+    assert states[-1].risk < 0.1
+
+
+def test_hysteresis_keeps_one_id_through_a_dip():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, QUIET) for t in hops(4.0, 4.6)]
+    script += [measured(t, LEFT) for t in hops(4.6, 7.0)]
+    _, states = run(start(), script)
+    assert len({e.id for s in states for e in s.entities}) == 1
+
+
+def test_a_parked_car_is_context_and_no_hand_over():
+    parked = car(0.5, moving=False)
+    _, states = run(start(), [measured(t, LEFT, parked, answer=Absent(0.04)) for t in hops(1.0, 4.0)])
+    assert [(e.status, e.moving) for e in states[-1].entities] == [("visible", False), ("hidden", True)]
+
+
+def test_a_parked_car_that_comes_to_notice_takes_nobodys_place():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script += [measured(4.0, LEFT, car(0.5, moving=False), answer=Absent(0.04))]
+    _, states = run(start(), script)
+    assert [(e.status, e.moving) for e in states[-1].entities] == [("hidden", True), ("visible", False)]
+
+
+def test_a_parked_car_drives_off():
+    script = [measured(t, FRONT, car(0.3, moving=False)) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(0.3 - 0.6 * (t - 4.0))) for t in hops(4.0, 5.0)]
+    _, states = run(start(), script)
+    (entity,) = states[-1].entities
+    assert {e.id for s in states for e in s.entities} == {entity.id}
+    assert (entity.moving, entity.azimuth_rad) == (True, pytest.approx(-0.24, abs=0.03))
+    assert entity.azimuth_rate_rad_s == pytest.approx(-0.6, abs=0.1)
+
+
+def test_a_new_entity_does_not_inherit_the_last_ones_existence():
+    """What came into view before it was born was another vehicle."""
+    off, slow = Unqueried("-"), FilterSettings(birth_probability=0.7)
+    script = [measured(t, LEFT, answer=off) for t in hops(1.0, 2.5)]
+    script += [measured(t, FRONT, answer=off) for t in hops(2.5, 4.0)]
+    script += [measured(t, LEFT, answer=off) for t in hops(4.0, 9.0)]
+    world = WorldFilter(policy=replace(POLICY, gamma=1.1), settings=slow)
+    for measurement in script:
+        before, world = world, world.update(measurement)
+        if world.state.entities:
+            break
+    assert before.explanation.emerged[0] > 0.01
+    assert world.state.entities[0].existence_probability == pytest.approx(world.explanation.hidden[0])
+
+
+def test_a_moving_car_drives_past_a_parked_one():
+    script = [measured(t, FRONT, car(0.4 - 0.2 * (t - 1.0)), car(0.0, moving=False)) for t in hops(1.0, 5.0)]
+    _, states = run(start(), script)
+    first, last = ({e.moving: e.id for e in s.entities} for s in (states[0], states[-1]))
+    assert first == last
+    assert len(states[-1].entities) == 2
+
+
+def test_a_standing_bearing_is_no_collision():
+    """Seen at one place for long and never heard to approach: it stays there."""
+    script = [measured(t, FRONT, car(-0.46)) for t in hops(1.0, 15.0)]
+    _, states = run(start(), script)
+    (entity,) = states[-1].entities
+    assert entity.azimuth_rad == pytest.approx(-0.46, abs=0.01)
+    assert {e.id for s in states for e in s.entities} == {entity.id}
+
+
+def test_seen_without_being_heard_is_an_entity_of_its_own():
+    world, _ = run(start(), [measured(t, QUIET, car(0.3)) for t in hops(1.0, 1.5)])
+    (entity,) = world.state.entities
+    assert entity.status == "visible"
+    assert "emerged_from" not in {r.kind for r in world.state.relations}
+
+
+def test_back_into_occlusion_with_the_same_id():
+    script = [measured(t, FRONT, car(0.1 - 0.35 * (t - 1.0))) for t in hops(1.0, 2.5)]
+    script += [measured(t, RIGHT, answer=Absent(0.6)) for t in hops(2.5, 5.0)]
+    _, states = run(start(), script)
+    assert states[-1].entities[0].status == "hidden"
+    assert states[-1].entities[0].last_seen_ns == 2_400_000_000
+    assert len({e.id for s in states for e in s.entities}) == 1
+
+
+@pytest.mark.parametrize("miss_rate", [0.04, 0.3, 0.9])
+def test_empty_looks_move_existence_as_bernoulli_says(miss_rate):
+    """One look an interval counts in full: r (1 - pd) / (1 - r pd), times survival."""
+    settings_ = FilterSettings(look_interval_s=0.1, window_s=0.1)
+    world = start(settings=settings_).update(measured(1.0, FRONT, car(0.0)))
+    (before,) = world.state.entities
+    world = world.update(measured(1.1, FRONT, answer=Absent(miss_rate)))
+    (after,) = world.state.entities
+    r = before.existence_probability * math.exp(-0.1 / settings_.visible_life_s)
+    pd = 1.0 - miss_rate
+    assert after.existence_probability == pytest.approx(r * (1 - pd) / (1 - r * pd))
+    assert after.visibility.answer == "absent"
+
+
+def test_looks_in_quick_succession_count_for_their_share():
+    """Three looks within one interval weigh as one."""
+    world = start().update(measured(1.0, FRONT, car(0.0)))
+    r = world.state.entities[0].existence_probability
+    for t in (1.1, 1.2, 1.3):
+        world = world.update(measured(t, FRONT, answer=Absent(0.04)))
+    for _ in range(3):
+        r *= math.exp(-0.01)
+        odds = r / (1 - r) * 0.04 ** (1 / 3)
+        r = odds / (1 + odds)
+    assert world.state.entities[0].existence_probability == pytest.approx(r)
+
+
+def test_a_hand_over_takes_the_risk_with_it():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script.append(measured(4.0, LEFT, car(0.5), answer=Unqueried("sector out of view")))
+    _, states = run(start(), script)
+    assert states[-2].risk > 0.7
+    assert states[-1].risk < 0.1
+    assert states[-1].cues[0].hypotheses.visible > 0.8
+
+
+def test_not_looking_moves_nothing_but_survival():
+    world = start().update(measured(1.0, FRONT, car(0.0)))
+    before = world.state.entities[0].existence_probability
+    world = world.update(measured(1.1, FRONT, answer=Unqueried("no frame")))
+    (entity,) = world.state.entities
+    assert entity.existence_probability == pytest.approx(before * math.exp(-0.01))
+    assert entity.visibility.answer == "unqueried"
+
+
+@given(st.floats(0.001, 0.999), st.floats(0.01, 0.99), st.floats(0.001, 0.5))
+def test_bernoulli_updates_are_bayes(r, miss_rate, clutter):
+    """Against the two-hypothesis table written out."""
+    empty = np.array([r * miss_rate, 1 - r])
+    assert after_empty_look(r, miss_rate) == pytest.approx(empty[0] / empty.sum())
+    found = np.array([r * (1 - miss_rate * (1 - clutter)), (1 - r) * clutter])
+    assert after_sighting(r, miss_rate, clutter) == pytest.approx(found[0] / found.sum())
+
+
+angles = st.floats(-0.6, 0.6)
+classes = st.tuples(*[st.floats(0.02, 1.0)] * 4)
+sightings = st.lists(st.builds(car, angles, st.just("car"), st.booleans()), max_size=3).map(tuple)
+answers = st.one_of(
+    st.builds(Absent, st.floats(0.0, 1.0)),
+    st.builds(Present, st.floats(0.0, 1.0), st.floats(0.001, 0.2)),
+    st.just(Unqueried("-")),
+)
+bearings = st.one_of(st.just(SILENT), st.builds(Bearing, st.floats(-3.1, 3.1), st.floats(0.01, 1.0)))
+approaches = st.one_of(st.just(SILENT), st.builds(Approach, st.floats(-2.0, 2.0), st.floats(0.05, 1.0)))
+gaps = st.sampled_from([0.0, 0.1, 0.1001, 0.5, 3.0])
+
+
+@st.composite
+def scripts(draw):
+    time_s, script = 1.0, []
+    for _ in range(draw(st.integers(1, 12))):
+        time_s += draw(gaps)
+        heard = draw(st.sampled_from([LEFT, RIGHT, FRONT, QUIET]) | classes)
+        seen = draw(sightings)
+        answer, bearing, approach = draw(answers), draw(bearings), draw(approaches)
+        script.append(measured(time_s, heard, *seen, answer=answer, bearing=bearing, approach=approach))
+    return script
+
+
+@settings(max_examples=60, deadline=None)
+@given(scripts())
+def test_every_state_is_sound(script):
+    world = start()
+    for measurement in script:
+        world = world.update(measurement)
+        state = world.state
+        assert world.explanation.probabilities.sum() == pytest.approx(1.0)
+        assert type(state).from_json(state.to_json()) == state
+        assert len({e.id for e in state.entities}) == len(state.entities)
+        assert sum(cue.risk for cue in state.cues) == pytest.approx(world.risk)
+        for entity in state.entities:
+            assert 0 <= entity.hidden_probability <= entity.existence_probability <= 1
+            assert -math.pi < entity.azimuth_rad <= math.pi
+            assert entity.azimuth_std_rad > 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(approaches, min_size=5, max_size=30), st.floats(-1.5, 1.5))
+def test_a_hidden_entity_stays_on_its_side_whatever_looming_says(rates, azimuth):
+    peak, times = Bearing(azimuth, 0.06), hops(1.0, 4.5)
+    script = [measured(t, LEFT, approach=rate, bearing=peak) for t, rate in zip(times, rates, strict=False)]
+    _, states = run(start(), script)
+    hidden = [e for s in states for e in s.entities]
+    assert hidden
+    assert all(0.2 < e.azimuth_rad < 1.7 and 0.17 < e.azimuth_std_rad < 0.8 for e in hidden)
+
+
+def described(state, sign):
+    """A state without ids, in a mirror if sign is -1."""
+    side = {"left": "right", "right": "left"} if sign < 0 else {"left": "left", "right": "right"}
+
+    def rounded(value):
+        return None if value is None else round(value, 7) + 0.0
+
+    entities = sorted(
+        (
+            rounded(e.existence_probability),
+            rounded(e.hidden_probability),
+            rounded(sign * e.azimuth_rad),
+            rounded(e.azimuth_std_rad),
+            rounded(e.inverse_tta_hz) or 0.0,
+            e.status,
+            side[e.direction],
+            e.moving,
+            e.created_ns,
+        )
+        for e in state.entities
+    )
+    cues = sorted(
+        (side[c.direction], rounded(c.risk), c.advisory, rounded(sign * c.azimuth_rad)) for c in state.cues
+    )
+    relations = sorted((r.kind, rounded(r.probability)) for r in state.relations)
+    return entities, cues, relations
+
+
+def test_a_mirrored_world_has_the_mirrored_state():
+    script = list(approach_from_left())
+    _, states = run(start(), script)
+    _, reflections = run(start(), [mirrored(m) for m in script])
+    assert any(s.entities for s in states)
+    assert [described(s, 1) for s in states] == [described(s, -1) for s in reflections]
+
+
+@settings(max_examples=40, deadline=None)
+@given(scripts())
+def test_any_mirrored_world_has_the_mirrored_state(script):
+    # A car dead ahead is as near to one side as to the other, and has to be given to one of them.
+    script = [m for m in script if all(abs(s.azimuth_rad) > 1e-3 for s in m.sightings)]
+    _, states = run(start(), script)
+    _, reflections = run(start(), [mirrored(m) for m in script])
+    for state, reflection in zip(states, reflections, strict=True):
+        for mine, other in zip(described(state, 1), described(reflection, -1), strict=True):
+            assert len(mine) == len(other)
+            for a, b in zip(mine, other, strict=True):
+                assert a == pytest.approx(b, abs=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(scripts(), st.randoms())
+def test_the_order_of_sightings_does_not_matter(script, random):
+    shuffled = [replace(m, sightings=tuple(random.sample(m.sightings, len(m.sightings)))) for m in script]
+    assert run(start(), shuffled)[1] == run(start(), script)[1]
+
+
+def test_predicting_in_small_steps_is_predicting_at_once():
+    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 3.0)])
+    small = world
+    for _ in range(10):
+        small = small.predict(0.05)
+    assert small.explanation.probabilities == pytest.approx(world.predict(0.5).explanation.probabilities)
+    assert small.state.stamp_ns == world.predict(0.5).state.stamp_ns == 3_400_000_000
+
+
+def test_update_predicts_by_itself():
+    script = list(approach_from_left())
+    _, states = run(start(), script)
+    world, explicit = start(), []
+    for measurement in script:
+        world = world.predict_to(measurement.stamp_ns).update(measurement)
+        explicit.append(world.state)
+    assert explicit == states
+
+
+def test_without_news_a_hidden_entity_fades_and_stays_on_its_side():
+    world, _ = run(start(), [measured(t, LEFT, approach=Approach(0.8, 0.2)) for t in hops(1.0, 4.0)])
+    before = world.state.entities[0].existence_probability
+    (entity,) = world.predict(3.0).state.entities
+    assert entity.hidden_probability < before
+    assert entity.azimuth_rad > 0.3
+
+
+def still(priors):
+    """A context in which explanations do not change by themselves."""
+    return Context(rates=Rates(*[0.0] * 6), priors=priors)
+
+
+@given(st.floats(0.02, 0.98), st.floats(0.02, 0.98))
+def test_risk_rises_with_the_posterior_and_equals_the_map_of_the_statistic(first, second):
+    """Without memory (prior = reference prior, one whole window) the filtered risk is the map of s."""
+    policy = replace(POLICY, risk_map=PlattMap(-1.3, 0.4))
+    risks = []
+    for share in (first, second):
+        m = measured(1.0, (share / 2, share / 2, (1 - share) / 2, (1 - share) / 2), answer=Absent(0.2))
+        world = WorldFilter(still(Priors(0.5, 0.25, 0.25)), policy).update(m)
+        s = statistic(m.signature, m.co_evidence, policy.reference_prior)
+        assert (world.statistic, world.risk) == pytest.approx((s, policy.risk_map(s)))
+        risks.append(world.risk)
+    assert (risks[0] < risks[1]) == (first < second) or risks[0] == pytest.approx(risks[1])
+
+
+def test_overlapping_windows_are_not_counted_twice():
+    """Ten hops of a tenth of a window weigh as much as one window."""
+    context, off = still(Priors(0.2, 0.2, 0.6)), Unqueried("-")
+    often, _ = run(start(context=context), [measured(t, LEFT, answer=off) for t in hops(0.1, 1.01)])
+    once, _ = run(start(context=context), [measured(1.0, LEFT, answer=off)])
+    assert often.explanation.hidden_total == pytest.approx(once.explanation.hidden_total)
+
+
+def test_overlapping_bearings_are_not_counted_twice():
+    """Ten tenths of a window tell about as much as one window; of the azimuth a little more.
+
+    Whether the peak is the entity's own is asked anew each hop, which one window asks once.
+    """
+    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
+    (track,) = world.memory.tracks
+    once, often = (track,), (track,)
+    once = hear(once, m, world.explanation, 1.0, FilterSettings())
+    for _ in range(10):
+        often = hear(often, m, world.explanation, 0.1, FilterSettings())
+    for row, most in ((0, 0.35), (2, 0.2)):
+        one, ten, none = (t.motion.covariance[row, row] for t in (once[0], often[0], track))
+        assert ten == pytest.approx(one, rel=most)
+        assert one < 0.9 * none
+
+
+@settings(max_examples=20, deadline=None)
+@given(scripts(), st.integers(0, 11))
+def test_a_checkpoint_continues_bit_for_bit(script, cut):
+    world, _ = run(start(), script[:cut])
+    restored = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict(), allow_nan=False)))
+    _, expected = run(world, script[cut:])
+    _, got = run(restored, script[cut:])
+    assert restored.state == world.state
+    assert got == expected
+    assert [s.to_json() for s in got] == [s.to_json() for s in expected]
+
+
+def test_a_damaged_checkpoint_is_refused():
+    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 3.0)])
+    value = json.loads(json.dumps(world.to_dict()))
+    with pytest.raises(SchemaVersionError):
+        WorldFilter.from_dict(value | {"schema": {"name": "worldstate.Filter", "version": "3.0.0"}})
+    value["memory"]["tracks"][0]["covariance"][0] = -1.0
+    with pytest.raises(InvalidArgumentError, match=r"tracks\[0\]\.covariance"):
+        WorldFilter.from_dict(value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"stamp_ns": 1_000_000_000}, "expected time stamps in order"),
+        ({"bearing": Bearing(math.nan, 0.1)}, "bearing.azimuth_rad"),
+        ({"bearing": Bearing(0.1, 0.0)}, "bearing.std_rad"),
+        ({"approach": Approach(math.inf, 0.1)}, "inverse_tta_hz"),
+        ({"sightings": (Sighting(0.1, math.nan, "car", 0.9),)}, r"sightings\[0\].std_rad"),
+        ({"signature": SignatureEvidence(("north",), (0.0,), 0.0, 0.0)}, "expected the directions"),
+    ],
+)
+def test_bad_measurements_are_refused_and_change_nothing(change, words):
+    world = start().update(measured(2.0, LEFT))
+    before = world.state
+    with pytest.raises(InvalidArgumentError, match=words):
+        world.update(replace(measured(2.1, LEFT), **change))
+    assert world.state == before
+
+
+def test_time_does_not_run_back():
+    with pytest.raises(InvalidArgumentError, match="not before"):
+        start(start_ns=10**9).predict_to(0)
+    with pytest.raises(InvalidArgumentError, match="dt_s"):
+        start().predict(-0.1)
+
+
+def test_a_policy_for_other_directions_is_refused():
+    with pytest.raises(InvalidArgumentError, match="reference priors"):
+        WorldFilter(policy=replace(POLICY, reference_prior=(0.25, 0.25, 0.5)))
+
+
+def test_the_same_run_has_the_same_ids():
+    ids = [[e.id for s in run(start(), approach_from_left())[1] for e in s.entities] for _ in range(2)]
+    assert ids[0] == ids[1]
+    other = run(start(settings=FilterSettings(stream="other")), approach_from_left())[1]
+    assert not set(ids[0]) & {e.id for s in other for e in s.entities}

@@ -1,0 +1,182 @@
+"""Motion in modified polar coordinates, against straight lines, an integrator, and plain matrix algebra."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.stats import chi2
+
+from worldstate.belief.motion import MotionBelief, predict, relax, update_approach, update_azimuth
+from worldstate.belief.polar import jacobian, process_noise, propagate
+
+states = st.tuples(st.floats(-3.0, 3.0), st.floats(-0.8, 0.8), st.floats(-0.8, 0.8), st.floats(1.5, 4.5)).map(
+    np.array
+)
+times = st.floats(0.01, 0.8)
+
+
+def to_cartesian(state):
+    theta, omega, rho, log_range = state
+    r = np.exp(log_range)
+    along, across = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
+    return r * along, r * rho * along + r * omega * across
+
+
+def to_polar(position, velocity):
+    x, y = position
+    r2 = x * x + y * y
+    omega, rho = (x * velocity[1] - y * velocity[0]) / r2, (position @ velocity) / r2
+    return np.array([np.arctan2(y, x), omega, rho, 0.5 * np.log(r2)])
+
+
+def wrapped(difference):
+    difference = np.array(difference)
+    difference[0] = np.arctan2(np.sin(difference[0]), np.cos(difference[0]))
+    return difference
+
+
+@given(states, times)
+def test_it_is_a_straight_line(state, time_s):
+    position, velocity = to_cartesian(state)
+    expected = to_polar(position + time_s * velocity, velocity)
+    assert wrapped(propagate(state, time_s) - expected) == pytest.approx(0.0, abs=1e-9)
+
+
+@settings(max_examples=20)
+@given(states, times)
+def test_it_solves_the_differential_equation(state, time_s):
+    def derivative(t, x):
+        return [x[1], -2 * x[2] * x[1], x[1] ** 2 - x[2] ** 2, x[2]]
+
+    solved = solve_ivp(derivative, (0, time_s), state, rtol=1e-9, atol=1e-11).y[:, -1]
+    assert propagate(state, time_s) == pytest.approx(solved, abs=1e-6)
+
+
+@given(states, times)
+def test_the_jacobian_is_the_derivative(state, time_s):
+    h = 1e-6
+    ahead = np.array([propagate(state + h * axis, time_s) for axis in np.eye(4)])
+    behind = np.array([propagate(state - h * axis, time_s) for axis in np.eye(4)])
+    assert jacobian(state, time_s) == pytest.approx((ahead - behind).T / (2 * h), rel=1e-4, abs=1e-6)
+
+
+@given(states, times, times)
+def test_two_steps_are_one(state, first, second):
+    assume(state[2] * (first + second) > -0.9)  # short of the array itself
+    at_once = propagate(state, first + second)
+    assert propagate(propagate(state, first), second) == pytest.approx(at_once, abs=1e-8)
+
+
+def test_process_noise_composes():
+    """Two steps of the noise-driven linear part add up to one step of twice the length."""
+    step = np.eye(4) + 0.5 * np.array([[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1, 0]])
+    half = process_noise(2.0, 10.0, 0.5)
+    assert step @ half @ step.T + half == pytest.approx(process_noise(2.0, 10.0, 1.0))
+
+
+def random_belief(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(4, 4)) * 0.1
+    return MotionBelief(rng.normal((0, 0, 0, 3), 0.3), root @ root.T + 1e-3 * np.eye(4))
+
+
+@given(st.integers(0, 10**6), st.floats(-3.1, 3.1), st.floats(0.01, 1.0))
+def test_an_update_is_the_kalman_update(seed, azimuth, std):
+    belief = random_belief(seed)
+    got = update_azimuth(belief, azimuth, std, weight=1.0)
+    H = np.array([[1.0, 0, 0, 0]])
+    gain = belief.covariance @ H.T / (belief.covariance[0, 0] + std**2)
+    residual = math.remainder(azimuth - belief.mean[0], 2 * math.pi)
+    assert wrapped(got.mean - belief.mean - gain[:, 0] * residual) == pytest.approx(0.0, abs=1e-9)
+    assert got.covariance == pytest.approx((np.eye(4) - gain @ H) @ belief.covariance, abs=1e-9)
+
+
+@given(st.integers(0, 10**6), st.floats(-1.0, 1.0), st.floats(0.01, 1.0), st.floats(0.0, 1.0))
+def test_association_mixes_the_two_outcomes(seed, rate, std, weight):
+    """Mean and covariance are those of the mixture "mine with probability w, else not", by its moments."""
+    belief, sure = random_belief(seed), update_approach(random_belief(seed), rate, std, weight=1.0)
+    got = update_approach(belief, rate, std, weight)
+    mean = weight * sure.mean + (1 - weight) * belief.mean
+    spread = sum(
+        w * (part.covariance + np.outer(part.mean - mean, part.mean - mean))
+        for w, part in ((weight, sure), (1 - weight, belief))
+    )
+    assert got.mean == pytest.approx(mean, abs=1e-9)
+    assert got.covariance == pytest.approx(spread, abs=1e-9)
+
+
+heard = st.tuples(st.floats(-3.1, 3.1), st.floats(-1, 1), st.floats(0, 1), st.floats(0.01, 0.5))
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 10**6), st.lists(heard, max_size=20))
+def test_the_covariance_stays_symmetric_and_positive(seed, looks):
+    belief, prior = random_belief(seed), MotionBelief.around((0.9, 0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
+    for azimuth, rate, weight, time_s in looks:
+        belief = relax(predict(belief, time_s, 2.0), prior, 0.97, 0.9)
+        belief = update_approach(update_azimuth(belief, azimuth, 0.1, weight), rate, 0.3, weight)
+        assert (belief.covariance == belief.covariance.T).all()
+        assert np.linalg.eigvalsh(belief.covariance)[0] > 0
+        assert -math.pi < belief.azimuth_rad <= math.pi
+
+
+def test_it_tracks_across_the_cut_behind_the_car():
+    belief = MotionBelief.around((3.1, 0.2, 0.0, 3.0), (0.05, 0.05, 0.1, 0.5))
+    for hop in range(1, 11):
+        true = math.remainder(3.1 + 0.02 * hop, 2 * math.pi)
+        belief = update_azimuth(predict(belief, 0.1, 0.1), true, 0.02, weight=1.0)
+    assert belief.azimuth_rad == pytest.approx(true, abs=0.02)
+
+
+def test_relaxation_returns_to_the_prior_and_no_further():
+    prior = MotionBelief.around((0.9, 0.0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
+    belief = MotionBelief.around((-0.5, 0.5, -1.0, 2.0), (0.02, 0.05, 0.1, 0.1))
+    for _ in range(400):
+        belief = relax(belief, prior, 0.967, 0.9)
+    assert belief.mean == pytest.approx(prior.mean, abs=1e-4)
+    assert belief.covariance == pytest.approx(prior.covariance, abs=1e-4)
+
+
+def test_relaxation_may_leave_the_bearing_alone():
+    prior = MotionBelief.around((0.9, 0.0, -0.2, 3.2), (0.35, 0.15, 0.25, 0.6))
+    belief = random_belief(1)
+    after = relax(belief, prior, 1.0, 0.0)
+    assert after.mean == pytest.approx([*belief.mean[:2], *prior.mean[2:]])
+    assert after.covariance[:2, :2] == pytest.approx(belief.covariance[:2, :2])
+    assert after.covariance[2:, 2:] == pytest.approx(prior.covariance[2:, 2:])
+
+
+def test_nobody_drives_through_the_array():
+    """At a constant bearing and a closing rate that nobody corrects, the azimuth stays what it is."""
+    belief = MotionBelief.around((-0.46, 0.0, -5.0, 3.0), (0.01, 0.01, 0.1, 0.5))
+    assert predict(belief, 1.0, 0.1).azimuth_rad == pytest.approx(-0.46)
+
+
+def mean_nees(runs, seed, steps=30):
+    """Normalised estimation error squared over runs drawn from the prior; bearing 4 deg, looming 0.25 1/s."""
+    rng = np.random.default_rng(seed)
+    std = (0.35, 0.1, 0.1, 0.3)
+    start = (0.9, 0.0, -0.12, 3.4)
+    nees = []
+    for _ in range(runs):
+        truth, belief = rng.normal(start, std), MotionBelief.around(start, std)
+        for _ in range(steps):
+            noise = process_noise(0.5, np.exp(truth[3]), 0.1)
+            truth = propagate(truth, 0.1) + rng.multivariate_normal(np.zeros(4), noise)
+            belief = predict(belief, 0.1, 0.5)
+            azimuth = math.remainder(truth[0] + rng.normal(0, 0.07), 2 * math.pi)
+            belief = update_azimuth(belief, azimuth, 0.07, 1.0)
+            belief = update_approach(belief, -truth[2] + rng.normal(0, 0.25), 0.25, 1.0)
+        error = wrapped(truth - belief.mean)
+        nees.append(error @ np.linalg.solve(belief.covariance, error))
+    return float(np.mean(nees))
+
+
+def test_the_errors_are_as_large_as_it_says():
+    """Mean NEES of 80 runs within the 99.9 % band of chi-square with four degrees of freedom."""
+    runs = 80
+    low, high = chi2.ppf([0.0005, 0.9995], 4 * runs) / runs
+    assert low < mean_nees(runs, seed=3) < high

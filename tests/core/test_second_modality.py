@@ -1,0 +1,129 @@
+"""V2X beacons through the same abduction and the same filter as sound: the example, held to its claims."""
+
+import ast
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.measurement.measurement import Measurement
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beacon.py"
+
+
+@pytest.fixture(scope="module")
+def v2x():
+    spec = importlib.util.spec_from_file_location("v2x_beacon", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def last(states):
+    return list(states)[-1]
+
+
+def test_hidden_by_radio_then_visible_with_the_same_id(v2x):
+    beacons = v2x.approach_from_left()
+    states = list(v2x.run(beacons, v2x.ScriptedCamera(beacons, t0_s=4.0)))
+    at = {state.stamp_ns: state for state in states}
+    (hidden,) = at[nanoseconds(3.0)].entities
+    (seen,) = at[nanoseconds(4.5)].entities
+    assert (hidden.status, hidden.direction, seen.status) == ("hidden", "left", "visible")
+    assert hidden.id == seen.id
+    assert at[nanoseconds(3.0)].risk > 0.9 > 0.1 > at[nanoseconds(4.5)].risk
+    assert hidden.tta_s == pytest.approx(15.0**2 / 8.0 / 15.0 * (1 + 100 / 225), rel=0.3)
+    advisory = [s.stamp_ns for s in states if any(cue.advisory for cue in s.cues)]
+    assert advisory
+    assert max(advisory) <= nanoseconds(4.3)
+
+
+def test_a_forged_beacon_in_plain_view_is_refuted_by_what_the_camera_does_not_see(v2x):
+    """A claim to stand in the open, with the power of the open: only the missing car tells."""
+    signature = v2x.RadioSignature()
+    plain = v2x.Beacon(0, 20.0, 0.0, -5.0, 0.0, signature.transmit_dbm - signature.loss_at_1_m_db - 26.0)
+    forged = [replace(plain, stamp_ns=nanoseconds(i / 10)) for i in range(1, 81)]
+    refuted = last(v2x.run(forged, v2x.ScriptedCamera([], t0_s=0.0)))
+    believed = last(v2x.run(forged, None))
+    assert refuted.cues[0].hypotheses.none > 0.9
+    assert believed.cues[0].hypotheses.visible > 0.9
+    # A camera that misses almost everything refutes nothing.
+    blind = last(v2x.run(forged, v2x.ScriptedCamera([], t0_s=0.0, miss_rate=0.99)))
+    assert blind.cues[0].hypotheses.visible > 0.9
+
+
+def test_a_beacon_whose_power_belies_its_claim_is_nobody(v2x):
+    far_too_weak = [
+        replace(beacon, power_dbm=beacon.power_dbm - 30.0) for beacon in v2x.approach_from_left(3.0)
+    ]
+    state = last(v2x.run(far_too_weak, v2x.ScriptedCamera([], t0_s=0.0)))
+    assert state.cues[0].hypotheses.none > 0.9
+    assert state.entities == ()
+
+
+def test_what_the_camera_is_asked_for_follows_from_the_claim(v2x):
+    asked = []
+
+    class Spy:
+        def ask(self, stamp_ns, bearing, expected_labels=None, side=None):
+            asked.append(set(expected_labels))
+            return Absent(0.1)
+
+        def sightings(self, stamp_ns):
+            return ()
+
+    beacon = v2x.approach_from_left()[0]
+    adapter = v2x.BeaconAdapter(vision=Spy())
+    kinds = ["passenger car", "truck", "pedestrian", "spaceship"]
+    answers = [adapter.measure([replace(beacon, station=kind)])[0].co_evidence for kind in kinds]
+    assert asked == [{"car"}, {"truck", "bus"}]
+    assert [type(answer) for answer in answers] == [Absent, Absent, Unqueried, Unqueried]
+
+
+def test_beacons_and_sound_share_one_filter(v2x):
+    """Sound alone leaves doubt, beacons alone leave doubt; together they are believed, as one entity."""
+    doubtful = v2x.RadioSignature(loss_std_db=12.0)
+    beacons = v2x.approach_from_left(2.0)
+    radio = v2x.BeaconAdapter(doubtful).measure(beacons)
+    faint = SignatureEvidence(("left", "right"), (0.5, -0.5), 0.0, 0.3)
+    sound = [Measurement(m.stamp_ns, faint, Unqueried("-"), NotUsable("-"), NotUsable("-")) for m in radio]
+
+    def heard(measurements):
+        world = WorldFilter()
+        for m in sorted(measurements, key=lambda m: (m.stamp_ns, m.source)):
+            world = world.predict_to(m.stamp_ns).update(m)
+        return world
+
+    both = heard([*radio, *sound])
+    assert both.explanation.hidden[0] > max(heard(w).explanation.hidden[0] for w in (radio, sound))
+    (entity,) = both.state.entities
+    assert set(entity.sources) <= {"acoustic", "v2x"}
+    assert {source for source, _ in both.memory.last_ns} == {"acoustic", "v2x"}
+
+
+def test_the_example_needs_nothing_of_sound_and_reaches_into_no_private_part():
+    tree = ast.parse(EXAMPLE.read_text(encoding="utf-8"))
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    names = {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+    assert not any("frontend" in module or "acoustic" in module for module in imported)
+    assert not any(name.startswith("_") for name in names)
+
+
+def test_it_runs_as_a_program(v2x, capsys):
+    v2x.main()
+    out = capsys.readouterr().out
+    assert "hidden" in out
+    assert "visible" in out
+
+
+def test_presence_answers_the_same_whatever_the_modality(v2x):
+    beacon = v2x.approach_from_left()[-10]
+    camera = v2x.ScriptedCamera([beacon], t0_s=0.0)
+    (measurement,) = v2x.BeaconAdapter(vision=camera).measure([beacon])
+    assert isinstance(measurement.co_evidence, Present)
+    assert measurement.source == "v2x"

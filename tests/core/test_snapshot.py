@@ -1,0 +1,229 @@
+"""Snapshots: what is written is read back, order carries no meaning, and damage is refused by name."""
+
+import copy
+import json
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
+from worldstate.state import (
+    Classification,
+    Context,
+    Entity,
+    Occluder,
+    Priors,
+    Rates,
+    Relation,
+    RiskCue,
+    Visibility,
+    WorldState,
+)
+
+unit = st.floats(0.0, 1.0)
+number = st.floats(allow_nan=False, allow_infinity=False, width=64)
+azimuth = st.floats(-math.pi, math.pi)
+stamp = st.integers(-(2**62), 2**62)
+name = st.text(max_size=12)
+vector = st.tuples(number, number, number)
+
+
+def maybe(strategy):
+    return st.none() | strategy
+
+
+@st.composite
+def priors(draw):
+    hidden = draw(st.floats(0.0, 1.0))
+    visible = draw(st.floats(0.0, 1.0)) * (1.0 - hidden)
+    return Priors(hidden, visible, max(1.0 - hidden - visible, 0.0))
+
+
+entities = st.builds(
+    Entity,
+    id=st.uuids().map(str),
+    status=st.sampled_from(["hidden", "emerged", "visible"]),
+    existence_probability=unit,
+    hidden_probability=unit,
+    azimuth_rad=azimuth,
+    azimuth_std_rad=number,
+    created_ns=stamp,
+    updated_ns=stamp,
+    classification=st.lists(st.builds(Classification, name, unit), max_size=3).map(tuple),
+    moving=st.booleans(),
+    direction=maybe(name),
+    azimuth_rate_rad_s=maybe(number),
+    range_m=maybe(number),
+    position_m=maybe(vector),
+    velocity_mps=maybe(vector),
+    inverse_tta_hz=maybe(number),
+    inverse_tta_std_hz=maybe(number),
+    tta_s=maybe(number),
+    visibility=st.builds(Visibility, st.sampled_from(["visible", "absent", "unqueried"]), maybe(unit)),
+    sources=st.lists(name, max_size=2).map(tuple),
+    last_seen_ns=maybe(stamp),
+)
+relations = st.builds(Relation, name, name, name, unit, stamp)
+cues = st.builds(
+    RiskCue,
+    direction=name,
+    azimuth_rad=azimuth,
+    azimuth_std_rad=number,
+    risk=unit,
+    confidence=unit,
+    statistic=unit,
+    log_lambda=maybe(number),
+    hypotheses=priors(),
+    advisory=st.booleans(),
+    alpha=maybe(unit),
+    entity_id=maybe(name),
+    horizon_s=maybe(number),
+)
+occluders = st.builds(Occluder, name, name, azimuth, azimuth, st.floats(0.01, 3.0))
+contexts = st.builds(
+    Context,
+    rates=st.builds(Rates, *[st.floats(0, 10)] * 6),
+    occluders=st.lists(
+        occluders, min_size=1, max_size=3, unique_by=(lambda o: o.id, lambda o: o.direction)
+    ).map(tuple),
+    priors=maybe(priors()),
+    ego_speed_mps=maybe(number),
+    degradation=maybe(unit),
+    site=maybe(name),
+    view_half_angle_rad=st.floats(0, 3),
+)
+states = st.builds(
+    WorldState,
+    stamp_ns=stamp,
+    seq=st.integers(0, 2**40),
+    entities=st.lists(entities, max_size=4, unique_by=lambda e: e.id).map(tuple),
+    relations=st.lists(relations, max_size=4, unique_by=lambda r: (r.src, r.dst, r.kind)).map(tuple),
+    context=contexts,
+    cues=st.lists(cues, max_size=3, unique_by=lambda c: c.direction).map(tuple),
+    clock=name,
+)
+
+
+@given(states)
+def test_what_is_written_is_read_back(state):
+    assert WorldState.from_json(state.to_json()) == state
+    assert WorldState.from_dict(state.to_dict()) == state
+
+
+@given(states, st.randoms())
+def test_order_carries_no_meaning(state, random):
+    parts = {key: list(getattr(state, key)) for key in ("entities", "relations", "cues")}
+    for part in parts.values():
+        random.shuffle(part)
+    parts = {key: tuple(part) for key, part in parts.items()}
+    shuffled = WorldState(state.stamp_ns, state.seq, context=state.context, clock=state.clock, **parts)
+    assert shuffled == state
+    assert shuffled.to_json() == state.to_json()
+
+
+def full_state():
+    entity = Entity("a", "hidden", 0.9, 0.8, 0.9, 0.3, 1, 2, (Classification("vehicle", 1.0),))
+    cue = RiskCue("left", 0.9, 0.3, 0.7, 0.9, 0.95, 2.0, Priors(0.7, 0.2, 0.1), True, 0.02, "a", 2.5)
+    edge = Relation("a", "corner_left", "occluded_by", 0.9, 2)
+    return WorldState(2, 1, (entity,), (edge,), Context(priors=Priors(0.2, 0.3, 0.5)), (cue,))
+
+
+def places(value, path=()):
+    """All paths into a decoded JSON value."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        yield from places(item, (*path, key))
+
+
+def replaced(value, path, new):
+    if not path:
+        return new
+    value = copy.copy(value)
+    value[path[0]] = replaced(value[path[0]], path[1:], new)
+    return value
+
+
+junk = st.sampled_from([None, True, -1, 0.5, 1e308, 10**400, "", "x", [], [1], {}, {"a": 1}, [[]], 2**70])
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_damage_is_accepted_or_refused_by_a_typed_error(data):
+    value = full_state().to_dict()
+    path = data.draw(st.sampled_from(list(places(value))))
+    try:
+        WorldState.from_dict(replaced(value, path, data.draw(junk))).to_json()
+    except WorldstateError as error:
+        assert "snapshot" in str(error) or "expected" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("path", "new", "words"),
+    [
+        (("entities", 0, "azimuth_rad"), "left", r"snapshot\.entities\[0\]\.azimuth_rad: expected a finite"),
+        (("entities", 0, "existence_probability"), 1.2, "existence_probability: expected a number in"),
+        (("entities", 0, "status"), "ghost", "status: expected one of hidden, emerged, visible"),
+        (("relations",), {}, "relations: expected a list"),
+        (("cues", 0, "advisory"), 1, "advisory: expected true or false"),
+        (("context", "rates", "arrival_hz"), -1.0, "arrival_hz: expected a number in"),
+        (("stamp_ns",), 1.5, "stamp_ns: expected a whole number"),
+        (("stamp_ns",), True, "stamp_ns: expected a whole number"),
+    ],
+)
+def test_damage_is_named(path, new, words):
+    with pytest.raises(InvalidArgumentError, match=words):
+        WorldState.from_dict(replaced(full_state().to_dict(), path, new))
+
+
+@pytest.mark.parametrize("cut", [1, 40, 400, -1])
+def test_a_cut_text_is_refused(cut):
+    with pytest.raises(InvalidArgumentError, match="expected JSON"):
+        WorldState.from_json(full_state().to_json()[:cut])
+
+
+@pytest.mark.parametrize("text", ["NaN", "[" * 100_000, "1" * 5000, '{"a": Infinity}'])
+def test_no_json_is_refused(text):
+    with pytest.raises(InvalidArgumentError):
+        WorldState.from_json(text)
+
+
+def test_unknown_keys_are_ignored_and_minor_versions_read():
+    value = full_state().to_dict()
+    value |= {"mood": "fine", "schema": {"name": "worldstate.Snapshot", "version": "1.9.3"}}
+    value["entities"][0]["colour"] = "red"
+    assert WorldState.from_dict(value) == full_state()
+
+
+@pytest.mark.parametrize("version", ["2.0.0", "0.9.0", "11.0.0", "x"])
+def test_another_major_version_is_refused(version):
+    value = full_state().to_dict() | {"schema": {"name": "worldstate.Snapshot", "version": version}}
+    with pytest.raises(SchemaVersionError, match=r"expected schema worldstate\.Snapshot 1\.x"):
+        WorldState.from_dict(value)
+
+
+def test_json_never_says_nan():
+    entity = Entity("a", "hidden", 0.9, 0.8, math.nan, 0.3, 1, 2)
+    with pytest.raises(InvalidArgumentError, match="finite"):
+        WorldState(0, 0, (entity,)).to_json()
+
+
+def test_unknown_is_null():
+    written = json.loads(full_state().to_json())["entities"][0]
+    unknown = ("range_m", "position_m", "velocity_mps", "tta_s", "last_seen_ns")
+    assert [written[key] for key in unknown] == [None] * 5
+
+
+def test_the_graph_holds_every_relation():
+    graph = full_state().graph()
+    assert graph.nodes["a"]["value"].status == "hidden"
+    assert graph.nodes["corner_left"]["type"] == "occluder"
+    assert list(graph.edges(keys=True)) == [("a", "corner_left", "occluded_by")]
+    assert graph.edges["a", "corner_left", "occluded_by"]["probability"] == 0.9
+
+
+def test_risk_is_the_largest_of_all_directions():
+    assert full_state().risk == 0.7
+    assert WorldState(0, 0).risk == 0.0

@@ -1,0 +1,90 @@
+"""Looming against closed forms of an approaching point source."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.frontend.approach.looming import Looming, looming
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
+
+TIMES_S = np.arange(-0.95, 0.0, 0.1)
+
+
+def direct_approach(range_m: float, closing_m_s: float) -> np.ndarray:
+    """Log-energy of a point source that is `range_m` away at the end of the window."""
+    return -2.0 * np.log(range_m - closing_m_s * TIMES_S)
+
+
+@given(st.floats(2.0, 80.0), st.floats(0.0, 15.0), st.floats(-30.0, 30.0))
+def test_exact_at_constant_speed_whatever_the_level(range_m: float, closing_m_s: float, level: float) -> None:
+    found = looming(TIMES_S, direct_approach(range_m, closing_m_s) + level, floor_std=1e-4)
+    assert isinstance(found, Looming)
+    assert found.inverse_tta_hz == pytest.approx(closing_m_s / range_m, rel=1e-6, abs=1e-9)
+
+
+@given(st.floats(20.0, 80.0), st.floats(1.0, 15.0))
+def test_log_slope_is_two_over_tta_near_the_middle(range_m: float, closing_m_s: float) -> None:
+    found = looming(TIMES_S, direct_approach(range_m, closing_m_s), floor_std=1e-4)
+    assert isinstance(found, Looming)
+    middle = 2 * closing_m_s / (range_m + 0.5 * closing_m_s)
+    assert found.log_slope_hz == pytest.approx(middle, rel=0.02)
+
+
+def test_a_receding_source_has_a_negative_rate() -> None:
+    found = looming(TIMES_S, direct_approach(30.0, -6.0), floor_std=1e-3)
+    assert isinstance(found, Looming)
+    assert found.inverse_tta_hz == pytest.approx(-0.2, rel=1e-6)
+
+
+def test_standard_errors_tell_the_truth() -> None:
+    rng = np.random.default_rng(0)
+    sigma = 0.08
+    found = [
+        looming(TIMES_S, direct_approach(30.0, 9.0) + sigma * rng.normal(size=10), sigma) for _ in range(1500)
+    ]
+    usable = [f for f in found if isinstance(f, Looming)]
+    assert len(usable) == len(found)
+    z_range = np.array([(f.inverse_tta_hz - 0.3) / f.std_hz for f in usable])
+    slopes = np.array([f.log_slope_hz for f in usable])
+    z_slope = (slopes - slopes.mean()) / np.array([f.log_slope_std_hz for f in usable])
+    assert abs(np.median(z_range)) < 0.1
+    # The assumed scatter is never below the floor, so that errors are a little wide rather than narrow.
+    assert 0.75 < z_range.std() < 1.1
+    assert 0.75 < z_slope.std() < 1.1
+
+
+def test_standard_error_grows_with_the_scatter_that_is_there() -> None:
+    jagged = direct_approach(30.0, 9.0) + 0.3 * np.array([1, -1] * 5)
+    smooth = looming(TIMES_S, direct_approach(30.0, 9.0), floor_std=0.05)
+    rough = looming(TIMES_S, jagged, floor_std=0.05)
+    assert isinstance(smooth, Looming)
+    assert isinstance(rough, Looming)
+    assert rough.std_hz > 3 * smooth.std_hz
+
+
+def test_wild_energy_is_not_usable() -> None:
+    assert isinstance(looming(TIMES_S, 2.0 * np.array([1, -1] * 5), floor_std=0.05), NotUsable)
+
+
+def test_range_zero_within_the_window_is_not_usable() -> None:
+    steep = np.linspace(0.0, 1.0, 10) ** 4 * 8.0
+    found = looming(TIMES_S, steep, floor_std=0.1)
+    assert isinstance(found, NotUsable)
+    assert "zero" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("times", "energy", "floor"),
+    [
+        (TIMES_S[:3], np.zeros(3), 0.1),
+        (TIMES_S[::-1], np.zeros(10), 0.1),
+        (TIMES_S, np.zeros(9), 0.1),
+        (TIMES_S, np.full(10, np.nan), 0.1),
+        (TIMES_S, np.zeros(10), 0.0),
+    ],
+)
+def test_bad_input_is_refused(times: np.ndarray, energy: np.ndarray, floor: float) -> None:
+    with pytest.raises(InvalidArgumentError):
+        looming(times, energy, floor)

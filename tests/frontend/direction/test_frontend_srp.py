@@ -1,0 +1,139 @@
+"""SRP-PHAT against pyroomacoustics on the same frames, and its laws."""
+
+import numpy as np
+import pyroomacoustics
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.peaks import find_peaks
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.stft import StreamingStft
+
+AZIMUTHS = np.radians(np.arange(-90.0, 91.0))
+BAND = (300.0, 1800.0)
+
+
+def random_array(rng: np.random.Generator, n_microphones: int = 6) -> MicrophoneArray:
+    return MicrophoneArray(rng.uniform(-0.3, 0.3, (n_microphones, 3)))
+
+
+def beams(array: MicrophoneArray, rate: float = 48_000.0) -> Steering:
+    return Steering.towards(array, bin_frequencies_hz(band_bins(BAND, rate, 512), rate, 512), AZIMUTHS)
+
+
+def random_frames(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+
+
+def noise_from(array: MicrophoneArray, azimuth_rad: float, rate: float, seed: int) -> np.ndarray:
+    """One second of a white plane wave in a little sensor noise, exact fractional delays, float32 (n, M)."""
+    rng, n = np.random.default_rng(seed), int(rate)
+    wave = np.fft.rfft(rng.standard_normal(n))[:, None]
+    wave = wave * array.steering(np.fft.rfftfreq(n, 1 / rate), azimuth_rad)[:, :, 0]
+    return (np.fft.irfft(wave, n, axis=0) + 0.1 * rng.standard_normal((n, array.n_microphones))).astype("f4")
+
+
+@pytest.mark.parametrize("rate", [47_998.0, 16_000.0])
+@pytest.mark.parametrize("layout", ["roof", "square", "line", "solid"])
+def test_equals_pyroomacoustics_on_the_same_frames(layout: str, rate: float) -> None:
+    layouts = {
+        "roof": roof_array_56().positions_m,
+        "square": [[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]],
+        "line": [[0, 0.1 * i, 0] for i in range(6)],
+        "solid": np.random.default_rng(5).uniform(-0.3, 0.3, (9, 3)),
+    }
+    array = MicrophoneArray(layouts[layout])
+    frames = StreamingStft(array.n_microphones, 512, range(0, 257)).push(
+        noise_from(array, 0.3, rate, 0)[:4800]
+    )
+    peer = pyroomacoustics.doa.SRP(array.positions_m.T, rate, 512, c=343.0, azimuth=AZIMUTHS)
+    peer.locate_sources(frames.transpose(2, 1, 0).astype(np.complex128), freq_range=list(BAND))
+    bins = band_bins(BAND, rate, 512)
+    ours = srp_phat(frames[:, bins.start : bins.stop], beams(array, rate))
+    assert np.corrcoef(ours, peer.grid.values)[0, 1] > 0.999999
+    m = array.n_microphones
+    np.testing.assert_allclose(ours * 2 * m / (m - 1), peer.grid.values, rtol=2e-5)
+
+
+def test_factored_beams_equal_full_ones() -> None:
+    array, rate = roof_array_56(), 47_998.0
+    factored = beams(array, rate)
+    assert factored.basis is not None
+    frequencies = bin_frequencies_hz(band_bins(BAND, rate, 512), rate, 512)
+    full = array.steering(frequencies, AZIMUTHS).conj()
+    frames = random_frames(np.random.default_rng(0), (20, len(frequencies), 56))
+    whitened = frames / np.abs(frames)
+    direct = np.abs(np.einsum("tkm,kma->tka", whitened, full)) ** 2
+    np.testing.assert_allclose(srp_phat(frames, factored), direct.mean((0, 1)) / 56**2, rtol=1e-5)
+
+
+@given(st.floats(-1.4, 1.4), st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=25)
+def test_a_lone_plane_wave_scores_one_where_it_comes_from(azimuth: float, seed: int) -> None:
+    array = random_array(np.random.default_rng(seed))
+    frequencies = bin_frequencies_hz(band_bins(BAND, 48_000, 512), 48_000, 512)
+    steering = Steering.towards(array, frequencies, [azimuth - 0.2, azimuth, azimuth + 0.2])
+    wave = array.steering(frequencies, azimuth)[None, :, :, 0].astype(np.complex64)
+    spectrum = srp_phat(wave, steering)
+    assert spectrum[1] == pytest.approx(1.0, abs=1e-5)
+    assert spectrum[1] >= spectrum.max()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=25)
+def test_microphone_order_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    array = random_array(rng)
+    order = rng.permutation(6)
+    frames = random_frames(rng, (9, 16, 6))
+    shuffled = srp_phat(frames[:, :, order], beams(MicrophoneArray(array.positions_m[order])))
+    np.testing.assert_allclose(shuffled, srp_phat(frames, beams(array)), rtol=1e-5)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=25)
+def test_mirrored_array_hears_the_mirrored_world(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    array = random_array(rng)
+    frames = random_frames(rng, (9, 16, 6))
+    mirrored = MicrophoneArray(array.positions_m * [1.0, -1.0, 1.0])
+    np.testing.assert_allclose(
+        srp_phat(frames, beams(mirrored)), srp_phat(frames, beams(array))[::-1], rtol=1e-5
+    )
+
+
+@given(st.floats(1e-4, 1e4), st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=25)
+def test_a_gain_changes_nothing(gain: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    array, frames = random_array(rng), random_frames(rng, (9, 16, 6))
+    louder = srp_phat(np.float32(gain) * frames, beams(array))
+    np.testing.assert_allclose(louder, srp_phat(frames, beams(array)), rtol=1e-5)
+
+
+def test_independent_noise_scores_one_over_m() -> None:
+    frames = random_frames(np.random.default_rng(0), (4000, 16, 6))
+    spectrum = srp_phat(frames, beams(random_array(np.random.default_rng(1))))
+    np.testing.assert_allclose(spectrum, 1 / 6, rtol=0.02)
+
+
+def test_silence_scores_zero() -> None:
+    assert not srp_phat(
+        np.zeros((3, 16, 6), np.complex64), beams(random_array(np.random.default_rng(0)))
+    ).any()
+
+
+@pytest.mark.parametrize("azimuth_deg", [-70.0, -20.4, 0.3, 33.7, 60.0])
+def test_bearing_is_finer_than_the_grid(azimuth_deg: float) -> None:
+    array = roof_array_56()
+    sound = noise_from(array, np.radians(azimuth_deg), 47_998.0, 3)
+    bins = band_bins(BAND, 47_998, 512)
+    spectrum = srp_phat(StreamingStft(56, 512, bins).push(sound), beams(array, 47_998.0))
+    tolerance_deg = 0.1 / np.cos(np.radians(azimuth_deg))
+    assert np.degrees(find_peaks(spectrum, AZIMUTHS)[0].azimuth_rad) == pytest.approx(
+        azimuth_deg, abs=tolerance_deg
+    )

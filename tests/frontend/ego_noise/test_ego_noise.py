@@ -1,0 +1,565 @@
+"""Ego-noise: the generator's physics, prewhitening and its definition, learning, engine lines, no harm."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.covariance import OAS
+from sklearn.metrics import roc_auc_score
+
+from worldstate.adapters.simulation.sound.ego_sound import ENGINE_M, ego_noise, ego_sound
+from worldstate.frontend.approach.engine_line import track_fundamental
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.music import covariance_subspace, music_spectrum
+from worldstate.frontend.direction.srp import steered_power
+from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
+from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
+from worldstate.frontend.ego_noise.prewhitening import Prewhitener, inverse_root, white_share
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.phat import whiten
+from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.errors import InvalidArgumentError
+
+RATE, NFFT = 16_000, 256
+ROOF = MicrophoneArray(roof_array_56().positions_m[::4])
+LIFTED_M = np.array([0.0, 0.0, 1.7])
+MOUNTED_M = ROOF.positions_m + LIFTED_M
+PLAIN = FrontEndSettings(nfft=NFFT)
+LEARNING = replace(PLAIN, ego_noise=EgoNoiseSettings())
+
+
+def noise_covariance(rng: np.random.Generator, bins: int, microphones: int) -> np.ndarray:
+    roots = rng.standard_normal((bins, microphones, 2 * microphones)) + 1j * rng.standard_normal(
+        (bins, microphones, 2 * microphones)
+    )
+    return roots @ roots.conj().transpose(0, 2, 1)
+
+
+def wave(
+    azimuth_rad: float, seconds: float, rng: np.random.Generator, like: np.ndarray | None = None
+) -> np.ndarray:
+    """A plane wave of noise in the band of SRP, unit mean square, flat or coloured like a sound, (n, M)."""
+    n = round(seconds * RATE)
+    frequencies = np.fft.rfftfreq(n, 1 / RATE)
+    spectrum = np.fft.rfft(rng.standard_normal(n)) * ((frequencies > 300) & (frequencies < 1800))
+    if like is not None:
+        grid, density = scipy.signal.welch(like, RATE, nperseg=512, axis=0)
+        spectrum *= np.sqrt(np.interp(frequencies, grid, density.mean(axis=1)))
+    heard = np.fft.irfft(spectrum[:, None] * ROOF.steering(frequencies, azimuth_rad)[:, :, 0], n, axis=0)
+    return (heard / heard.std()).astype(np.float32)
+
+
+def in_band(sound: np.ndarray, rate: float = RATE) -> np.ndarray:
+    sos = scipy.signal.butter(4, [300, 1800], "bandpass", fs=rate, output="sos")
+    return scipy.signal.sosfilt(sos, sound, axis=0)
+
+
+# The generator.
+
+
+def test_the_same_seed_gives_the_same_sound_and_another_another() -> None:
+    speed = np.full(4000, 8.0)
+    first, again, other = (ego_noise(MOUNTED_M, speed, RATE, np.random.default_rng(s)) for s in (1, 1, 2))
+    assert first.shape == (4000, len(MOUNTED_M))
+    assert first.dtype == np.float32
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0.1 * first.std()
+
+
+def test_levels_follow_the_speed_while_driving() -> None:
+    speed = np.repeat([5.0, 10.0, 20.0], RATE)
+    sound = in_band(ego_noise(MOUNTED_M, speed, RATE, np.random.default_rng(3)))
+    level_db = 10 * np.log10([np.square(part[2000:-2000]).mean() for part in np.split(sound, 3)])
+    # Per doubling rolling noise rises by 8 to 12 dB, wind by 12, flow by 18; the engine by one or two.
+    assert 3 < level_db[1] - level_db[0] < 14
+    assert 6 < level_db[2] - level_db[1] < 14
+
+
+def test_wind_knows_nothing_of_its_neighbour_and_the_vehicle_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = np.array([[0, 0.03, 1.7], [0, -0.03, 1.7]])
+    both = ego_noise(pair, np.full(4 * RATE, 8.0), RATE, np.random.default_rng(4))
+    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._add_wind", lambda *_: None)
+    vehicle = ego_noise(pair, np.full(4 * RATE, 8.0), RATE, np.random.default_rng(4))
+    of_wind, of_vehicle = (
+        scipy.signal.coherence(*sound.T, RATE, nperseg=1024)[1][20:60] for sound in (both - vehicle, vehicle)
+    )
+    assert of_wind.mean() < 0.05
+    assert of_vehicle.mean() > 0.8
+
+
+def test_the_engine_s_sound_arrives_when_geometry_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the engine, no wind, no road: two microphones, delay and level by hand."""
+    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._places", lambda: ENGINE_M[None])
+    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._add_wind", lambda *_: None)
+    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound.ROAD_REFLECTION", 0.0)
+    monkeypatch.setattr(
+        "worldstate.adapters.simulation.sound.ego_sound._levels_db", lambda speed: [np.full((8, 9), 94.0)]
+    )
+    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._line_shares", lambda: (0.0,))
+    pair = np.array([[0.0, 0.4, 1.4], [0.0, -0.1, 2.2]])
+    sound = ego_noise(pair, np.full(9 * 1024, 5.0), 48_000.0, np.random.default_rng(5))
+    edge = np.stack([np.full(1201, 0.4), np.linspace(-0.6, 0.6, 1201), np.full(1201, 1.35)], axis=1)
+    paths = np.linalg.norm(edge - ENGINE_M, axis=1)[:, None] + np.linalg.norm(edge[:, None] - pair, axis=2)
+    lengths = paths.min(axis=0)
+    lag = np.argmax(np.correlate(sound[:, 1], sound[:, 0], "full")) - (len(sound) - 1)
+    assert lag == pytest.approx(np.diff(lengths)[0] / 343.0 * 48_000, abs=1.0)
+    levels = sound[2000:-2000].std(axis=0)
+    assert levels[0] / levels[1] == pytest.approx(lengths[1] / lengths[0], rel=0.02)
+
+
+def test_a_standing_car_has_an_engine_and_no_tyres() -> None:
+    sound = ego_sound(MOUNTED_M, np.zeros(4 * RATE), RATE, np.random.default_rng(6))
+    assert sound.firing_hz.mean() == pytest.approx(800 / 60 * 2, rel=0.02)
+    frequencies, density = scipy.signal.welch(sound.pressure_pa[:, 0], RATE, nperseg=RATE)
+    lines = [density[np.abs(frequencies - h * sound.firing_hz.mean()) < 3].max() for h in (2, 3, 4)]
+    between = [density[np.abs(frequencies - (h + 0.5) * sound.firing_hz.mean()) < 3].max() for h in (2, 3, 4)]
+    assert np.median(np.array(lines) / between) > 5
+
+
+@pytest.mark.parametrize(
+    ("positions", "speed", "named"),
+    [
+        (MOUNTED_M[:, :2], np.ones(100), "positions_m"),
+        (MOUNTED_M, np.ones((100, 2)), "speed_mps"),
+        (MOUNTED_M, -np.ones(100), "speed_mps"),
+        (MOUNTED_M, np.full(100, np.nan), "speed_mps"),
+        (MOUNTED_M, np.ones(0), "one sample"),
+    ],
+)
+def test_a_bad_drive_is_named(positions: np.ndarray, speed: np.ndarray, named: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=named):
+        ego_noise(positions, speed, RATE, np.random.default_rng(0))
+
+
+# Prewhitening.
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000), microphones=st.integers(2, 12), level=st.floats(1e-6, 1e6))
+def test_whitened_noise_is_white_whatever_its_level(seed: int, microphones: int, level: float) -> None:
+    R = level * noise_covariance(np.random.default_rng(seed), 2, microphones)
+    whitener = Prewhitener.of(R, shrinkage=0.0)
+    power = np.einsum("bmm->b", R).real / microphones
+    expected = np.eye(microphones) * power[:, None, None]
+    np.testing.assert_allclose(whitener.covariance(R), expected, atol=1e-6 * level * microphones)
+    np.testing.assert_allclose(whitener.roots, whitener.roots.conj().transpose(0, 2, 1), atol=1e-12)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000), microphones=st.integers(3, 10))
+def test_eigenvalues_are_the_generalised_ones(seed: int, microphones: int) -> None:
+    """Oracle: scipy's generalised eigensolver."""
+    rng = np.random.default_rng(seed)
+    R, noise = noise_covariance(rng, 1, microphones), noise_covariance(rng, 1, microphones)
+    noise /= np.trace(noise[0]).real / microphones
+    ours = np.linalg.eigvalsh(Prewhitener.of(noise, shrinkage=0.0).covariance(R)[0])
+    np.testing.assert_allclose(ours, scipy.linalg.eigh(R[0], noise[0], eigvals_only=True), rtol=1e-7)
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 10_000), level=st.floats(1e-3, 1e3), shrinkage=st.floats(0.0, 1.0))
+def test_white_noise_changes_nothing(seed: int, level: float, shrinkage: float) -> None:
+    rng = np.random.default_rng(seed)
+    whitener = Prewhitener.of(np.tile(level * np.eye(5), (3, 1, 1)), shrinkage)
+    frames = rng.standard_normal((4, 3, 5)) + 1j * rng.standard_normal((4, 3, 5))
+    steering = np.exp(1j * rng.uniform(0, 6, (3, 5, 7)))
+    np.testing.assert_allclose(whitener.spectra(frames), frames, rtol=1e-12)
+    np.testing.assert_allclose(whitener.steering(steering), steering, rtol=1e-12)
+
+
+def test_spectra_covariance_and_steering_are_whitened_alike() -> None:
+    rng = np.random.default_rng(7)
+    whitener = Prewhitener.of(noise_covariance(rng, 2, 4))
+    frames = rng.standard_normal((9, 2, 4)) + 1j * rng.standard_normal((9, 2, 4))
+    R = np.einsum("tbi,tbj->bij", frames, frames.conj())
+    white = whitener.spectra(frames)
+    np.testing.assert_allclose(whitener.covariance(R), np.einsum("tbi,tbj->bij", white, white.conj()))
+    turned = whitener.steering(frames[:1].transpose(1, 2, 0))[:, :, 0]
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), np.linalg.norm(frames[0], axis=1))
+    assert np.abs(np.vdot(turned[0], white[0, 0])) == pytest.approx(
+        np.linalg.norm(turned[0]) * np.linalg.norm(white[0, 0])
+    )
+
+
+def test_a_dead_microphone_has_no_say_and_silence_changes_nothing() -> None:
+    R = noise_covariance(np.random.default_rng(8), 2, 4)
+    R[:, 2] = R[:, :, 2] = 0.0
+    root = inverse_root(R)
+    assert not root[:, 2].any()
+    assert np.einsum("bmm->bm", root).real[:, [0, 1, 3]].min() > 0
+    np.testing.assert_array_equal(inverse_root(np.zeros((2, 3, 3))), np.tile(np.eye(3), (2, 1, 1)))
+
+
+def test_gain_is_bounded_by_the_shrinkage() -> None:
+    rank_one = np.ones((1, 6, 6))
+    assert np.linalg.eigvalsh(inverse_root(rank_one, 0.04)[0]).max() == pytest.approx(1 / np.sqrt(0.04))
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 10_000), microphones=st.integers(4, 30), n_frames=st.integers(60, 400))
+def test_the_shrinkage_knows_white_noise_from_structure(seed: int, microphones: int, n_frames: int) -> None:
+    """Oracle for the real part of the formula: scikit-learn's OAS on real data."""
+    rng = np.random.default_rng(seed)
+    white = (
+        rng.standard_normal((n_frames, microphones)) + 1j * rng.standard_normal((n_frames, microphones))
+    ) / 2**0.5
+    loud = white + 3.0 * rng.standard_normal((n_frames, 1)) * np.exp(1j * np.arange(microphones))
+    of_white, of_loud = (white_share(x.T @ x.conj() / n_frames, n_frames) for x in (white, loud))
+    assert of_white > 0.5
+    assert of_loud < 0.1
+    x = white.real @ np.diag(np.linspace(0.5, 2.0, microphones))
+    shrinkage = OAS(assume_centered=True).fit(x).shrinkage_
+    # scikit-learn leaves the small terms 2 / M out, as the published correction does.
+    assert white_share(x.T @ x / n_frames, n_frames) == pytest.approx(shrinkage, rel=0.25)
+
+
+@pytest.mark.parametrize(("R", "s"), [(np.ones((1, 2, 3)), 0.1), (np.eye(2)[None], 1.5), (np.eye(2), 0.1)])
+def test_bad_covariances_are_refused(R: np.ndarray, s: float) -> None:
+    with pytest.raises(InvalidArgumentError):
+        inverse_root(R, s)
+
+
+def test_generalised_music_finds_the_source_under_a_louder_interferer() -> None:
+    rng = np.random.default_rng(9)
+    grid = np.radians(np.arange(-90.0, 91.0))
+    A = ROOF.steering([700.0, 1000.0, 1300.0], grid)
+    noise_at, source_at = 60, 115
+    interferer = 10.0 * A[:, :, [noise_at]] @ A[:, :, [noise_at]].conj().transpose(0, 2, 1)
+    noise = interferer + np.eye(ROOF.n_microphones)
+    R = noise + A[:, :, [source_at]] @ A[:, :, [source_at]].conj().transpose(0, 2, 1)
+    whitener = Prewhitener.of(noise, shrinkage=1e-3)
+    plain = music_spectrum(covariance_subspace(R, 1), A)
+    general = music_spectrum(covariance_subspace(whitener.covariance(R), 1), whitener.steering(A))
+    assert plain.argmax() == noise_at
+    assert general.argmax() == source_at
+    mixed = noise_covariance(rng, 3, ROOF.n_microphones)
+    assert not np.allclose(whitener.covariance(mixed), mixed)
+
+
+# Learning.
+
+
+def run(sound: np.ndarray, chosen: FrontEndSettings, gate: float | None = None) -> list:
+    front_end = FrontEnd(ROOF, RATE, chosen)
+    if gate is not None:
+        front_end.learn_ego_noise(gate)
+    return front_end.process(sound)
+
+
+def test_nothing_changes_before_something_is_learned() -> None:
+    sound = wave(0.3, 1.5, np.random.default_rng(10))
+    for plain, shut in zip(run(sound, PLAIN), run(sound, LEARNING, gate=0.0), strict=True):
+        np.testing.assert_array_equal(plain.srp, shut.srp)
+        np.testing.assert_array_equal(plain.feature, shut.feature)
+
+
+@settings(deadline=None, max_examples=4)
+@given(cuts=st.lists(st.integers(0, 28_000), max_size=8))
+def test_block_size_does_not_matter_while_learning(cuts: list[int]) -> None:
+    rng = np.random.default_rng(11)
+    sound = ego_noise(MOUNTED_M, np.full(28_000, 8.0), RATE, rng) + 0.01 * wave(0.4, 1.75, rng)
+    whole, pieces = FrontEnd(ROOF, RATE, LEARNING), FrontEnd(ROOF, RATE, LEARNING)
+    for front_end in (whole, pieces):
+        front_end.learn_ego_noise(0.9)
+        front_end.follow_engine(64.0)
+    frames = whole.process(sound)
+    parts = [frame for block in np.split(sound, sorted(cuts)) for frame in pieces.process(block)]
+    assert len(parts) == len(frames) > 5
+    for a, b in zip(frames, parts, strict=True):
+        np.testing.assert_array_equal(a.srp, b.srp)
+
+
+def test_the_published_feature_is_left_alone_unless_asked() -> None:
+    sound = ego_noise(MOUNTED_M, np.full(3 * RATE, 8.0), RATE, np.random.default_rng(12))
+    plain, learned = run(sound, PLAIN)[-1], run(sound, LEARNING, gate=1.0)[-1]
+    both = run(sound, replace(PLAIN, ego_noise=EgoNoiseSettings(feature=True)), gate=1.0)[-1]
+    np.testing.assert_array_equal(plain.feature, learned.feature)
+    assert np.abs(plain.srp - learned.srp).max() > 0.01
+    # More bins are brought up to date in turn, each a little later.
+    np.testing.assert_allclose(both.srp, learned.srp, rtol=0.25)
+    assert both.feature.max() < 0.7 * plain.feature.max()
+
+
+def whitener(chosen: EgoNoiseSettings, n_microphones: int, beams: Steering) -> EgoNoise:
+    return EgoNoise(chosen, 125.0, n_microphones, [(beams, slice(0, len(beams.weights)))])
+
+
+def correlated_hops(rng: np.random.Generator, hops: int, array: MicrophoneArray = ROOF) -> np.ndarray:
+    """Frames of an interferer in white noise, (hops, frames, bins, M)."""
+    a = array.steering([600.0, 900.0], 0.5)[:, :, 0]
+    shape = (hops, 12, 2)
+    loud = 3.0 * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))[..., None] * a
+    white = rng.standard_normal((*shape, len(a.T))) + 1j * rng.standard_normal((*shape, len(a.T)))
+    return (loud + white).astype(np.complex64)
+
+
+@pytest.mark.parametrize("thin", [False, True])
+def test_beams_are_those_of_the_definition(thin: bool) -> None:
+    """Oracle: the definition in double precision, its root by scipy's sqrtm."""
+    array = roof_array_56() if thin else MicrophoneArray(ROOF.positions_m[:5])
+    grid = np.linspace(-1.2, 1.2, 21)
+    beams = Steering.towards(array, [600.0, 900.0], grid)
+    assert (beams.basis is not None) == thin
+    chosen = EgoNoiseSettings(guard_hops=0, forgetting_s=1e5, min_shrinkage=0.1)
+    ego, hops = (
+        whitener(chosen, array.n_microphones, beams),
+        correlated_hops(np.random.default_rng(13), 40, array),
+    )
+    ego.weight = 1.0
+    for hop in hops:
+        ((heard, steering),) = ego.process(hop)
+    # Every second hop is learned; a few more let both bins see the last of them.
+    ego.weight = 0.0
+    for _ in range(9):
+        ((heard, steering),) = ego.process(hops[-1])
+    learned = hops[::2].reshape(-1, 2, array.n_microphones).astype(np.complex128)
+    unit = learned / np.linalg.norm(learned, axis=2, keepdims=True) * np.sqrt(array.n_microphones)
+    R = np.einsum("tbi,tbj->bij", unit, unit.conj()) / len(unit)
+    s = np.maximum(0.1, [white_share(matrix, len(unit)) for matrix in R])
+    assert s.max() < 0.5
+    A = MicrophoneArray(array.centred_m).steering([600.0, 900.0], grid)
+    expected = np.zeros(len(grid))
+    for b in range(2):
+        root = np.linalg.inv(scipy.linalg.sqrtm((1 - s[b]) * R[b] + s[b] * np.eye(len(R[b]))))
+        bent = root @ A[b]
+        bent *= np.sqrt(array.n_microphones) / np.linalg.norm(bent, axis=0)
+        z = hops[-1][:, b].astype(np.complex128) @ root.T
+        expected += np.square(np.abs((z / np.abs(z)) @ bent.conj())).sum(axis=0)
+    np.testing.assert_allclose(steered_power(heard, steering), expected, rtol=2e-3)
+
+
+def test_a_shut_gate_keeps_what_is_known() -> None:
+    hops = correlated_hops(np.random.default_rng(14), 200)
+    ego = whitener(EgoNoiseSettings(), ROOF.n_microphones, Steering.towards(ROOF, [600.0, 900.0], [0.0, 0.5]))
+    ego.weight = 1.0
+    for hop in hops[:50]:
+        ego.process(hop)
+    ego.weight = 0.0
+    for hop in hops[50:70]:
+        ego.process(hop)
+    ((before, _),) = ego.process(hops[0])
+    remembered = ego.learned_frames
+    for hop in hops[70:]:
+        ego.process(hop)
+    ((after, _),) = ego.process(hops[0])
+    assert ego.learned_frames == remembered > 0
+    np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize("guard", [0, 3, 8])
+def test_the_hops_before_the_gate_shuts_are_not_learned(guard: int) -> None:
+    hops = correlated_hops(np.random.default_rng(15), 30)
+    chosen = EgoNoiseSettings(guard_hops=guard, forgetting_s=1e5)
+    ego = whitener(chosen, ROOF.n_microphones, Steering.towards(ROOF, [600.0, 900.0], [0.0, 0.5]))
+    for k, hop in enumerate(hops):
+        ego.weight = 1.0 if k < 20 else 0.0
+        ego.process(hop)
+    assert ego.learned_frames == pytest.approx(12 * ((20 - guard + 1) // 2), rel=1e-2)
+
+
+def test_an_unlikely_none_is_not_learned_at_all() -> None:
+    hops = correlated_hops(np.random.default_rng(16), 20)
+    ego = whitener(EgoNoiseSettings(), ROOF.n_microphones, Steering.towards(ROOF, [600.0, 900.0], [0.0, 0.5]))
+    ego.weight = 0.49
+    for hop in hops:
+        ((heard, _),) = ego.process(hop)
+    assert ego.learned_frames == 0
+    np.testing.assert_array_equal(heard, whiten(hops[-1]))
+
+
+def test_old_noise_is_forgotten() -> None:
+    rng = np.random.default_rng(17)
+    mirror = MicrophoneArray(ROOF.positions_m * [1, -1, 1])
+    beams = Steering.towards(ROOF, [600.0, 900.0], [-0.5, 0.5])
+    ego = whitener(EgoNoiseSettings(forgetting_s=1.0, guard_hops=0), ROOF.n_microphones, beams)
+    ego.weight = 1.0
+    for hop in correlated_hops(rng, 60):
+        ego.process(hop)
+    # Now the interferer stands at -0.5.
+    stands_out = []
+    for hop in correlated_hops(rng, 60, mirror):
+        ((heard, steering),) = ego.process(hop)
+        power = steered_power(heard, steering)
+        stands_out.append(power[0] / power[1])
+    assert np.mean(stands_out[-10:]) < 0.6 * stands_out[0]
+
+
+def test_it_has_to_be_asked_for() -> None:
+    front_end = FrontEnd(ROOF, RATE, PLAIN)
+    for call in (lambda: front_end.learn_ego_noise(1.0), lambda: front_end.follow_engine(50.0)):
+        with pytest.raises(InvalidArgumentError, match="ego_noise"):
+            call()
+    with pytest.raises(InvalidArgumentError, match="none_probability"):
+        FrontEnd(ROOF, RATE, LEARNING).learn_ego_noise(1.2)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"forgetting_s": 0},
+        {"guard_hops": -1},
+        {"guard_hops": 1.5},
+        {"min_shrinkage": 0},
+        {"refresh_hops": 0},
+        {"min_weight": 2},
+        {"harmonics": 0},
+    ],
+)
+def test_settings_out_of_range_are_named(wrong: dict) -> None:
+    with pytest.raises(InvalidArgumentError, match=next(iter(wrong))):
+        EgoNoiseSettings(**wrong)
+
+
+# Engine lines.
+
+
+def comb(fundamental: np.ndarray, channels: int, rng: np.random.Generator) -> np.ndarray:
+    """Lines of unit mean square each, with phases of their own at every microphone, (n, channels)."""
+    cycles = np.cumsum(fundamental) / RATE
+    lines = np.zeros((len(fundamental), channels))
+    for order in range(3, 31):
+        lines += np.sqrt(2) * np.cos(2 * np.pi * (order * cycles[:, None] + rng.random(channels)))
+    return lines.astype(np.float32)
+
+
+def cancelled(sound: np.ndarray, told_hz: np.ndarray, tolerance: float = 0.01) -> np.ndarray:
+    """Spectra before, spectra after, hop by hop, the speed told every hop."""
+    stft, canceller = (
+        StreamingStft(sound.shape[1], NFFT, range(3, 30)),
+        HarmonicCanceller(range(3, 30), RATE, NFFT),
+    )
+    out = []
+    for k, block in enumerate(np.array_split(sound, len(sound) // 1600)):
+        canceller.follow(float(told_hz[min((k + 1) * 1600, len(told_hz) - 1)]), tolerance)
+        spectra = stft.push(block)
+        out.append(np.stack([spectra, canceller.cancel(spectra)]))
+    return np.concatenate(out, axis=1)
+
+
+def power_db(values: np.ndarray) -> float:
+    return float(10 * np.log10(np.square(np.abs(values)).mean()))
+
+
+@pytest.mark.parametrize(
+    ("drift_hz_per_s", "told_wrong"), [(0.0, 1.0), (0.0, 1.003), (1.5, 1.0), (-1.5, 1.002)]
+)
+def test_lines_go_and_the_rest_stays(drift_hz_per_s: float, told_wrong: float) -> None:
+    rng = np.random.default_rng(18)
+    fundamental = 52.0 + drift_hz_per_s * np.arange(4 * RATE) / RATE
+    lines = comb(fundamental, 8, rng)
+    noise = 2.0 * rng.standard_normal(lines.shape).astype(np.float32)
+    before, after = cancelled(lines + noise, told_wrong * fundamental)
+    (only_lines, _), (only_noise, _) = (cancelled(part, fundamental) for part in (lines, noise))
+    late = slice(len(before) // 2, None)
+    left = (after - only_noise)[late]
+    assert power_db(left) < power_db(only_lines[late]) - 12
+    assert power_db(before[late]) - power_db(after[late]) > 3
+
+
+def test_an_engine_whose_speed_is_heard_and_not_told() -> None:
+    rng = np.random.default_rng(22)
+    lines = comb(np.full(4 * RATE, 47.3), 8, rng)
+    noise = 2.0 * rng.standard_normal(lines.shape).astype(np.float32)
+    heard = track_fundamental((lines + noise)[: 2 * RATE, 0], RATE).frequency_hz[-1]
+    before, after = cancelled(lines + noise, np.full(len(lines), heard))
+    only_noise = cancelled(noise, np.full(len(lines), heard))[0]
+    late = slice(len(before) // 2, None)
+    assert power_db((after - only_noise)[late]) < power_db((before - only_noise)[late]) - 12
+
+
+def test_next_to_nothing_is_taken_where_there_is_no_engine() -> None:
+    sound = np.random.default_rng(19).standard_normal((3 * RATE, 8)).astype(np.float32)
+    before, after = cancelled(sound, np.full(len(sound), 52.0))
+    assert power_db(before) - power_db(after) < 0.1
+    assert power_db(before - after) < power_db(before) - 15
+
+
+def test_without_an_engine_the_spectra_are_handed_through() -> None:
+    spectra = np.ones((5, 10, 2), np.complex64)
+    canceller = HarmonicCanceller(range(3, 13), RATE, NFFT)
+    assert canceller.cancel(spectra) is spectra
+    canceller.follow(60.0)
+    assert canceller.fundamental_hz == 60.0
+    canceller.cancel(spectra)
+    canceller.follow(None)
+    assert canceller.fundamental_hz is None
+    assert canceller.cancel(spectra) is spectra
+    with pytest.raises(InvalidArgumentError, match="fundamental_hz"):
+        canceller.follow(5.0)
+    canceller.follow(60.0)
+    with pytest.raises(InvalidArgumentError, match="spectra"):
+        canceller.cancel(spectra[:, :4])
+    assert np.isfinite(canceller.cancel(np.zeros((5, 10, 2), np.complex64))).all()
+
+
+# What it is for.
+
+
+def statistics(sound: np.ndarray, chosen: FrontEndSettings, learn_s: float) -> np.ndarray:
+    """Log peak and log prominence of SRP in the seconds after learning, shape (hops, 2)."""
+    front_end = FrontEnd(ROOF, RATE, chosen)
+    cut = round(learn_s * RATE)
+    if chosen.ego_noise is not None:
+        front_end.learn_ego_noise(1.0)
+    front_end.process(sound[:cut])
+    if chosen.ego_noise is not None:
+        front_end.learn_ego_noise(0.0)
+    srp = np.array([frame.srp for frame in front_end.process(sound[cut:])[10:]])
+    return np.log(np.stack([srp.max(axis=1), srp.max(axis=1) / np.median(srp, axis=1)], axis=1))
+
+
+def auroc(positive: list[np.ndarray], negative: list[np.ndarray]) -> np.ndarray:
+    """AUROC of both statistics over all windows."""
+    scores = np.concatenate(positive + negative)
+    labels = np.repeat([1, 0], [sum(map(len, positive)), sum(map(len, negative))])
+    return np.array([roc_auc_score(labels, column) for column in scores.T])
+
+
+def test_a_plane_wave_under_ego_noise_is_found_again_and_elsewhere_no_harm_is_done() -> None:
+    rng = np.random.default_rng(20)
+    gains: dict[str, list[np.ndarray]] = {}
+    for ego in (True, False):
+        found: dict[tuple[str, bool], list[np.ndarray]] = {}
+        for _ in range(4):
+            speed = np.full(round(3.7 * RATE), rng.uniform(4, 12))
+            for present in (True, False):
+                white = rng.standard_normal((len(speed), ROOF.n_microphones)).astype(np.float32)
+                noise = ego_noise(MOUNTED_M, speed, RATE, rng) if ego else white
+                source = wave(rng.uniform(-0.9, 0.9), 3.7, rng, like=noise)
+                source[: 2 * RATE] = 0.0
+                level = in_band(noise).std() * 10 ** ((-17.0 if ego else -19.0) / 20)
+                sound = (noise + present * level * source).astype(np.float32)
+                for name, chosen in (("plain", PLAIN), ("learned", LEARNING)):
+                    found.setdefault((name, present), []).append(statistics(sound, chosen, 2.0))
+        for name in ("plain", "learned"):
+            gains.setdefault(name, []).append(auroc(found[name, True], found[name, False]))
+    plain, learned = np.array(gains["plain"]), np.array(gains["learned"])
+    assert (learned[0] - plain[0] > 0.1).all()
+    assert (learned[1] - plain[1] > -0.01).all()
+    assert 0.7 < plain[1].min() < 0.999
+
+
+def test_the_bearing_stays_where_it_was_without_ego_noise() -> None:
+    rng = np.random.default_rng(21)
+    errors: dict[str, list[float]] = {"plain": [], "learned": []}
+    for azimuth in np.radians([-50.0, -20.0, 5.0, 40.0]):
+        quiet = rng.standard_normal((5 * RATE, ROOF.n_microphones)).astype(np.float32)
+        sound = quiet.copy()
+        sound[3 * RATE :] += wave(azimuth, 2.0, rng)
+        for name, chosen in (("plain", PLAIN), ("learned", LEARNING)):
+            front_end = FrontEnd(ROOF, RATE, chosen)
+            if chosen.ego_noise is not None:
+                front_end.learn_ego_noise(1.0)
+            front_end.process(sound[: 3 * RATE])
+            if chosen.ego_noise is not None:
+                front_end.learn_ego_noise(0.0)
+            errors[name] += [f.bearing_rad - azimuth for f in front_end.process(sound[3 * RATE :])[3:]]
+    rms = {name: float(np.degrees(np.sqrt(np.mean(np.square(error))))) for name, error in errors.items()}
+    assert rms["plain"] < 1.0
+    assert rms["learned"] < rms["plain"] + 0.1

@@ -1,0 +1,107 @@
+"""Ego-noise where people listen: the filter's belief opens and shuts the gate, end to end."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+import soundfile
+
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.listen import Source, listen_steps, measure_steps, open_source
+from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate.adapters.simulation.sound.ego_sound import ego_noise
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.ground.errors import InvalidArgumentError
+
+RATE, SECONDS, APPEARS_S = 16_000, 6.0, 4.5
+ARRAY = roof_array_56()
+
+
+def drive(source_deg: float) -> np.ndarray:
+    """Drive at 5 m/s; a source of the same colour, 15 dB below it in the band of SRP, comes late, (n, M)."""
+    rng, n = np.random.default_rng(150), round(SECONDS * RATE)
+    mounted = ARRAY.centred_m + np.array([0.0, 0.0, 1.7])
+    noise = ego_noise(mounted, np.full(n, 5.0), RATE, rng)
+    frequencies = np.fft.rfftfreq(n, 1 / RATE)
+    band = (frequencies > 300) & (frequencies < 1800)
+    grid, density = scipy.signal.welch(noise, RATE, nperseg=512, axis=0)
+    colour = np.sqrt(np.interp(frequencies, grid, density.mean(axis=1))) * band
+    wave = np.fft.rfft(rng.standard_normal(n))[:, None] * colour[:, None]
+    wave = np.fft.irfft(wave * ARRAY.steering(frequencies, np.radians(source_deg))[:, :, 0], n, axis=0)
+    heard = np.fft.irfft(np.fft.rfft(noise, axis=0) * band[:, None], n, axis=0)
+    wave *= 10 ** (-15 / 20) * heard.std() / wave.std()
+    wave[: round(APPEARS_S * RATE)] = 0.0
+    return np.asarray((noise + wave) / FULL_SCALE_PA, np.float32)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("drive") / "drive.wav"
+    soundfile.write(path, drive(35.0), RATE, subtype="FLOAT")
+    return path
+
+
+def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recording: Path) -> None:
+    bearings = {}
+    for ego in (False, True):
+        steps = list(listen_steps(open_source(recording, ego_noise=ego)))
+        late = [step.frame for step in steps if step.frame.stamp_ns > (APPEARS_S + 0.4) * 1e9]
+        bearings[ego] = np.degrees([frame.bearing_rad for frame in late])
+    assert len(bearings[True]) > 8
+    assert np.abs(bearings[True] - 35.0).max() < 3.0
+    assert np.median(np.abs(bearings[False] - 35.0)) > 10.0
+
+
+def test_it_is_off_unless_asked_and_where_nobody_believes(recording: Path) -> None:
+    plain = [frame.srp for frame, _ in measure_steps(open_source(recording))]
+    doubted: list[list[np.ndarray]] = []
+    for belief in (None, lambda: 0.3):
+        source = open_source(recording, ego_noise=True)
+        doubted.append([frame.srp for frame, _ in measure_steps(source, belief)])
+    for srp, unasked, unlearned in zip(plain, *doubted, strict=True):
+        np.testing.assert_array_equal(srp, unasked)
+        np.testing.assert_array_equal(srp, unlearned)
+    believed = [frame.srp for frame, _ in measure_steps(open_source(recording, ego_noise=True), lambda: 1.0)]
+    assert np.abs(believed[-1] - plain[-1]).max() > 0.02
+
+
+def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
+    """The posterior is the same, hop by hop: only spatial spectrum, bearing and prominence change."""
+    plain, learned = (list(listen_steps(open_source(recording, ego_noise=ego))) for ego in (False, True))
+    for a, b in zip(plain, learned, strict=True):
+        assert a.measurement.signature == b.measurement.signature
+
+
+def test_settings_of_one_s_own(recording: Path) -> None:
+    assert open_source(recording).ego_noise is None
+    assert open_source(recording, ego_noise=True).ego_noise == EgoNoiseSettings()
+    chosen = EgoNoiseSettings(forgetting_s=3.0)
+    assert open_source(recording, ego_noise=chosen).ego_noise is chosen
+
+
+def test_the_command_line_passes_it_on(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[Source] = []
+
+    def listened(source: Source, **_: object) -> None:
+        heard.append(source)
+        raise InvalidArgumentError("enough")
+
+    monkeypatch.setattr("worldstate.cli.common.listening.listen_with_progress", listened)
+    for options in ([], ["--ego-noise"]):
+        main(["run", str(recording), *options])
+    assert [source.ego_noise for source in heard] == [None, EgoNoiseSettings()]
+
+
+def test_a_belief_out_of_range_is_refused_and_without_ego_noise_ignored() -> None:
+    class Flat:
+        def evidence(self, feature: object, /) -> None: ...
+
+    settings = FrontEndSettings(nfft=256, ego_noise=EgoNoiseSettings())
+    learning = AcousticAdapter(ARRAY, RATE, Flat(), front_end_settings=settings)  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgumentError, match="none_probability"):
+        learning.believe(1.5)
+    AcousticAdapter(ARRAY, RATE, Flat()).believe(0.5)  # type: ignore[arg-type]

@@ -1,0 +1,451 @@
+"""Misbehaving microphones: found, named, left out; and none found where there is none."""
+
+import gc
+import tracemalloc
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.adapters.simulation import draw_settings, simulate_recording
+from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.health.channel_health import ArrayHealth, Fault
+from worldstate.frontend.health.clipping import RailCounter
+from worldstate.frontend.health.dropouts import GapFinder
+from worldstate.frontend.health.position_fit import place_scores, place_weights
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.ground.values import NotUsable
+
+RATE = 16_000
+ROOF = roof_array_56()
+HALF = MicrophoneArray(ROOF.positions_m[::2])
+SECONDS = 3.5
+
+
+def street(
+    array: MicrophoneArray, seed: int, seconds: float = SECONDS, waves: int = 10, slope: float = 1.0
+) -> np.ndarray:
+    """Red noise from many directions of the half circle ahead, and each microphone's own noise, (n, M)."""
+    rng, n = np.random.default_rng(seed), round(seconds * RATE)
+    frequencies = np.fft.rfftfreq(n, 1 / RATE)
+    colour = (1.0 + frequencies / 300.0) ** -slope
+    colour[frequencies > 0.45 * RATE] = 0.0
+    sound = np.zeros((len(frequencies), array.n_microphones), complex)
+    for azimuth in rng.uniform(-1.5, 1.5, waves):
+        wave = np.fft.rfft(rng.standard_normal(n) * rng.uniform(0.3, 1.0)) * colour
+        sound += wave[:, None] * array.steering(frequencies, azimuth, rng.normal(0, 0.2))[:, :, 0]
+    heard = np.fft.irfft(sound, n, axis=0)
+    own = 0.03**slope * heard.std() * rng.standard_normal(heard.shape)
+    return np.asarray((heard + own) / heard.std(), np.float32)
+
+
+def healths(array: MicrophoneArray, sound: np.ndarray, rate: float = RATE) -> list[ArrayHealth]:
+    found = [frame.health for frame in FrontEnd(array, rate).process(sound)]
+    return [health for health in found if isinstance(health, ArrayHealth)]
+
+
+def named(health: ArrayHealth) -> dict[str, list[int]]:
+    kinds: dict[str, list[int]] = {}
+    for fault in health.faults:
+        kinds.setdefault(fault.fault.value, []).append(fault.channel)
+    return kinds
+
+
+def silence(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, [3, 17]] = [0.0, 0.4]
+
+
+def nearly_dead(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, 5] = 1e-3 * rng.standard_normal(len(x))
+
+
+def dropouts(x: np.ndarray, rng: np.random.Generator) -> None:
+    for start in (20_000, 33_000, 41_000):
+        x[start : start + 1200, 9] = 0.0
+
+
+def crackle(x: np.ndarray, rng: np.random.Generator) -> None:
+    for start in range(17_000, 55_000, 7000):
+        x[start : start + 20, 11] += 40 * rng.standard_normal(20)
+
+
+def noise(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, [2, 20]] = rng.standard_normal((len(x), 2))
+
+
+def inversion(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, 13] *= -1
+
+
+def swap(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, [1, 22]] = x[:, [22, 1]]
+
+
+def clip(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, 6] = x[:, 6].clip(-1.5, 1.5)
+    x[:, 25] = x[:, 25].clip(-9.0, 1.2)
+
+
+def offset(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, 8] += 2.0
+
+
+def gain(x: np.ndarray, rng: np.random.Generator) -> None:
+    x[:, 0] *= 8.0
+    x[:, 27] *= 0.1
+
+
+FAULTS: list[tuple[Callable[[np.ndarray, np.random.Generator], None], dict[str, list[int]], bool]] = [
+    (silence, {"dead": [3, 17]}, True),
+    (nearly_dead, {"dead": [5]}, True),
+    (dropouts, {"intermittent": [9]}, True),
+    (crackle, {"intermittent": [11]}, True),
+    (noise, {"noisy": [2, 20]}, True),
+    (inversion, {"inverted": [13]}, True),
+    (swap, {"swapped": [1, 22]}, True),
+    (clip, {"clipped": [6, 25]}, False),
+    (offset, {"offset": [8]}, False),
+    (gain, {"level": [0, 27]}, False),
+]
+
+
+@pytest.mark.parametrize(("spoil", "expected", "masked"), FAULTS, ids=[f[0].__name__ for f in FAULTS])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_every_fault_is_named_and_nothing_else(
+    spoil: Callable[[np.ndarray, np.random.Generator], None],
+    expected: dict[str, list[int]],
+    masked: bool,
+    seed: int,
+) -> None:
+    sound = street(HALF, seed)
+    spoil(sound, np.random.default_rng(50 + seed))
+    last = healths(HALF, sound)[-1]
+    assert named(last) == expected
+    left_out = np.flatnonzero(~last.mask.keep).tolist()
+    assert left_out == (next(iter(expected.values())) if masked else [])
+    assert last.n_gaps == 0
+
+
+def test_a_swap_says_where_the_channels_belong() -> None:
+    sound = street(HALF, 3)
+    swap(sound, np.random.default_rng(0))
+    faults = healths(HALF, sound)[-1].faults
+    assert {(fault.channel, fault.looks_like) for fault in faults} == {(1, 22), (22, 1)}
+
+
+def test_all_at_once() -> None:
+    sound = street(ROOF, 4)
+    rng = np.random.default_rng(44)
+    sound[:, [7, 40]] = sound[:, [40, 7]]
+    sound[:, 12] *= -1
+    sound[:, 33] = rng.standard_normal(len(sound))
+    sound[:, [0, 50]] = 0.0
+    last = healths(ROOF, sound)[-1]
+    assert named(last) == {"dead": [0, 50], "swapped": [7, 40], "inverted": [12], "noisy": [33]}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_clean_street_raises_no_alarm(seed: int) -> None:
+    array = (HALF, ROOF)[seed % 2]
+    sound = street(array, 100 + seed)
+    assert all(health.is_healthy for health in healths(array, sound))
+
+
+@pytest.mark.parametrize(("approach", "seed"), [("left", 5), ("none", 6)])
+def test_simulated_junctions_raise_no_alarm_and_show_a_swap(approach: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    recording = simulate_recording(draw_settings("SB1", approach, rng, duration_s=2.2), rng)
+    found = healths(ROOF, recording.audio, recording.sample_rate_hz)
+    assert all(health.is_healthy for health in found)
+    assert isinstance(found[-1].coherence, float)
+    swapped = recording.audio.copy()
+    swapped[:, [3, 40]] = recording.audio[:, [40, 3]]
+    assert named(healths(ROOF, swapped, recording.sample_rate_hz)[-1]) == {"swapped": [3, 40]}
+
+
+@pytest.mark.parametrize("levels", [2, 5, 30])
+def test_coarse_quantisation_is_no_clipping(levels: int) -> None:
+    sound = np.round(street(HALF, 8) * levels).astype(np.float32)
+    assert all(health.is_healthy for health in healths(HALF, sound))
+
+
+def test_noise_of_their_own_is_not_judged() -> None:
+    sound = np.random.default_rng(0).standard_normal((3 * RATE, 8))
+    last = healths(MicrophoneArray(ROOF.positions_m[:8]), sound)[-1]
+    assert last.is_healthy
+    assert isinstance(last.coherence, NotUsable)
+
+
+def test_silence_is_dead_after_a_second() -> None:
+    array = MicrophoneArray(ROOF.positions_m[:4])
+    last = healths(array, np.zeros((3 * RATE, 4)))[-1]
+    assert named(last) == {"dead": [0, 1, 2, 3]}
+    assert last.n_gaps == 0
+
+
+def test_a_channel_that_dies_is_left_out_at_once_and_comes_back() -> None:
+    sound = street(HALF, 9, seconds=9.0)
+    sound[: 2 * RATE, 4] = 0.0
+    found = healths(HALF, sound)
+    assert named(found[0]) == {"dead": [4]}
+    assert not found[0].mask.keep[4]
+    assert named(found[12]) == {"intermittent": [4]}
+    assert found[-1].is_healthy
+    assert found[-1].mask.is_whole
+
+
+def moving_source(array: MicrophoneArray, seconds: float, seed: int) -> tuple[np.ndarray, Callable]:
+    """A car at 10 m/s, 10 m ahead, from left to right, exactly retarded, (n, M); its azimuth heard at t."""
+    from scipy.interpolate import CubicSpline
+
+    rate, c, rng = 48_000, 343.0, np.random.default_rng(seed)
+    start = -0.2
+    n = round((seconds - start) * rate)
+    spectrum = np.fft.rfft(rng.standard_normal(n))
+    spectrum[np.fft.rfftfreq(n, 1 / rate) > 5000] = 0.0
+    emitted = CubicSpline(start + np.arange(n) / rate, np.fft.irfft(spectrum, n))
+
+    def emission(t: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        te = t.copy()
+        for _ in range(5):
+            r = np.sqrt((10 - place[0]) ** 2 + (10 - 10 * te - place[1]) ** 2 + place[2] ** 2)
+            te = t - r / c
+        return te, r
+
+    time = np.arange(round(seconds * rate)) / rate
+    heard = np.empty((len(time), array.n_microphones), np.float32)
+    for m, place in enumerate(array.positions_m):
+        te, r = emission(time, place)
+        heard[:, m] = emitted(te) / r
+    heard += 0.3 * heard.std() * rng.standard_normal(heard.shape, dtype=np.float32)
+
+    def azimuth(t: float) -> float:
+        te = emission(np.array([t]), array.positions_m.mean(axis=0))[0][0]
+        return float(np.arctan2(10 - 10 * te, 10.0))
+
+    return heard, azimuth
+
+
+def rms_deg(frames: list[AcousticFrame], azimuth: Callable) -> float:
+    errors = [
+        frame.bearing_rad - azimuth(frame.sample_index / 48_000 - frame.bearing_age_s) for frame in frames
+    ]
+    return float(np.degrees(np.sqrt(np.mean(np.square(errors)))))
+
+
+def test_bearing_of_a_pass_by_with_twenty_of_fifty_six_dead() -> None:
+    sound, azimuth = moving_source(ROOF, 2.2, seed=1)
+    whole = rms_deg(FrontEnd(ROOF, 48_000).process(sound), azimuth)
+    for seed in range(3):
+        dead = np.sort(np.random.default_rng(seed).choice(56, 20, replace=False))
+        spoilt = sound.copy()
+        spoilt[:, dead] = 0.0
+        frames = FrontEnd(ROOF, 48_000).process(spoilt)
+        rms = rms_deg(frames, azimuth)
+        print(f"bearing rms {whole:.3f} deg, with 20 of 56 dead {rms:.3f} deg")
+        assert rms < whole + 0.5
+        assert all(named(frame.health) == {"dead": dead.tolist()} for frame in frames)  # type: ignore[arg-type]
+
+
+def test_leaving_out_noise_keeps_the_bearing() -> None:
+    sound, azimuth = moving_source(ROOF, 3.0, seed=2)
+    rng = np.random.default_rng(2)
+    noisy = rng.choice(56, 20, replace=False)
+    sound[:, noisy] = 2 * sound.std() * rng.standard_normal((len(sound), 20))
+    watched, unwatched = (
+        FrontEnd(ROOF, 48_000, FrontEndSettings(watch_channels=on)).process(sound) for on in (True, False)
+    )
+    assert all(set(frame.health.with_fault(Fault.NOISY)) == set(noisy) for frame in watched[11:])  # type: ignore[union-attr]
+    assert rms_deg(watched[11:], azimuth) < 0.5
+    assert np.mean([f.prominence for f in watched[11:]]) > np.mean([f.prominence for f in unwatched[11:]])
+
+
+@settings(deadline=None, max_examples=5)
+@given(dead=st.sets(st.integers(0, 27), max_size=20), seed=st.integers(0, 99))
+def test_leaving_out_is_listening_with_the_rest(dead: set[int], seed: int) -> None:
+    sound = street(HALF, seed, seconds=1.3)
+    rest = np.setdiff1d(np.arange(28), list(dead))
+    sound[:, list(dead)] = 0.0
+    chosen = FrontEndSettings(music_sources=2)
+    ours = FrontEnd(HALF, RATE, chosen).process(sound)[-1]
+    theirs = FrontEnd(MicrophoneArray(HALF.positions_m[rest]), RATE, chosen).process(sound[:, rest])[-1]
+    np.testing.assert_allclose(ours.srp, theirs.srp, rtol=1e-4)
+    np.testing.assert_allclose(ours.feature, theirs.feature, rtol=1e-3)
+    assert ours.bearing_rad == pytest.approx(theirs.bearing_rad, abs=1e-4)
+    np.testing.assert_allclose(ours.music.spectrum, theirs.music.spectrum, rtol=5e-3)  # type: ignore[union-attr]
+
+
+def test_clipping_costs_no_bearing_and_so_no_microphone() -> None:
+    sound, azimuth = moving_source(ROOF, 1.6, seed=3)
+    clean = rms_deg(FrontEnd(ROOF, 48_000).process(sound), azimuth)
+    clipped = np.random.default_rng(3).choice(56, 20, replace=False)
+    sound[:, clipped] = sound[:, clipped].clip(-0.5 * sound.std(), 0.5 * sound.std())
+    frames = FrontEnd(ROOF, 48_000).process(sound)
+    assert set(frames[-1].health.with_fault(Fault.CLIPPED)) == set(clipped)  # type: ignore[union-attr]
+    assert frames[-1].health.mask.is_whole  # type: ignore[union-attr]
+    assert rms_deg(frames, azimuth) < clean + 0.1
+
+
+def test_a_channel_that_dies_makes_no_step_in_looming_and_levels() -> None:
+    array = MicrophoneArray(ROOF.positions_m[::8])
+    time = np.arange(2 * RATE) / RATE
+    sound = street(array, 11, seconds=2.0, waves=1) / (30.0 - 10.0 * time)[:, None].astype(np.float32)
+    broken = sound.copy()
+    broken[round(1.55 * RATE) :, 1:4] = 0.0
+    for well, ill in zip(
+        FrontEnd(array, RATE).process(sound), FrontEnd(array, RATE).process(broken), strict=True
+    ):
+        assert isinstance(well.looming, Looming)
+        assert isinstance(ill.looming, Looming)
+        assert abs(well.looming.inverse_tta_hz - ill.looming.inverse_tta_hz) < 2 * well.looming.std_hz
+        np.testing.assert_allclose(well.band_log_energy, ill.band_log_energy, atol=0.8)
+
+
+@settings(deadline=None, max_examples=3)
+@given(cuts=st.lists(st.integers(0, 40_000), max_size=8))
+def test_reports_do_not_depend_on_the_block_size(cuts: list[int]) -> None:
+    sound = street(HALF, 12, seconds=2.5)
+    silence(sound, np.random.default_rng(0))
+    inversion(sound, np.random.default_rng(0))
+    sound[30_000:30_200] = 0.0
+    whole = healths(HALF, sound)
+    front_end = FrontEnd(HALF, RATE)
+    pieces = [f.health for b in np.split(sound, sorted(cuts)) for f in front_end.process(b)]
+    for one, other in zip(whole, pieces, strict=True):
+        assert isinstance(other, ArrayHealth)
+        assert (one.faults, one.gaps, one.coherence) == (other.faults, other.gaps, other.coherence)
+    assert whole[-1].n_gaps == 1
+
+
+def test_memory_does_not_grow_while_masks_change() -> None:
+    array = MicrophoneArray(ROOF.positions_m[::8])
+    sound = street(array, 13, seconds=1.0)
+    front_end = FrontEnd(array, RATE, FrontEndSettings(music_sources=1))
+
+    def run(rounds: int) -> int:
+        for k in range(rounds):
+            spoilt = sound.copy()
+            spoilt[:, [k % 7, (3 * k) % 7]] = 0.0
+            spoilt[k * 37 % RATE :][:64] = 0.0
+            front_end.process(spoilt)
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    before, after = run(10), run(16)
+    tracemalloc.stop()
+    # 160 hops: a steering matrix of one mask alone is 600 kB.
+    assert after - before < 60_000
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_over_an_hour() -> None:
+    rate, array = 8000, MicrophoneArray(ROOF.positions_m[::14])
+    front_end = FrontEnd(array, rate, FrontEndSettings(music_sources=1))
+    rng = np.random.default_rng(0)
+    sound = rng.standard_normal((60 * rate, 1)) + 0.1 * rng.standard_normal((60 * rate, 4))
+    tracemalloc.start()
+    traced = []
+    for minute in range(60):
+        sound[minute * 1000 :][:200] = 0.0
+        front_end.process(np.roll(sound, 13 * minute, axis=0))
+        gc.collect()
+        traced.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert max(traced[30:]) - traced[5] < 100_000
+
+
+def test_gaps_are_found_where_they_are() -> None:
+    sound = street(HALF, 14, seconds=6.0, slope=2.0)
+    cut = np.delete(sound, np.arange(30_000, 30_777), axis=0)
+    cut[50_000:50_300] = cut[49_999]
+    cut[70_000:70_800] = cut[69_200:70_000]
+    last = healths(HALF, cut)[-1]
+    assert last.faults == ()
+    splices = [gap.sample for gap in last.gaps if gap.kind == "splice"]
+    assert splices[0] == pytest.approx(30_000, abs=1)
+    # The ends of a repeat are cuts, too.
+    assert all(min(abs(s - 70_000), abs(s - 70_800)) <= 1 for s in splices[1:])
+    assert [(gap.sample, gap.n_samples) for gap in last.gaps if gap.kind == "still"] == [(49_999, 301)]
+    (repeat,) = (gap for gap in last.gaps if gap.kind == "repeat")
+    assert 70_000 <= repeat.sample < 70_800
+
+
+def test_four_cuts_in_five_are_found_in_simulated_streets() -> None:
+    """Pooled over streets with and without a vehicle; .86 of them, more where nothing drives."""
+    array = MicrophoneArray(roof_array_56().positions_m[::4])
+    found = 0
+    for seed, approach in product(range(3, 7), ("left", "none")):
+        rng = np.random.default_rng(seed)
+        audio = simulate_recording(draw_settings("SA1", approach, rng, duration_s=1.5), rng, array).audio
+        for _ in range(25):
+            start, gap = rng.integers(0, 30_000), rng.integers(64, 9600)
+            joined = np.concatenate([audio[start : start + 2400], audio[start + 2400 + gap :][:2400]])
+            gaps = GapFinder(14).push(joined, np.ones(14, bool))
+            found += any(gap.kind == "splice" and abs(gap.sample - 2400) <= 1 for gap in gaps)
+            clean = GapFinder(14).push(audio[start : start + 4800], np.ones(14, bool))
+            assert clean == []
+    assert found >= 160
+
+
+@settings(deadline=None, max_examples=20)
+@given(period=st.floats(60, 400), amplitude=st.floats(200, 3e4), limit=st.floats(0.3, 0.9))
+def test_a_clipped_wave_is_clipped_and_a_whole_one_is_not(
+    period: float, amplitude: float, limit: float
+) -> None:
+    rng = np.random.default_rng(0)
+    wave = amplitude * (np.sin(2 * np.pi * np.arange(9600) / period) + 0.1 * rng.standard_normal(9600))
+    both = np.round(np.stack([wave, wave.clip(-9e9, limit * amplitude)], axis=1)).astype(np.float32)
+    rails = RailCounter(2)
+    for hop in np.split(both, 2):
+        rails.push(hop, hop.min(axis=0), hop.max(axis=0))
+    share = rails.clipped_share()
+    assert share[0] == 0.0
+    assert share[1] > 0.03
+
+
+def test_place_weights_are_the_best_linear_guess_of_the_others() -> None:
+    array, f = MicrophoneArray(ROOF.positions_m[::7]), np.array([400.0, 1200.0])
+    usable = np.arange(8) != 2
+    weights = place_weights(array, f, usable)
+    distance = np.linalg.norm(array.positions_m[:, None] - array.positions_m, axis=2)
+    for k, frequency in enumerate(f):
+        field = np.sinc(2 * frequency * distance / 343.0) + np.diag(np.where(usable, 0.2, 1e3))
+        for p in range(8):
+            others = np.arange(8) != p
+            guess = np.linalg.solve(field[np.ix_(others, others)], field[others, p])
+            np.testing.assert_allclose(weights[k, p, others], guess, atol=1e-5)
+            assert weights[k, p, p] == 0.0
+
+
+def test_place_scores_are_their_definition() -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.standard_normal((40, 3, 5)) + 1j * rng.standard_normal((40, 3, 5))
+    z = frames / np.abs(frames)
+    weights = np.abs(rng.standard_normal((3, 5, 5))) * (1 - np.eye(5))
+    expected = np.empty((5, 5))
+    for m in range(5):
+        for p in range(5):
+            others = [j for j in range(5) if j not in (m, p)]
+            without = np.einsum("tkj,kj->tk", z[:, :, others], weights[:, p, others])
+            guess = np.einsum("tkj,kj->tk", z, weights[:, p])
+            power = np.square(np.abs(guess)).mean(axis=0).sum()
+            agreement = (z[:, :, m] * without.conj()).real.mean(axis=0).sum()
+            expected[m, p] = agreement / np.sqrt(3 * power)
+    coherence = np.einsum("tki,tkj->kij", z, z.conj()).real / 40
+    scores = place_scores(coherence.astype(np.float32), weights.astype(np.float32))
+    np.testing.assert_allclose(scores, expected, atol=1e-5)
+
+
+def test_masks_scale_back_to_the_whole() -> None:
+    mask = ChannelMask(np.array([True, False, True, True, False]))
+    assert mask.power_scale == pytest.approx(25 / 9)
+    assert mask.pair_scale == pytest.approx(10 / 3)
+    nobody = ChannelMask(np.zeros(3, bool))
+    assert np.isfinite([nobody.power_scale, nobody.pair_scale]).all()

@@ -1,0 +1,134 @@
+"""`worldstate doctor` names exactly what is wrong; `run` refuses silent channels or leaves them out."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.simulation import draw_settings, simulate_recording
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.ground.errors import InputFileError
+
+RATE = 47_998
+ROOF = roof_array_56()
+
+
+@pytest.fixture(scope="module")
+def street() -> np.ndarray:
+    rng = np.random.default_rng(11)
+    return simulate_recording(draw_settings("SA1", "left", rng, duration_s=2.5), rng).audio
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[np.ndarray], Path]:
+    def to_file(samples: np.ndarray) -> Path:
+        soundfile.write(tmp_path / "some.wav", samples, RATE, subtype="PCM_24")
+        write_array_xml(tmp_path / "mics.xml", ROOF)
+        return tmp_path / "some.wav"
+
+    return to_file
+
+
+def doctor(path: Path, *options: str) -> int:
+    return main(["doctor", str(path), "--array", str(path.with_name("mics.xml")), *options])
+
+
+def test_a_healthy_recording(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor(write(street)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "healthy"
+    assert not any(line.startswith("channel") for line in lines)
+    assert "front-back" in lines[1]
+
+
+def test_it_names_exactly_the_dead(
+    street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    dead = np.sort(np.random.default_rng(0).choice(56, 20, replace=False))
+    spoilt = street.copy()
+    spoilt[:, dead] = 0.0
+    assert doctor(write(spoilt), "--json", "--figure", str(tmp_path / "array.png")) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert not report["healthy"]
+    assert [(fault["channel"], fault["fault"]) for fault in report["faults"]] == [
+        (d + 1, "dead") for d in dead
+    ]
+    assert report["masked_microphones"] == (dead + 1).tolist()
+    assert (tmp_path / "array.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_it_says_what_to_do(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+    spoilt = street.copy()
+    spoilt[:, [3, 40]] = street[:, [40, 3]]
+    spoilt[:, 12] *= -1
+    spoilt[:, 20] = street[:, 20].clip(-street.std(), street.std())
+    spoilt[:, 30] += 3 * street.std()
+    spoilt[:, 50] = street.std() * np.random.default_rng(5).standard_normal(len(street))
+    spoilt = np.delete(spoilt, np.arange(60_000, 62_000), axis=0)
+    assert doctor(write(spoilt)) == 1
+    lines = capsys.readouterr().out.splitlines()
+    table = {int(line.split()[0]): line for line in lines if line.strip()[:1].isdigit() and "%" in line}
+    assert sorted(table) == [4, 13, 21, 31, 41, 51]
+    for channel, words in {4: "channel 41", 41: "channel 4:", 13: "polarity", 21: "gain", 31: "mean"}.items():
+        assert words in table[channel]
+    assert any(line.startswith("1 gap (splice at sample ") for line in lines)
+    assert lines[-1].startswith("not healthy: swapped 4, 41;")
+
+
+def test_a_wrong_sample_rate(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(street)
+    length = len(street) / RATE
+    assert doctor(path, "--duration", str(1.05 * length)) == 1
+    assert "the header is wrong" in capsys.readouterr().out
+    assert doctor(path, "--duration", str(length + 0.005)) == 0
+    assert "sample rate by the other clock" in capsys.readouterr().out
+
+
+def test_bad_input(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "nothing.wav"]) == 2
+    assert "nothing.wav: no such file" in capsys.readouterr().err
+    path = write(street[:, :55])
+    assert doctor(path) == 2
+    assert "expected 56 channels" in capsys.readouterr().err
+    mostly = street.copy()
+    mostly[:, :29] = 0.0
+    assert doctor(write(mostly)) == 2
+    assert "at least half of 56 channels" in capsys.readouterr().err
+
+
+def test_run_refuses_silent_channels_and_says_how_not_to(
+    street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoilt = street.copy()
+    spoilt[:, [6, 9]] = 0.0
+    path = write(spoilt)
+    assert main(["run", str(path)]) == 2
+    captured = capsys.readouterr()
+    assert "channel 7, 10; --mask-dead leaves them out" in captured.err
+    assert captured.out == ""
+    assert main(["run", str(path), "--mask-dead", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["masked_microphones"] == [7, 10]
+    assert main(["run", str(write(street)), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["masked_microphones"] == []
+
+
+def test_open_audio_tells_silent_channels(tmp_path: Path) -> None:
+    samples = np.random.default_rng(0).uniform(-0.5, 0.5, (9000, 4))
+    samples[:, [0, 2]] = [0.0, 0.25]
+    soundfile.write(tmp_path / "a.wav", samples, 8000)
+    with pytest.raises(SilentChannelsError) as refused:
+        open_audio(tmp_path / "a.wav")
+    assert refused.value.channels == (1, 3)
+    with open_audio(tmp_path / "a.wav", strict=False) as source:
+        assert source.silent_channels == (1, 3)
+        assert len(np.concatenate(list(source.blocks(1000)))) == 9000
+    samples[:, 1] = 0.1
+    soundfile.write(tmp_path / "b.wav", samples, 8000)
+    with pytest.raises(InputFileError, match=r"b\.wav: expected sound on at least half of 4 channels"):
+        open_audio(tmp_path / "b.wav", strict=False)

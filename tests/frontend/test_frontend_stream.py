@@ -1,0 +1,294 @@
+"""The streaming front-end: hops, laws, bad input."""
+
+import gc
+import os
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.frontend.approach.looming import Looming
+from worldstate.frontend.approach.tone_stage import ToneReading
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.music_stage import MusicReading
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
+
+SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
+RATE = 16_000
+EVERYTHING = FrontEndSettings(music_sources=1, tone_band_hz=(20.0, 400.0))
+
+
+def noise_from(
+    array: MicrophoneArray, azimuth_rad: float, rate: int, seconds: float, seed: int = 0, noise: float = 0.1
+) -> np.ndarray:
+    """A white plane wave with exact fractional delays in sensor noise, float32 (n, M)."""
+    rng, n = np.random.default_rng(seed), round(seconds * rate)
+    wave = np.fft.rfft(rng.standard_normal(n))[:, None]
+    wave = wave * array.steering(np.fft.rfftfreq(n, 1 / rate), azimuth_rad)[:, :, 0]
+    sensor = noise * rng.standard_normal((n, array.n_microphones))
+    return (np.fft.irfft(wave, n, axis=0) + sensor).astype(np.float32)
+
+
+def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: float = 1e-5) -> None:
+    assert [f.stamp_ns for f in ours] == [f.stamp_ns for f in theirs]
+    for a, b in zip(ours, theirs, strict=True):
+        for name in ("srp", "feature", "band_log_energy", "bearing_rad", "bearing_std_rad", "prominence"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=rtol, err_msg=name)
+        assert isinstance(a.looming, Looming) == isinstance(b.looming, Looming)
+        if isinstance(a.looming, Looming) and isinstance(b.looming, Looming):
+            assert a.looming.inverse_tta_hz == pytest.approx(b.looming.inverse_tta_hz, rel=rtol, abs=1e-7)
+            assert a.looming.std_hz == pytest.approx(b.looming.std_hz, rel=rtol)
+        assert_same_options(a, b)
+
+
+def assert_same_options(a: AcousticFrame, b: AcousticFrame) -> None:
+    """MUSIC and tone, bit for bit: hops are cut before anything is computed."""
+    assert a.tone == b.tone
+    assert isinstance(a.music, MusicReading) == isinstance(b.music, MusicReading)
+    if isinstance(a.music, MusicReading) and isinstance(b.music, MusicReading):
+        np.testing.assert_array_equal(a.music.spectrum, b.music.spectrum)
+
+
+@settings(deadline=None, max_examples=15)
+@given(cuts=st.lists(st.integers(0, 20_000), max_size=12), rate=st.sampled_from([8_000, 15_999.7]))
+def test_block_size_does_not_matter(cuts: list[int], rate: float) -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.25)
+    sound += np.sin(2 * np.pi * 61.0 / RATE * np.arange(len(sound)), dtype=np.float32)[:, None]
+    whole = FrontEnd(SQUARE, rate, EVERYTHING).process(sound)
+    pieces = FrontEnd(SQUARE, rate, EVERYTHING)
+    blocks = np.split(sound, sorted(min(c, len(sound)) for c in cuts))
+    assert_same([frame for block in blocks for frame in pieces.process(block)], whole)
+    assert isinstance(whole[-1].tone, ToneReading)
+    assert isinstance(whole[-1].music, MusicReading)
+
+
+def test_sample_by_sample_is_the_same_too() -> None:
+    sound = noise_from(SQUARE, 0.5, 8_000, 1.15)
+    front_end = FrontEnd(SQUARE, 8_000)
+    frames = [frame for sample in sound for frame in front_end.process(sample[None])]
+    assert len(frames) == 2
+    assert_same(frames, FrontEnd(SQUARE, 8_000).process(sound))
+
+
+def test_hops_do_not_drift_at_the_recordings_odd_rate() -> None:
+    array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
+    sound = np.random.default_rng(0).standard_normal((47_998 * 4, 2))
+    frames = FrontEnd(array, 47_998, start_ns=5).process(sound)
+    assert [f.sample_index for f in frames] == [int(k * 4799.8 + 0.5) for k in range(10, 41)]
+    assert frames[10].stamp_ns == 5 + 2_000_000_000
+    assert abs(frames[3].stamp_ns - 1_300_000_005) < 1e9 / 47_998
+
+
+def test_nothing_before_the_first_full_second() -> None:
+    front_end = FrontEnd(SQUARE, RATE)
+    sound = noise_from(SQUARE, 0.2, RATE, 1.0)
+    assert front_end.process(sound[:-1]) == []
+    assert len(front_end.process(sound[-1:])) == 1
+
+
+@pytest.mark.parametrize("rate", [16_000, 48_000])
+@pytest.mark.parametrize("azimuth_deg", [-50.0, 0.0, 25.0])
+@pytest.mark.parametrize("layout", ["square", "line", "roof"])
+def test_bearing_of_a_plane_wave(layout: str, azimuth_deg: float, rate: int) -> None:
+    line = MicrophoneArray([[0, 0.08 * i, 0] for i in range(8)])
+    array = {"square": SQUARE, "line": line, "roof": roof_array_56()}[layout]
+    frame = FrontEnd(array, rate).process(noise_from(array, np.radians(azimuth_deg), rate, 1.0))[0]
+    assert np.degrees(frame.bearing_rad) == pytest.approx(azimuth_deg, abs=1.0)
+    assert frame.prominence > 1.1
+    assert frame.bearing_std_rad < np.radians(12)
+
+
+def test_the_square_frame_has_the_promised_shapes() -> None:
+    frame = FrontEnd(SQUARE, RATE).process(noise_from(SQUARE, 0.2, RATE, 1.0))[0]
+    assert frame.srp.shape == frame.azimuths_rad.shape == (181,)
+    assert frame.band_log_energy.shape == (16,)
+    assert frame.feature.shape == (60,)
+    assert frame.azimuths_rad[0] == -np.pi / 2
+    assert np.all(np.diff(frame.azimuths_rad) > 0)
+
+
+@settings(deadline=None, max_examples=10)
+@given(gain=st.floats(1e-3, 1e3), seed=st.integers(0, 1000))
+def test_a_gain_changes_neither_bearing_nor_looming(gain: float, seed: int) -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.0, seed)
+    plain, louder = (FrontEnd(SQUARE, RATE).process(s)[0] for s in (sound, sound * np.float32(gain)))
+    assert louder.bearing_rad == pytest.approx(plain.bearing_rad, abs=1e-5)
+    assert isinstance(plain.looming, Looming)
+    assert isinstance(louder.looming, Looming)
+    assert louder.looming.inverse_tta_hz == pytest.approx(plain.looming.inverse_tta_hz, abs=1e-5)
+    np.testing.assert_allclose(louder.band_log_energy - plain.band_log_energy, 2 * np.log(gain), atol=1e-4)
+
+
+def test_mirrored_world_and_array_mirror_the_frame() -> None:
+    array = roof_array_56()
+    mirrored = MicrophoneArray(array.positions_m * [1.0, -1.0, 1.0])
+    left = FrontEnd(array, 48_000).process(noise_from(array, 0.6, 48_000, 1.0))[0]
+    right = FrontEnd(mirrored, 48_000).process(noise_from(mirrored, -0.6, 48_000, 1.0))[0]
+    np.testing.assert_allclose(right.srp, left.srp[::-1], rtol=1e-4)
+    assert right.bearing_rad == pytest.approx(-left.bearing_rad, abs=1e-4)
+    mirrored_feature = right.feature.reshape(2, 30)[:, ::-1].ravel()
+    np.testing.assert_allclose(mirrored_feature, left.feature, rtol=1e-3)
+
+
+def test_looming_on_an_approaching_source_in_the_stream() -> None:
+    n = 2 * RATE
+    time_s = np.arange(n) / RATE
+    range_m = 30.0 - 10.0 * time_s
+    sound = noise_from(SQUARE, 0.0, RATE, 2.0, noise=0.0) / range_m[:, None].astype(np.float32)
+    frames = FrontEnd(SQUARE, RATE).process(sound)
+    errors = []
+    for frame in frames:
+        assert isinstance(frame.looming, Looming)
+        truth = 10.0 / (30.0 - 10.0 * frame.sample_index / RATE)
+        errors.append((frame.looming.inverse_tta_hz - truth) / frame.looming.std_hz)
+    assert np.abs(np.mean(errors)) < 1.5
+    assert np.abs(errors).max() < 3.0
+
+
+def test_band_levels_of_white_noise_and_a_tone() -> None:
+    rng = np.random.default_rng(0)
+    white = FrontEnd(SQUARE, RATE).process(rng.standard_normal((RATE, 4)))[0].band_log_energy
+    # The 16 bands cover bins 2..230 of 256: mean square 1 times that share.
+    assert np.exp(white).sum() == pytest.approx(228 / 256, rel=0.05)
+    tone = np.sin(2 * np.pi * 1000 * np.arange(RATE) / RATE)[:, None] * np.ones(4)
+    levels = FrontEnd(SQUARE, RATE).process(tone)[0].band_log_energy
+    assert np.exp(levels).max() == pytest.approx(0.5, rel=0.02)
+    assert np.sort(levels)[-3] < np.log(1e-6)
+
+
+def test_silence_says_so() -> None:
+    frame = FrontEnd(SQUARE, RATE).process(np.zeros((RATE, 4)))[0]
+    assert frame.looming == NotUsable("silence within the window")
+    assert frame.prominence == 1.0
+    assert frame.bearing_std_rad > 0.8
+    assert not frame.srp.any()
+    assert np.isfinite(frame.band_log_energy).all()
+
+
+def test_looming_waits_for_its_own_window() -> None:
+    sound = noise_from(SQUARE, 0.0, RATE, 1.5)
+    frames = FrontEnd(SQUARE, RATE, FrontEndSettings(looming_hops=15)).process(sound)
+    assert [isinstance(f.looming, NotUsable) for f in frames] == [True] * 5 + [False]
+
+
+def test_a_refused_block_leaves_the_stream_as_it_was() -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.0)
+    front_end = FrontEnd(SQUARE, RATE)
+    front_end.process(sound[:5000])
+    broken = sound[5000:].copy()
+    broken[100, 2] = np.nan
+    with pytest.raises(InvalidArgumentError, match=r"channels \[2\]"):
+        front_end.process(broken)
+    assert_same(front_end.process(sound[5000:]), FrontEnd(SQUARE, RATE).process(sound))
+
+
+@pytest.mark.parametrize(
+    "block",
+    [np.zeros((10, 3)), np.zeros(10), "sound", [[None] * 4], np.full((2, 4), np.inf), np.full((2, 4), 1e300)],
+)
+def test_bad_blocks_are_refused(block: object) -> None:
+    with pytest.raises(InvalidArgumentError, match="block"):
+        FrontEnd(SQUARE, RATE).process(block)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("scale", [2.0**31, 1e13])
+def test_loud_is_not_infinite(scale: float) -> None:
+    sound = noise_from(SQUARE, 0.5, RATE, 1.0)
+    frame = FrontEnd(SQUARE, RATE).process(sound * np.float32(scale))[0]
+    assert np.isfinite(frame.band_log_energy).all()
+    assert isinstance(frame.looming, Looming)
+
+
+@pytest.mark.parametrize(
+    ("rate", "settings_", "message"),
+    [
+        (3_500, {"nfft": 256}, "half the sample rate"),
+        (4_000, {}, "nfft"),
+        (0, {}, "sample_rate_hz"),
+        (48_000, {"nfft": 511}, "nfft"),
+        (48_000, {"window_hops": 5}, "window_hops"),
+        (48_000, {"azimuth_step_deg": 0.7}, "divisor"),
+        (48_000, {"bearing_hops": 11}, "bearing_hops"),
+        (48_000, {"srp_band_hz": (1800.0, 300.0)}, "srp_band_hz"),
+    ],
+)
+def test_bad_settings_are_refused(rate: float, settings_: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=message):
+        FrontEnd(SQUARE, rate, FrontEndSettings(**settings_))  # type: ignore[arg-type]
+
+
+def hear(front_end: FrontEnd, sound: np.ndarray, hops: int, rounds: int = 1) -> None:
+    """So many hops out of a sound, with a gap and a dead channel now and then; every round is the same."""
+    size = round(front_end.sample_rate_hz / 10)
+    for hop in range(rounds * hops):
+        rng = np.random.default_rng(hop % hops)
+        start = int(rng.integers(0, len(sound) - size))
+        block = sound[start : start + size].copy()
+        if hop % 7 == 0:
+            block[: size // 3] = 0.0
+        if hop % 11 == 0:
+            block[:, rng.integers(0, block.shape[1])] = 0.0
+        front_end.process(block)
+    gc.collect()
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_memory_does_not_grow() -> None:
+    """Everything is on: nothing is kept of 1500 hops, and what is kept does not get larger."""
+    chosen = replace(EVERYTHING, nfft=256, ego_noise=EgoNoiseSettings())
+    front_end, sound = FrontEnd(SQUARE, 4_000, chosen), noise_from(SQUARE, 0.5, 4_000, 20.0)
+    front_end.learn_ego_noise(1.0)
+    hear(front_end, sound, 770)
+    blocks = sys.getallocatedblocks()
+    hear(front_end, sound, 770, rounds=2)
+    assert sys.getallocatedblocks() - blocks < 500
+    tracemalloc.start()
+    hear(front_end, sound, 77)
+    traced = tracemalloc.get_traced_memory()[0]
+    hear(front_end, sound, 77, rounds=2)
+    grown = tracemalloc.get_traced_memory()[0] - traced
+    tracemalloc.stop()
+    assert grown < 12_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the resident set is read from there")
+def test_memory_does_not_grow_in_an_hour_of_56_channels() -> None:
+    """A single float a channel and hop would be twice the limit."""
+    front_end = FrontEnd(roof_array_56(), 47_998, EVERYTHING)
+    sound = noise_from(roof_array_56(), 0.5, 47_998, 8.0)
+    hear(front_end, sound, 770)
+    blocks, resident = sys.getallocatedblocks(), resident_bytes()
+    hear(front_end, sound, 770, rounds=47)
+    assert sys.getallocatedblocks() - blocks < 1000
+    assert resident_bytes() - resident < 4_000_000
+
+
+def test_running_second_is_the_srp_of_the_frames_that_end_in_it() -> None:
+    array, rate = SQUARE, 16_000
+    sound = noise_from(array, 0.5, rate, 1.3)
+    frame = FrontEnd(array, rate).process(sound)[2]
+    bins = band_bins((300.0, 1800.0), rate, 512)
+    spectra = StreamingStft(4, 512, bins).push(sound)
+    ends = 512 + 256 * np.arange(len(spectra))
+    within = (ends > 0.2 * rate) & (ends <= 1.2 * rate)
+    steering = Steering.towards(array, bin_frequencies_hz(bins, rate, 512), frame.azimuths_rad)
+    np.testing.assert_allclose(frame.srp, srp_phat(spectra[within], steering), rtol=1e-5)
+    centres = (ends - 256)[(ends > 1.0 * rate) & (ends <= 1.2 * rate)]
+    assert frame.bearing_age_s == pytest.approx(1.2 - centres.mean() / rate)

@@ -1,0 +1,40 @@
+"""Onsets, lead time and false alarms per hour as DESIGN.md defines them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
+
+
+@given(st.lists(st.booleans(), max_size=50))
+def test_every_onset_is_a_change_from_quiet_to_alarm(alarm):
+    by_hand = [t for t, on in enumerate(alarm) if on and (t == 0 or not alarm[t - 1])]
+    assert rising_edges(alarm).tolist() == by_hand
+
+
+def test_lead_time_counts_from_the_first_onset_within_five_seconds():
+    assert detection([6.0, 6.5], 7.0).lead_time_s == pytest.approx(1.0)
+    early = detection([1.0, 1.9, 4.0], 7.0)
+    assert early.lead_time_s == pytest.approx(3.0)
+    assert early.false_advisories_before == 2
+
+
+@pytest.mark.parametrize("onsets", [[], [7.0, 8.0], [0.5]])
+def test_too_late_or_too_early_is_a_miss(onsets):
+    assert not detection(onsets, 7.0).detected
+
+
+def test_the_static_set_s_quantum():
+    # 0.103 h of hazard-free audio: one onset is 9.7 an hour.
+    hops = round(0.103 * 36000)
+    alarm = np.zeros(hops, dtype=bool)
+    alarm[100:140] = True
+    assert false_alarms_per_hour([alarm[:2000], alarm[2000:]]) == pytest.approx(9.7, abs=0.02)
+
+
+def test_a_hop_must_last():
+    with pytest.raises(InvalidArgumentError, match="hop_s"):
+        false_alarms_per_hour([[True]], hop_s=0.0)

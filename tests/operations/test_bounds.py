@@ -1,0 +1,173 @@
+"""Bounds: the paper's numbers, a numerical Fisher matrix for any array, efficiency of a beamformer peak."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.optimize import minimize_scalar
+
+from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.bounds.cramer_rao import (
+    bearing_crb_rad2,
+    bearing_information,
+    broadside_rad,
+    delay_crb_s2,
+    endfire_information,
+    radial_speed_crb_m2_s2,
+    tone_crb_hz2,
+)
+from worldstate.ground.errors import InvalidArgumentError
+
+SOUND_M_S = 343.0
+positions_strategy = st.integers(0, 2**32 - 1).map(
+    lambda seed: np.random.default_rng(seed).uniform(-0.5, 0.5, (9, 3))
+)
+
+
+def test_papers_bearing_constant():
+    """1.8 deg / sqrt(2 N SNR) at 1 kHz, broadside, S_xx = 3.027 m^2."""
+    y = np.linspace(-1, 1, 56)
+    y *= np.sqrt(3.027 / np.sum(y**2))
+    plate = np.column_stack([0 * y, y, np.cos(7 * y)])
+    degrees = np.rad2deg(np.sqrt(2 * 10 * 4.0 * bearing_crb_rad2(plate, 0.0, 1000.0, 4.0, 10)))
+    assert degrees == pytest.approx(1.7978, abs=1e-3)
+
+
+def test_built_in_array_has_the_papers_bound():
+    variance = bearing_crb_rad2(roof_array_56().positions_m, 0.0, 1000.0, 1.0, 1)
+    assert np.rad2deg(np.sqrt(2 * variance)) == pytest.approx(1.8, abs=0.02)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    positions=positions_strategy,
+    azimuth=st.floats(-3.1, 3.1),
+    elevation=st.floats(-1.2, 1.2),
+    snr=st.floats(0.01, 100.0),
+)
+def test_information_equals_a_numerical_fisher_matrix(positions, azimuth, elevation, snr):
+    """Oracle: 2 SNR Re(D^H (I - a a^H / M) D), derivatives of the steering vector by finite differences."""
+    frequency, h = 700.0, 1e-5
+
+    def steer(azimuth, elevation):
+        u = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        return np.exp(2j * np.pi * frequency / SOUND_M_S * (positions @ u))
+
+    a = steer(azimuth, elevation)
+    by_azimuth = (steer(azimuth + h, elevation) - steer(azimuth - h, elevation)) / (2 * h)
+    by_elevation = (steer(azimuth, elevation + h) - steer(azimuth, elevation - h)) / (2 * h)
+    D = np.column_stack([by_azimuth, by_elevation])
+    outside = np.eye(9) - np.outer(a, a.conj()) / 9
+    J = 2 * 30 * snr * (D.conj().T @ outside @ D).real
+    got = bearing_information(positions, azimuth, frequency, snr, 30, elevation_rad=elevation)
+    np.testing.assert_allclose(got, J, rtol=1e-6, atol=1e-6 * J.max())
+    unknown = bearing_crb_rad2(
+        positions, azimuth, frequency, snr, 30, elevation_rad=elevation, elevation_known=False
+    )
+    assert unknown == pytest.approx(np.linalg.inv(J)[0, 0], rel=1e-4)
+    assert unknown >= (1 - 1e-9) / J[0, 0]
+
+
+def test_information_of_bins_adds_and_a_random_signal_costs():
+    positions = roof_array_56().positions_m
+    each = [1 / bearing_crb_rad2(positions, 0.3, f, s, 5) for f, s in [(500.0, 2.0), (900.0, 0.1)]]
+    both = bearing_crb_rad2(positions, 0.3, [500.0, 900.0], [2.0, 0.1], 5)
+    assert 1 / both == pytest.approx(sum(each))
+    random = bearing_crb_rad2(positions, 0.3, 900.0, 0.1, 5, random_signal=True)
+    assert random == pytest.approx((1 + 1 / 5.6) / each[1])
+
+
+@settings(max_examples=30, deadline=None)
+@given(azimuth=st.floats(-np.pi, np.pi))
+def test_endfire_corollary(azimuth):
+    positions = roof_array_56().positions_m
+    share = endfire_information(positions, azimuth)
+    assert share == pytest.approx(np.cos(azimuth) ** 2, abs=1e-12)
+    broadside = bearing_crb_rad2(positions, 0.0, 1000.0, 1.0, 1)
+    if share > 1e-6:
+        assert bearing_crb_rad2(positions, azimuth, 1000.0, 1.0, 1) == pytest.approx(broadside / share)
+
+
+@settings(max_examples=30, deadline=None)
+@given(positions=positions_strategy, azimuth=st.floats(-np.pi, np.pi))
+def test_nowhere_is_better_than_broadside(positions, azimuth):
+    best = broadside_rad(positions)
+    assert -np.pi / 2 < best <= np.pi / 2
+    assert endfire_information(positions, best) == pytest.approx(1.0)
+    assert endfire_information(positions, azimuth) <= 1.0 + 1e-12
+
+
+def test_endfire_has_no_bearing():
+    y = np.linspace(-0.4, 0.4, 5)
+    line = np.column_stack([0 * y, y, 0 * y])
+    assert bearing_crb_rad2(line, np.pi / 2, 1000.0, 1.0, 1) > 1e20
+    assert bearing_crb_rad2(line, 0.1, 1000.0, 0.0, 1) == np.inf
+    for ask in (broadside_rad, lambda pole: endfire_information(pole, 0.0)):
+        with pytest.raises(InvalidArgumentError, match="horizontal extent"):
+            ask([[0, 0, 0], [0, 0, 1.0]])
+
+
+@pytest.mark.parametrize(("azimuth_deg", "snr"), [(0.0, 0.3), (0.0, 3.0), (20.0, 1.0), (65.0, 3.0)])
+def test_beamformer_peak_meets_the_bearing_bound(azimuth_deg, snr):
+    """For one source in white noise the maximum of the beamformer is maximum likelihood."""
+    rng = np.random.default_rng(int(azimuth_deg + 10 * snr))
+    positions, frequency = roof_array_56().positions_m, 1000.0
+    truth, snapshots, trials = np.deg2rad(azimuth_deg), 20, 500
+
+    def steer(azimuth):
+        return np.exp(2j * np.pi * frequency / SOUND_M_S * (positions[:, 1] * np.sin(azimuth)))
+
+    errors = []
+    for _ in range(trials):
+        wave = np.sqrt(snr) * np.exp(2j * np.pi * rng.uniform(size=snapshots))
+        noise = (rng.normal(size=(snapshots, 56)) + 1j * rng.normal(size=(snapshots, 56))) / np.sqrt(2)
+        X = wave[:, None] * steer(truth) + noise
+        peak = minimize_scalar(
+            lambda azimuth, X=X: -np.sum(np.abs(X @ steer(azimuth).conj()) ** 2),
+            bounds=(truth - 0.1, truth + 0.1), method="bounded", options={"xatol": 1e-8},
+        )  # fmt: skip
+        errors.append(peak.x - truth)
+    bound = bearing_crb_rad2(positions, truth, frequency, snr, snapshots)
+    ratio_db = 10 * np.log10(np.mean(np.square(errors)) / bound)
+    assert 10 * np.log10(1 - 3 * np.sqrt(2 / trials)) < ratio_db < 1.5
+
+
+def test_delay_bound_equals_adaptive_quadrature():
+    def coherence(f):
+        return 0.8 * np.exp(-(((f - 700.0) / 400.0) ** 2))
+
+    f = np.linspace(100.0, 2000.0, 4001)
+    integral = quad(lambda f: (2 * np.pi * f) ** 2 * coherence(f) / (1 - coherence(f)), 100.0, 2000.0)[0]
+    assert delay_crb_s2(f, coherence(f), 0.5) == pytest.approx(1 / integral, rel=1e-5)
+    assert delay_crb_s2(f, 0 * f, 0.5) == np.inf
+
+
+def test_tone_bound_equals_a_numerical_fisher_matrix():
+    """Amplitude, phase and frequency of a real tone, eta = A^2 / (2 sigma^2)."""
+    n, rate, frequency, sigma = 400, 1000.0, 123.0, 0.7
+    t = (np.arange(n) - 0.5 * (n - 1)) / rate
+    angle = 2 * np.pi * frequency * t + 0.3
+    H = np.column_stack([np.cos(angle), -np.sin(angle), -2 * np.pi * t * np.sin(angle)])
+    variance = np.linalg.inv(H.T @ H / sigma**2)[2, 2]
+    assert tone_crb_hz2(1 / (2 * sigma**2), n, rate) == pytest.approx(variance, rel=0.01)
+    assert radial_speed_crb_m2_s2(variance, frequency) == pytest.approx((343 / 123) ** 2 * variance)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: delay_crb_s2([100.0, 200.0], [0.5, 1.0], 1.0),
+        lambda: delay_crb_s2([200.0, 100.0], [0.5, 0.5], 1.0),
+        lambda: delay_crb_s2([100.0, 200.0], [0.5, 0.5], 0.0),
+        lambda: bearing_crb_rad2([[0.0, 0.0, 0.0]], 0.0, 1000.0, 1.0, 1),
+        lambda: bearing_crb_rad2(np.eye(3), 0.0, 1000.0, -1.0, 1),
+        lambda: bearing_crb_rad2(np.eye(3), np.nan, 1000.0, 1.0, 1),
+        lambda: tone_crb_hz2(0.0, 100, 1000.0),
+        lambda: tone_crb_hz2(1.0, 1, 1000.0),
+        lambda: radial_speed_crb_m2_s2(1.0, 0.0),
+    ],
+)
+def test_bad_input_is_refused(call):
+    with pytest.raises(InvalidArgumentError):
+        call()

@@ -1,0 +1,262 @@
+"""From recorded streams to thresholds: the statistic, the alarm map, the command."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.stats import poisson
+
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.cueing.cueing_policy import sustained_statistic
+from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap, fit_risk_map
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.posterior import statistic
+from worldstate.adapters.files.model_file import read_model
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.values import NotUsable
+from worldstate.measurement.measurement import Approach, Measurement, Sighting
+from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
+from worldstate.operations.calibration.false_alarm_map import false_alarm_rate, threshold_for_rate
+from worldstate.operations.recordings.advisories import rising_edges
+from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, load_streams, save_streams
+from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
+
+PRIOR = (0.3, 0.3, 0.2, 0.2)
+answers = st.one_of(
+    st.just(Unqueried("-")),
+    st.builds(Absent, st.floats(0.01, 1.0), st.floats(0.0, 0.5)),
+    st.builds(Present, st.floats(0.0, 0.99), st.floats(0.01, 0.5)),
+)
+nats = st.floats(-8.0, 8.0)
+
+
+def street(rng, label="none", hops=291, level=-1.5, phi=0.9):
+    """A stream whose log-odds are an AR(1) about `level`; an approach rises to T0 at 20 s."""
+    log_odds = lfilter([math.sqrt(1 - phi**2)], [1.0, -phi], rng.normal(size=hops)) + level
+    stream = HopStream.blank(f"{label}/{rng.integers(1 << 30)}", hops)
+    if label != "none":
+        log_odds = log_odds + np.clip((stream.time_s - 15.0) * 1.0, 0.0, 6.0)
+    heard = np.stack([log_odds, log_odds - 2.0, log_odds - 3.0, np.zeros(hops)], axis=1)
+    t0_s = math.nan if label == "none" else 20.0
+    return replace(stream, label=label, t0_s=t0_s, log_likelihoods=heard)
+
+
+@given(st.lists(st.tuples(st.tuples(nats, nats, nats, nats), answers), min_size=1, max_size=8))
+def test_over_a_stream_the_statistic_is_that_of_every_hop(rows):
+    measured = [
+        Measurement(
+            (i + 10) * 10**8, SignatureEvidence(("left", "right"), row[:2], row[2], row[3]), answer,
+            NotUsable("-"), NotUsable("-"),
+        )
+        for i, (row, answer) in enumerate(rows)
+    ]  # fmt: skip
+    stream = hop_stream(measured, name="x")
+    expected = [statistic(m.signature, m.co_evidence, PRIOR) for m in measured]
+    assert stream_statistic(stream, PRIOR) == pytest.approx(expected, rel=1e-9)
+    alone = [statistic(m.signature, Unqueried("-"), PRIOR) for m in measured]
+    switched = stream_statistic(stream, PRIOR, StatisticSwitches(use_absence=False))
+    assert switched == pytest.approx(alone, rel=1e-9)
+
+
+def test_the_approach_term_moves_the_log_odds_by_its_weight_and_only_where_usable():
+    stream = replace(street(np.random.default_rng(0), hops=4), approach=np.array([np.nan, 0.0, 1.5, -9.0]))
+    plain, looming = (
+        stream_statistic(stream, PRIOR, StatisticSwitches(approach_weight=w)) for w in (0.0, 0.4)
+    )
+    shift = np.log(looming / (1 - looming)) - np.log(plain / (1 - plain))
+    assert shift == pytest.approx([0.0, 0.0, 0.6, -1.2], abs=1e-9)
+
+
+def test_a_stream_keeps_what_was_measured():
+    sighted = Sighting(0.1, 0.02, "car", 0.9)
+    m = Measurement(
+        10**9, SignatureEvidence(("left",), (1.0,), 0.0, 0.0), Absent(0.1), NotUsable("-"),
+        Approach(0.5, 0.25), (sighted, replace(sighted, moving=False)),
+    )  # fmt: skip
+    stream = hop_stream([m], name="a", label="left", t0_s=2.0)
+    assert (stream.approach.item(), stream.seen.item(), stream.before_sight.item()) == (2.0, True, True)
+    with pytest.raises(InvalidArgumentError, match="hop"):
+        hop_stream([], name="a")
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.floats(0.0, 20.0), st.booleans())
+def test_the_map_read_backwards_is_the_smallest_threshold_above_which_the_rate_is_kept(
+    seed, hops, rate, ties
+):
+    rng = np.random.default_rng(seed)
+    streams = [rng.random(rng.integers(1, 40)).round(1 if ties else 6) for _ in range(5)]
+    found = threshold_for_rate(streams, rate, hops, hop_s=60.0)
+
+    def per_hour(gamma):
+        alarms = [sustained_statistic(s, hops) >= gamma for s in streams]
+        return sum(len(rising_edges(a)) for a in alarms) / (sum(map(len, alarms)) / 60.0)
+
+    levels = np.unique(np.concatenate(streams))
+    assert all(per_hour(g) <= rate + 1e-6 for g in [found.gamma, *levels[levels > found.gamma]])
+    assert found.per_hour == pytest.approx(per_hour(found.gamma))
+    if (below := np.nextafter(max(found.gamma, -1.0), -np.inf)) in levels:
+        assert per_hour(below) > rate
+
+
+@given(st.integers(0, 40), st.integers(50, 400))
+@settings(deadline=None)
+def test_the_interval_of_the_rate_is_the_exact_one_of_a_poisson_count(onsets, windows):
+    stream = np.zeros(max(windows, 2 * onsets + 1))
+    stream[1 : 2 * onsets : 2] = 1.0
+    rate = false_alarm_rate([stream], 0.5, hop_s=36.0)
+    assert rate.onsets == onsets
+    assert poisson.cdf(onsets, rate.high_per_hour * rate.hours) == pytest.approx(0.025, abs=1e-6)
+    if onsets:
+        assert poisson.sf(onsets - 1, rate.low_per_hour * rate.hours) == pytest.approx(0.025, abs=1e-6)
+    assert rate.quantum_per_hour == pytest.approx(1 / rate.hours)
+
+
+def test_few_samples_get_two_numbers_and_many_a_curve():
+    rng = np.random.default_rng(0)
+    labels = rng.random(600) < 0.5
+    scores = 1 / (1 + np.exp(-rng.normal(size=600) - labels))
+    assert isinstance(fit_risk_map(scores[:150], labels[:150]), PlattMap)
+    assert isinstance(fit_risk_map(scores, labels), IsotonicMap)
+    assert isinstance(fit_risk_map(scores, labels, independent=60.0), PlattMap)
+
+
+def test_calibration_keeps_its_budget_on_fresh_recordings_of_the_same_street():
+    kept = read_model().policies
+    settings_, rates = CueingSettings(alphas=(0.05,)), []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        done = calibrate_cueing([street(rng) for _ in range(40)], PRIOR, kept, settings_)
+        gamma = done.policies.for_alpha(0.05, 0.0).gamma
+        fresh = [
+            stream_statistic(street(rng), PRIOR, StatisticSwitches(fixed_miss_rate=0.0)) for _ in range(40)
+        ]
+        rates.append(false_alarm_rate(fresh, gamma, 3).window_rate)
+        assert done.risk == "kept"
+        assert done.policies.for_alpha(0.05, 0.0).risk_map == kept.for_alpha(0.02, 0.0).risk_map
+        assert [b.held_out_rate for b in done.budgets] == pytest.approx([0.04, 0.04], abs=0.03)
+    assert 0.5 * 0.05 < np.mean(rates) <= 0.05
+
+
+def test_approaches_with_a_t0_give_the_risk_map():
+    rng = np.random.default_rng(1)
+    streams = [street(rng, label) for label in ("none", "left") * 20]
+    done = calibrate_cueing(streams, PRIOR, read_model().policies, CueingSettings(alphas=(0.05,)))
+    assert done.risk in ("platt", "isotonic")
+    risk = done.policies.for_alpha(0.05, 0.0).risk_map
+    assert risk(0.1) < risk(0.9)
+    assert (done.recordings, done.windows) == (20, 20 * 291)
+
+
+def test_a_rate_to_keep_is_bounded_by_what_half_of_the_approaches_reach():
+    rng = np.random.default_rng(1)
+    streams = [street(rng, label) for label in ("none", "left") * 20]
+    chosen = CueingSettings(alphas=(0.05,), keep_per_hour=12.0)
+    policy = calibrate_cueing(streams, PRIOR, read_model().policies, chosen).policies.for_alpha(0.05, 0.0)
+    assert policy.adaptive.rate_per_hour == 12.0
+    switches = StatisticSwitches(fixed_miss_rate=0.0)
+    peaks = [
+        sustained_statistic(stream_statistic(s, PRIOR, switches)[s.before_sight], 3).max()
+        for s in streams
+        if not s.hazard_free
+    ]
+    deafest = policy.gamma_at(100.0)
+    assert np.mean(np.array(peaks) >= deafest) >= 0.5
+    plain = calibrate_cueing(streams, PRIOR, read_model().policies, CueingSettings(alphas=(0.05,)))
+    assert plain.policies.for_alpha(0.05, 0.0).adaptive is None
+
+
+def test_too_few_hours_are_said_with_what_it_would_take():
+    rng = np.random.default_rng(2)
+    few = [street(rng) for _ in range(5)]
+    done = calibrate_cueing(few, PRIOR, read_model().policies, CueingSettings(alphas=(0.01,)))
+    assert any("99 pieces of 10 s" in w and "got 10" in w for w in done.warnings)
+    slow = CueingSettings(alphas=(0.2,), block_s=1.0)
+    assert any("correlated" in w for w in calibrate_cueing(few, PRIOR, read_model().policies, slow).warnings)
+    with pytest.raises(InvalidArgumentError, match="without a hazard"):
+        calibrate_cueing([street(rng, "left")], PRIOR, read_model().policies)
+
+
+@pytest.fixture
+def streams_file(tmp_path):
+    rng = np.random.default_rng(3)
+    path = tmp_path / "streams.npz"
+    save_streams(path, [street(rng, label) for label in ("none", "none", "right") * 6])
+    return path
+
+
+def test_streams_survive_the_disk(streams_file):
+    streams = load_streams(streams_file)
+    again = streams_file.with_name("again.npz")
+    save_streams(again, streams)
+    for before, after in zip(streams, load_streams(again), strict=True):
+        assert (before.name, before.label, len(before)) == (after.name, after.label, 291)
+        assert np.array_equal(before.log_likelihoods, after.log_likelihoods)
+        assert np.array_equal(before.t0_s, after.t0_s, equal_nan=True)
+
+
+def test_damaged_streams_are_a_typed_error(streams_file, tmp_path):
+    whole = streams_file.read_bytes()
+    for number, cut in enumerate([b"", whole[:100], whole[: len(whole) // 2], b"PK\x03\x04" + b"\0" * 50]):
+        damaged = tmp_path / f"{number}.npz"
+        damaged.write_bytes(cut)
+        with pytest.raises(InputFileError, match=damaged.name):
+            load_streams(damaged)
+    objects = tmp_path / "objects.npz"
+    np.savez(objects, version=np.array({"a": 1}, dtype=object))
+    with pytest.raises(InputFileError, match=r"objects\.npz"):
+        load_streams(objects)
+    with np.load(streams_file) as file:
+        arrays = dict(file)
+    for key, value in {"hops": arrays["hops"] + 1, "log_likelihoods": np.full((5, 4), np.nan)}.items():
+        wrong = tmp_path / f"{key}.npz"
+        np.savez(wrong, **(arrays | {key: value}))
+        with pytest.raises(InputFileError, match=wrong.name):
+            load_streams(wrong)
+
+
+def test_the_command_replaces_the_policies_and_keeps_the_signature(streams_file, tmp_path, capsys):
+    out = tmp_path / "model.json"
+    arguments = ["calibrate", str(streams_file), "--alpha", "0.01", "0.1", "--out", str(out), "--json"]
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    summary = json.loads(captured.out)
+    assert "alpha 0.01" in captured.err
+    assert summary["warnings"]
+    assert summary["hazard_free_hours"] == pytest.approx(12 * 291 / 36000)
+    before, after = read_model(), read_model(out)
+    assert after.signature.to_dict() == before.signature.to_dict()
+    assert {(p.alpha, p.miss_rate) for p in after.policies.policies} == {
+        (a, b) for a in (0.01, 0.1) for b in (0.0, 1.0)
+    }
+    assert after.policies.for_alpha(0.1, 0.0).gamma == summary["budgets"][1]["gamma"]
+
+
+def test_the_command_listens_to_a_sound_file(tmp_path, capsys):
+    sound = tmp_path / "quiet.wav"
+    soundfile.write(sound, np.random.default_rng(0).normal(0, 0.01, (120_000, 56)), 48_000)
+    out, streams = tmp_path / "model.json", tmp_path / "s.npz"
+    extra = ["--method", "plain", "--alpha", "0.2", "--save-streams", str(streams), "--json"]
+    assert main(["calibrate", str(sound), "--out", str(out), *extra]) == 0
+    assert json.loads(capsys.readouterr().out)["windows"] == 16
+    (heard,) = load_streams(streams)
+    assert heard.hazard_free
+    assert not heard.answer.any()
+
+
+@pytest.mark.parametrize("name", ["missing.wav", "text.wav", "text.npz"])
+def test_bad_input_is_one_line_and_leaves_nothing(name, tmp_path, capsys):
+    path = tmp_path / name
+    if not name.startswith("missing"):
+        path.write_text("no sound")
+    assert main(["calibrate", str(path), "--out", str(tmp_path / "model.json")]) == 2
+    captured = capsys.readouterr()
+    assert name in captured.err
+    assert not (tmp_path / "model.json").exists()

@@ -1,0 +1,50 @@
+"""Lead time and hand-over, read off a stream of states."""
+
+from worldstate.ground.values import nanoseconds
+from worldstate.operations.recordings.warning import WarningMeter
+from worldstate.state import Context, Entity, RiskCue, WorldState
+from worldstate.state.context import Priors
+
+HYPOTHESES = Priors(0.5, 0.2, 0.3)
+
+
+def state(time_s: float, advisory: bool, entity_id: str = "a", *entities: Entity) -> WorldState:
+    cue = RiskCue("left", 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, HYPOTHESES, advisory, entity_id=entity_id)
+    return WorldState(nanoseconds(time_s), 0, entities=entities, relations=(), context=Context(), cues=(cue,))
+
+
+def summary(t0_s: float | None, onsets: dict[float, str], *entities: Entity):
+    meter = WarningMeter(t0_s)
+    for hop in range(100):
+        time_s = hop / 10
+        on = next((i for start, i in onsets.items() if start <= time_s < start + 0.3), None)
+        meter.update(state(time_s, on is not None, on or "-", *entities))
+    return meter.summary()
+
+
+def test_lead_time_counts_from_the_first_onset_within_five_seconds():
+    got = summary(8.0, {1.0: "early", 5.5: "heard", 7.0: "again"})
+    assert got.lead_time_s == 2.5
+    assert got.first_advisory_s == 5.5
+    assert got.false_advisories_before == 1
+    assert got.hidden_entity_id == "again"
+
+
+def test_an_advisory_after_line_of_sight_leads_nothing():
+    got = summary(4.0, {6.0: "late"})
+    assert got.lead_time_s is None
+    assert got.first_advisory_s == 6.0
+
+
+def test_every_onset_is_false_where_nothing_approaches():
+    got = summary(None, {2.0: "a", 5.0: "b"})
+    assert got.lead_time_s is None
+    assert got.false_advisories_before == 2
+
+
+def test_parked_cars_are_no_hand_over():
+    def seen(name: str, moving: bool) -> Entity:
+        return Entity(name, "visible", 0.9, 0.0, 0.1, 0.02, created_ns=0, updated_ns=0, moving=moving)
+
+    assert summary(5.0, {}, seen("parked", False), seen("coming", True)).visible_entity_id == "coming"
+    assert summary(5.0, {}, seen("parked", False)).visible_entity_id is None

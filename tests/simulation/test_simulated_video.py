@@ -1,0 +1,326 @@
+"""Rendered streets: what hides what, when, and whether a motion detector finds the vehicle and loses it."""
+
+import builtins
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.adapters.camera.degradation import degrade
+from worldstate.adapters.camera.detections import read_detections
+from worldstate.adapters.camera.detector import overlaps
+from worldstate.adapters.camera.motion_detector import MotionDetector
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.simulation import (
+    SITES,
+    DatasetSettings,
+    SimulationSettings,
+    simulate_recording,
+    site,
+    write_dataset,
+    write_recording,
+)
+from worldstate.adapters.simulation.camera.rays import Panel, Patch, View, cast_panels, cast_solid
+from worldstate.adapters.simulation.camera.street_view import ROAD_Z_M, look_at
+from worldstate.adapters.simulation.camera.vehicle_view import Car, add_car
+from worldstate.adapters.simulation.dataset.rendered_video import (
+    camera_frames,
+    parked_lane_m,
+    parked_middle_m,
+    write_video,
+)
+from worldstate.adapters.simulation.scene.vehicle import HEIGHT_M, LENGTH_M, WIDTH_M
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
+
+PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
+SMALL = PinholeCamera(width_px=320, height_px=201)
+MIDDLE = PinholeCamera(width_px=640, height_px=402)
+RED = (180.0, 20.0, 20.0)
+
+
+def scene(name="SA1", approach="left", **changes):
+    given = {"duration_s": 4.0, "entry_s": 2.0, "speed_mps": 8.0, "sample_rate_hz": 8_000.0} | changes
+    return SimulationSettings(site(name), approach, **given)
+
+
+def filmed(plan, seed=3, camera=SMALL):
+    rng = np.random.default_rng(seed)
+    recording = simulate_recording(plan, rng, PAIR)
+    return recording, list(camera_frames(plan, recording, np.random.default_rng(seed), camera))
+
+
+def changed(frame, other, by=25):
+    """Pixels in which two frames differ by far more than the sensor's noise."""
+    return np.abs(frame.astype(int) - other.astype(int)).max(axis=2) > by
+
+
+def opencv_pixels(camera, points):
+    """Project by OpenCV's own pinhole model, (n, 3) to (n, 2)."""
+    pitch = camera.pitch_rad
+    rows = [[0, -1, 0], [np.sin(pitch), 0, -np.cos(pitch)], [np.cos(pitch), 0, np.sin(pitch)]]
+    turn = np.array(rows, float)
+    focal = 0.5 * camera.width_px / np.tan(camera.half_angle_rad)
+    lens = np.array([[focal, 0, camera.width_px / 2], [0, focal, camera.height_px / 2], [0, 0, 1]])
+    shift = -turn @ np.array(camera.position_m)
+    return cv2.projectPoints(points, cv2.Rodrigues(turn)[0], shift, lens, None)[0][:, 0]
+
+
+def test_rays_are_those_of_opencv():
+    view = View(SMALL)
+    rays = view.rays(view.whole)
+    chosen = np.random.default_rng(0).integers(0, (402, 640), (50, 2))
+    points = np.array(SMALL.position_m) + 7.0 * rays[chosen[:, 0], chosen[:, 1]].astype(float)
+    pixels = opencv_pixels(SMALL, points)
+    assert np.abs(2 * pixels - 0.5 - chosen[:, ::-1]).max() < 1e-2
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_solid_is_met_where_sampling_says(seed):
+    """Oracle: march along the ray in small steps and look when all half-spaces hold."""
+    rng = np.random.default_rng(seed)
+    normals = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(3, 3))])
+    offsets = rng.uniform(0.4, 1.0, 9)
+    eye = np.array([-4.0, 0.3, 0.2])
+    rays = np.stack([np.ones((4, 6)), *rng.uniform(-0.4, 0.4, (2, 4, 6))], axis=-1).astype(np.float32)
+    reach, face = cast_solid(rays, eye, normals, offsets)
+    steps = np.arange(0.0, 8.0, 2e-3)
+    places = eye + steps[:, None, None, None] * rays
+    inside = (places @ normals.T <= offsets).all(axis=-1)
+    first = np.where(inside.any(axis=0), steps[inside.argmax(axis=0)], np.inf)
+    both = np.isfinite(first)
+    assert np.all(np.isfinite(reach) | ~both)
+    assert np.abs(reach[both] - first[both]).max(initial=0.0) < 3e-3
+    grazed = np.isfinite(reach) & ~both
+    assert grazed.mean() < 0.1
+    met = eye + reach[both][:, None] * rays[both]
+    assert np.abs((met * normals[face[both]]).sum(axis=1) - offsets[face[both]]).max(initial=0.0) < 1e-4
+
+
+def test_the_nearer_panel_hides_the_farther_in_any_order():
+    view = View(PinholeCamera(width_px=8, height_px=6, pitch_rad=0.0))
+
+    def plain(colour):
+        return lambda a, b: np.full((*a.shape, 3), colour, np.float32)
+
+    near = Panel(0, 3.0, ((-9.0, 9.0), (-9.0, 9.0)), plain(10.0))
+    far = Panel(0, 5.0, ((-9.0, 9.0), (-9.0, 9.0)), plain(20.0))
+    for order in ([near, far], [far, near]):
+        image, depth = cast_panels(view, view.whole, order, plain(99.0))
+        assert (image == 10.0).all()
+        assert depth == pytest.approx(3.567, abs=1e-3)
+
+
+def test_patch_holds_the_projection():
+    points = np.array([[6.0, 1.0, -1.7], [7.0, -1.0, -0.2]])
+    patch = View(SMALL).around(points)
+    pixels = opencv_pixels(SMALL, points)
+    assert patch.left <= 2 * pixels[:, 0].min() <= patch.left + 2
+    assert patch.right - 2 <= 2 * pixels[:, 0].max() <= patch.right
+    assert View(SMALL).around(np.array([[5.0, 40.0, -1.0]])) is None
+    assert patch.pixels == (
+        slice(patch.top // 2, patch.bottom // 2),
+        slice(patch.left // 2, patch.right // 2),
+    )
+    assert isinstance(patch, Patch)
+
+
+def test_a_car_fills_the_projection_of_its_cuboid():
+    """In the open, seen by its colour: the silhouette's box against OpenCV's projection of the corners."""
+    street = look_at(site("SB1"), View(MIDDLE))
+    still = street.pixels()
+    image = still.copy()
+    car = Car(8.0, 2.2, 1, RED)
+    add_car(street, car, image)
+    # Paint and lamps, not the shadow: what is red or brighter than the road can be.
+    body = (np.abs(image - still).max(axis=2) > 30.0) & (image.max(axis=2) > image.min(axis=2) + 60.0)
+    body |= (image.min(axis=2) > 215.0) & (still.min(axis=2) < 150.0)
+    rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
+    x = 8.0 + 0.5 * WIDTH_M * np.array([-1.0, 1.0])
+    y, z = [2.2 - LENGTH_M, 2.2], ROAD_Z_M + np.array([0.0, HEIGHT_M])
+    pixels = opencv_pixels(MIDDLE, np.array(np.meshgrid(x, y, z)).reshape(3, -1).T)
+    # The ends lean in by 16 cm above the skirt, some 5 pixels here.
+    assert 0 <= columns[0] - pixels[:, 0].min() < 6
+    assert 0 <= pixels[:, 0].max() - columns[-1] < 6
+    assert rows[0] == pytest.approx(opencv_pixels(MIDDLE, np.array([[7.4, 0.0, z[1]]]))[0, 1], abs=2)
+    skirt = opencv_pixels(MIDDLE, np.array([[8.0 - 0.5 * WIDTH_M, 0.0, ROAD_Z_M + 0.26]]))[0, 1]
+    assert rows[-1] == pytest.approx(skirt, abs=2)
+
+
+def test_a_mirrored_car_in_the_middle_mirrors_the_change():
+    """Site and camera made symmetric: left is the mirror image of right."""
+    camera = replace(SMALL, position_m=(-0.567, 0.0, -0.485))
+    plan = site("SB1")
+    plan = replace(plan, corner_right_m=plan.corner_left_m, side_wall_right_m=plan.side_wall_left_m)
+    street = look_at(plan, View(camera))
+    flat = replace(street, image=np.full_like(street.image, 90))
+    seen = []
+    for heading in (-1, 1):
+        image = flat.pixels()
+        add_car(flat, Car(7.0, -1.0 * heading, heading, RED), image)
+        seen.append(image)
+    assert np.abs(seen[0] - 90.0).max() > 50.0
+    assert np.abs(seen[0] - seen[1][:, ::-1]).max(axis=2).mean() < 0.2
+
+
+@pytest.mark.parametrize("name", SITES)
+@pytest.mark.parametrize("approach", ["left", "right"])
+def test_nothing_moves_before_line_of_sight_and_then_it_does(name, approach):
+    plan = scene(name, approach, duration_s=3.0)
+    recording, frames = filmed(plan)
+    t0 = recording.t0_frame
+    before = [changed(frame, frames[0]).mean() for frame in frames[: t0 - 2]]
+    assert max(before) < 1e-4
+    first_second = [changed(frame, frames[0]).mean() for frame in frames[t0 + 1 : t0 + 10]]
+    assert max(first_second) > 0.02
+    assert changed(frames[t0 + 1], frames[0]).mean() > 2e-4
+    columns = np.flatnonzero(changed(frames[t0 + 2], frames[0]).any(axis=0))
+    assert (columns.mean() < 160) == (approach == "left")
+
+
+def test_an_empty_street_stands_still_but_for_noise():
+    recording, frames = filmed(scene(approach="none", duration_s=1.0))
+    assert not recording.truth["frames"]
+    difference = frames[0].astype(float) - frames[5]
+    assert 1.5 < difference.std() / np.sqrt(2) < 1.9 or difference.std() == pytest.approx(
+        1.5 * 2**0.5, rel=0.2
+    )
+    assert frames[0].mean() == pytest.approx(np.mean([frame.mean() for frame in frames]), abs=0.1)
+    assert not np.array_equal(frames[0], frames[1])
+
+
+def test_same_seed_same_frames_another_seed_another_noise():
+    plan = scene(duration_s=0.6, entry_s=0.3)
+    first, again, other = (filmed(plan, seed)[1] for seed in (3, 3, 4))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], other[0])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(SITES))
+def test_the_parked_car_is_read_back_from_its_boxes(seed, name):
+    from worldstate.adapters.simulation.camera.simulated_detector import park
+
+    rng = np.random.default_rng(seed)
+    plan = site(name)
+    right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera().position_m[:2])
+    middle = np.random.default_rng(seed).uniform(0.6 * right, 0.6 * left)
+    found = parked_middle_m(park(plan, PinholeCamera(), 20, rng), plan)
+    # Where the line of sight cuts the car off, its box tells one end only; that end is in the picture.
+    assert found == pytest.approx(middle, abs=0.25)
+
+
+def test_the_parked_car_stands_in_its_box():
+    plan = scene("SB1", "none", duration_s=1.0, parked_car=True)
+    rng = np.random.default_rng(3)
+    recording = simulate_recording(plan, rng, PAIR)
+    plain = replace(plan, parked_car=False)
+    with_car, without = (
+        next(camera_frames(one, recording, np.random.default_rng(1), MIDDLE)) for one in (plan, plain)
+    )
+    rows, columns = (np.flatnonzero(changed(with_car, without, 8).any(axis=i)) for i in (1, 0))
+    left, top, right, bottom = np.array(recording.detections[0][0].box_px) * 640 / 1936
+    # Beside and below lies its shadow, up to half a metre: 25 pixels.
+    assert -25 < columns[0] - left < 3
+    assert -3 < columns[-1] - right < 25
+    assert rows[0] == pytest.approx(top, abs=4)
+    assert -3 < rows[-1] - bottom < 15
+
+
+@pytest.fixture(scope="module")
+def passing():
+    """A car through the picture in a second and a half, as large as the camera takes it."""
+    return filmed(scene("SB2", "right", duration_s=2.0, entry_s=1.0), camera=PinholeCamera())
+
+
+def missed(frames, recording, camera, family, d, seed=0):
+    """Share of frames with a box in which a fresh motion detector has none with IoU >= .3."""
+    detector, rng, looks, misses = MotionDetector(), np.random.default_rng(seed), 0, 0
+    for number, frame in enumerate(frames):
+        found = detector.detect(degrade(frame, family, d, rng))
+        if number >= max(recording.t0_frame, 10):
+            for seen in recording.detections[number]:
+                box = np.array([seen.box_px]) * camera.width_px / 1936
+                looks += 1
+                misses += not (overlaps(box, found.boxes_px) >= 0.3).any()
+    return misses / looks
+
+
+@pytest.mark.parametrize("family", ["blur", "darkness", "noise"])
+def test_a_motion_detector_finds_the_vehicle_and_loses_it_in_each_family(family, passing):
+    """Levels are those of the camera's own size, and blur is in pixels: the picture must be that large."""
+    recording, frames = passing
+    rates = [missed(frames, recording, PinholeCamera(), family, d) for d in (0.25, 1.0)]
+    assert rates[0] <= 0.2
+    assert rates[1] >= 0.9
+
+
+def test_a_motion_detector_finds_the_vehicle_in_clean_frames(passing):
+    recording, frames = passing
+    assert missed(frames, recording, PinholeCamera(), "blur", 0.0) <= 0.1
+
+
+def test_video_comes_back_as_written(tmp_path):
+    _, frames = filmed(scene(duration_s=0.6, entry_s=0.3), camera=MIDDLE)
+    write_video(tmp_path / "v.mp4", frames)
+    video = open_video(tmp_path / "v.mp4")
+    back = list(video.frames())
+    assert (video.width_px, video.height_px, video.frame_rate_hz, len(back)) == (640, 402, 10.0, 6)
+    error = np.abs(back[3].astype(float) - frames[3])
+    assert error.mean() < 4.0
+    assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
+
+
+def test_video_refuses_nothing_and_nowhere(tmp_path):
+    frame = np.zeros((16, 16, 3), np.uint8)
+    with pytest.raises(InvalidArgumentError, match="frames"):
+        write_video(tmp_path / "v.mp4", [])
+    with pytest.raises(InputFileError, match="nowhere"):
+        write_video(tmp_path / "nowhere" / "v.mp4", [frame])
+
+
+def test_without_opencv_the_extra_is_named(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *rest):
+        if name == "cv2":
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(MissingExtraError, match=r"worldstate\[vision\]"):
+        write_video(tmp_path / "v.mp4", [np.zeros((16, 16, 3), np.uint8)])
+
+
+def test_the_video_lies_beside_the_sound_with_the_same_bytes_again(tmp_path):
+    plan = scene(duration_s=0.5, entry_s=0.3)
+    recording = simulate_recording(plan, np.random.default_rng(3), PAIR)
+    for name in "abc":
+        (tmp_path / name).mkdir()
+        frames = camera_frames(plan, recording, np.random.default_rng(3), MIDDLE)
+        write_recording(tmp_path / name, recording, 0, None if name == "c" else frames)
+    first, again, silent = (tmp_path / name / "SA1/left/1_00_0000" for name in "abc")
+    files = {path.name for path in first.iterdir()}
+    assert files - {path.name for path in silent.iterdir()} == {VIDEO_NAME}
+    assert all((again / name).read_bytes() == (first / name).read_bytes() for name in files)
+    video = open_video(first / VIDEO_NAME)
+    assert (video.width_px, video.height_px, len(list(video.frames()))) == (640, 402, 5)
+    assert len(read_detections(first / "camera_baseline_results.json")) == 5
+
+
+@pytest.mark.slow
+def test_a_data_set_with_video_has_the_same_sound_for_any_number_of_jobs(tmp_path):
+    for name, video, jobs in (("a", True, 1), ("b", True, 2), ("c", False, 1)):
+        wanted = DatasetSettings(n_static=2, seed=5, duration_s=0.5, video=video)
+        write_dataset(tmp_path / name, wanted, jobs=jobs)
+    names = [path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*") if path.is_file()]
+    assert len(names) == 2 * 4 + 1
+    for name in names:
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes(), name
+        if name.name != VIDEO_NAME:
+            assert (tmp_path / "c" / name).read_bytes() == (tmp_path / "a" / name).read_bytes(), name

@@ -1,0 +1,275 @@
+"""Air, road, kinds of vehicles and their ways, against tables, closed forms and brute force."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from worldstate.adapters.simulation import SimulationSettings, draw_settings, site
+from worldstate.adapters.simulation.scene.driving import trajectories
+from worldstate.adapters.simulation.scene.ego_motion import BRAKING_MPS2, EgoMotion
+from worldstate.adapters.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
+from worldstate.adapters.simulation.scene.occluders import Occluder, box, detours, hidden_by
+from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
+from worldstate.adapters.simulation.scene.vehicle import (
+    GEARS_HZ_PER_MPS,
+    IDLE_HZ,
+    TURN_MPS,
+    Trajectory,
+    drive,
+    emit,
+    firing_frequency_hz,
+    propulsion_level_db,
+    rolling_level_db,
+)
+from worldstate.adapters.simulation.sound.air import (
+    ROAD_REFLECTION,
+    absorption_db_per_m,
+    air_gain,
+    ground_gain,
+)
+from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
+from worldstate.ground.errors import InvalidArgumentError
+
+FS = 48_000.0
+TIME_S = np.linspace(-2.0, 10.0, 4501)
+
+# ISO 9613-2:1996, table 2, which is ISO 9613-1 rounded: deg C, per cent, dB/km from 63 Hz to 8 kHz.
+ISO_TABLE = [
+    (10, 70, [0.1, 0.4, 1.0, 1.9, 3.7, 9.7, 32.8, 117.0]),
+    (20, 70, [0.1, 0.3, 1.1, 2.8, 5.0, 9.0, 22.9, 76.6]),
+    (30, 70, [0.1, 0.3, 1.0, 3.1, 7.4, 12.7, 23.1, 59.3]),
+    (15, 20, [0.3, 0.6, 1.2, 2.7, 8.2, 28.2, 88.8, 202.0]),
+    (15, 50, [0.1, 0.5, 1.2, 2.2, 4.2, 10.8, 36.2, 129.0]),
+    (15, 80, [0.1, 0.3, 1.1, 2.4, 4.1, 8.3, 23.7, 82.8]),
+]
+
+
+@pytest.mark.parametrize(("celsius", "humidity", "db_per_km"), ISO_TABLE)
+def test_air_absorbs_what_the_standard_tabulates(celsius, humidity, db_per_km):
+    midbands = 1000.0 * 10.0 ** (0.3 * np.arange(-4, 4))
+    ours = 1000.0 * absorption_db_per_m(midbands, celsius + 273.15, humidity)
+    np.testing.assert_allclose(ours, db_per_km, rtol=0.005, atol=0.06)
+
+
+@given(st.floats(0.0, 500.0), st.floats(0.0, 500.0))
+def test_air_is_passed_one_stretch_after_the_other(one, two):
+    both = air_gain(np.array([one, two, one + two]))
+    np.testing.assert_allclose(both[0] * both[1], both[2], rtol=1e-9)
+
+
+@pytest.mark.parametrize("source_m", [0.05, 0.3, 0.75])
+@pytest.mark.parametrize("flat_m", [6.0, 12.0, 40.0])
+def test_the_road_adds_what_two_waves_average_to(source_m, flat_m):
+    """|1 + rho exp(ik Delta)|^2 over each octave, with both lengths exact, against the energetic sum."""
+    receiver_m = 1.7
+    direct, mirrored = np.hypot(flat_m, receiver_m - source_m), np.hypot(flat_m, receiver_m + source_m)
+    for octave, gain in zip(
+        OCTAVES_HZ, ground_gain(np.array([direct]), source_m, receiver_m)[0], strict=True
+    ):
+        f = octave * np.linspace(2.0**-0.5, 2.0**0.5, 4001)
+        both = np.abs(
+            1.0 + ROAD_REFLECTION * np.exp(2j * np.pi * f * (mirrored - direct) / SPEED_OF_SOUND_MPS)
+        )
+        expected_db = 10.0 * np.log10((both**2).mean() / (1.0 + ROAD_REFLECTION**2))
+        assert 20.0 * np.log10(gain) == pytest.approx(expected_db, abs=0.8)
+
+
+@given(st.sampled_from(sorted(KINDS)), st.floats(3.0, 20.0), st.floats(1.1, 2.0))
+def test_every_kind_follows_the_published_speed_laws(name, speed, factor):
+    """CNOSSOS: rolling A + B log10(v / 70), propulsion A + B (v - 70) / 70."""
+    kind, speeds = vehicle_kind(name), np.array([speed, factor * speed, 70.0 / 3.6])
+    rolling, propulsion = rolling_level_db(speeds, kind), propulsion_level_db(speeds, kind)
+    np.testing.assert_allclose(rolling[:, 2], kind.rolling_a_db)
+    np.testing.assert_allclose(propulsion[:, 2], kind.propulsion_a_db)
+    np.testing.assert_allclose(np.diff(rolling)[:, 0], np.array(kind.rolling_b_db) * np.log10(factor))
+    risen = np.array(kind.propulsion_b_db) * 3.6 * (factor - 1.0) * speed / 70.0
+    np.testing.assert_allclose(np.diff(propulsion)[:, 0], risen, atol=1e-9)
+
+
+def octave_levels_db(signal: np.ndarray) -> np.ndarray:
+    power = np.abs(np.fft.rfft(signal)) ** 2 / len(signal) ** 2 * 2.0
+    masks = octave_masks(np.fft.rfftfreq(len(signal), 1.0 / FS))
+    return 10.0 * np.log10((masks**2 @ power) / REFERENCE_PA**2)
+
+
+def constant(speed: float, name: str) -> Trajectory:
+    return drive(TIME_S, entry_s=7.0, entry_y_m=5.0, lane_x_m=6.0, speed_mps=speed, kind=vehicle_kind(name))
+
+
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_a_vehicle_emits_the_power_of_its_kind(name):
+    """Levels at 1 m over hard ground, all sources together: the law's sound power less 8 dB."""
+    path = constant(10.0, name)
+    samples = 4 * round(FS)
+    parts = emit(path, samples, FS, 0.0, np.random.default_rng(1))
+    power = sum(10.0 ** (octave_levels_db(part.signal.astype(float)) / 10.0) for part in parts)
+    laws = np.stack(
+        [law(np.array([10.0]), path.kind)[:, 0] for law in (rolling_level_db, propulsion_level_db)]
+    )
+    expected = 10.0 * np.log10((10.0 ** (laws / 10.0)).sum(axis=0)) - 8.0
+    # Lines of an engine fall where they fall: an octave's share is not exact, the sum of all nearly is.
+    np.testing.assert_allclose(10.0 * np.log10(power)[2:], expected[2:], atol=2.5)
+    assert 10.0 * np.log10(power.sum() / (10.0 ** (expected / 10.0)).sum()) == pytest.approx(0.0, abs=1.0)
+    assert len(parts) == len(path.kind.axles_m) + (name not in ("bicycle",))
+
+
+def test_quiet_kinds_are_quiet_and_loud_ones_loud():
+    def level(name: str) -> float:
+        parts = emit(constant(7.0, name), 48_000, FS, 0.0, np.random.default_rng(2))
+        return float(20.0 * np.log10(np.std(np.sum([part.signal for part in parts], axis=0))))
+
+    order = [level(name) for name in ("bicycle", "electric", "light", "medium", "heavy")]
+    assert np.all(np.diff(order) > 1.0)
+    assert order[2] - order[0] > 15.0
+
+
+@settings(deadline=None)
+@given(st.floats(3.0, 14.0), st.floats(0.0, 5.0), st.integers(0, 2**31))
+def test_the_engine_goes_through_its_gears_and_wanders_by_five_per_cent(speed, braking, seed):
+    path = drive(TIME_S, entry_s=7.0, entry_y_m=5.0, lane_x_m=6.0, speed_mps=speed, braking_mps2=braking)
+    time = np.arange(-2.0, 10.0, 1e-3)
+    firing = firing_frequency_hz(path, time, np.random.default_rng(seed))
+    driven = np.interp(time, TIME_S, path.speed_mps)
+    assert firing.min() > 0.94 * IDLE_HZ
+    assert firing.max() < 1.06 * max(IDLE_HZ, GEARS_HZ_PER_MPS[0] * driven.max())
+    # Away from changes of gear it is one of the ratios, give or take the wander, or idle.
+    ratios = firing / driven
+    nearest = np.abs(ratios[:, None] / np.array(GEARS_HZ_PER_MPS) - 1.0).min(axis=1)
+    idle = np.abs(firing / IDLE_HZ - 1.0)
+    assert np.mean(np.minimum(nearest, idle) < 0.051) > 0.85
+    assert np.abs(np.diff(np.log(firing))).max() < 0.01  # no jumps
+
+
+@pytest.mark.parametrize("approach", ["left", "right"])
+@pytest.mark.parametrize("speed", [3.0, 8.0, 13.0])
+def test_who_turns_in_stops_before_the_ego(approach, speed):
+    scene = SimulationSettings(
+        site("SA1"), approach, duration_s=20.0, entry_s=7.0, speed_mps=speed, manoeuvre="turn"
+    )
+    (path,) = trajectories(scene, np.linspace(-2.0, 20.0, 8251))
+    x, y = path.behind(0.0)
+    step = np.hypot(np.diff(x), np.diff(y)) / np.diff(path.time_s)
+    assert step.max() < speed * 1.001
+    np.testing.assert_allclose(step, path.speed_mps[1:], atol=0.12 * speed + 0.05)
+    turning = (np.abs(y) < 3.0) & (x < path.lane_x_m - 0.5)
+    assert path.speed_mps[turning].max() < TURN_MPS * 1.1
+    assert 2.0 < x[-1] < 3.05  # beside the bonnet where the near lane leaves no more room
+    assert y[-1] == pytest.approx(1.2, abs=0.01)
+    assert path.speed_mps[-1] < 0.5
+    straight = trajectories(replace(scene, manoeuvre="pass"), path.time_s)[0]
+    entry = [np.interp(7.0, one.time_s, one.behind(0.0)[1]) for one in (path, straight)]
+    assert entry[0] == pytest.approx(entry[1], abs=0.1)
+
+
+@given(st.floats(0.0, 20.0), st.floats(0.0, 60.0))
+def test_the_ego_s_speed_is_the_slope_of_its_way(speed, stop):
+    ego, time = EgoMotion(speed, stop), np.linspace(-5.0, 70.0, 20_001)
+    x, v = ego.x_m(time), ego.at_mps(time)
+    np.testing.assert_allclose(np.diff(x) / np.diff(time), 0.5 * (v[1:] + v[:-1]), atol=0.01)
+    assert np.all(np.diff(v) >= -1.01 * BRAKING_MPS2 * (time[1] - time[0]))
+    assert x[-1] == 0.0 == v[-1]
+
+
+points = st.floats(-20.0, 20.0)
+
+
+def _outline(x: float, y: float, width: float, depth: float, turn: float) -> np.ndarray:
+    corners = np.array([[-width, -depth], [width, -depth], [width, depth], [-width, depth]])
+    c, s = np.cos(turn), np.sin(turn)
+    return corners @ np.array([[c, s], [-s, c]]) + [x, y]
+
+
+@given(points, points, st.floats(0.2, 4.0), st.floats(0.2, 4.0), st.floats(0.0, 3.0), points, points)
+@example(-2.0, 0.0, 1.0, 1.0, 0.0, -5.6e-73, 0.0)
+def test_a_body_hides_what_lies_behind_it(x, y, width, depth, turn, source_x, source_y):
+    """Brute force: a point of the line inside the body; and no way round is shorter than a taut string."""
+    corners = _outline(x, y, width, depth, turn)
+    body = Occluder(tuple(map(tuple, corners)))
+    line = np.linspace(0.0, 1.0, 4001)[1:-1, None] * [source_x, source_y]
+    edges = np.roll(corners, -1, axis=0) - corners
+    to = line[:, None] - corners
+    inside = edges[:, 0] * to[..., 1] - edges[:, 1] * to[..., 0]
+    depth_inside = inside.min(axis=1) / np.hypot(*edges.T).min()
+    if (inside[0] > 0).all() or (inside[-1] > 0).all():
+        return  # one end is inside the body
+    at = np.array([source_x]), np.array([source_y])
+    hidden = bool(hidden_by([body], *at, (0.0, 0.0))[0])
+    detour = float(detours(body, *at, (0.0, 0.0))[0][0])
+    if depth_inside.max() > 1e-3:
+        assert hidden
+        hull = ConvexHull(np.concatenate([corners, [[0.0, 0.0], [source_x, source_y]]]))
+        order = hull.vertices.tolist()
+        if 4 in order and 5 in order:
+            string = _shorter_way(hull.points[order], order.index(4), order.index(5))
+            assert -1e-6 <= detour <= string - np.hypot(source_x, source_y) + 1e-6
+    elif depth_inside.max() < -1e-3:
+        assert not hidden
+        assert detour <= 0.0
+
+
+def _shorter_way(outline: np.ndarray, first: int, last: int) -> float:
+    low, high = sorted((first, last))
+    steps = np.hypot(*np.diff(np.concatenate([outline, outline[:1]]), axis=0).T)
+    return float(min(steps[low:high].sum(), steps.sum() - steps[low:high].sum()))
+
+
+def test_a_long_barrier_hides_who_drives_beside_us():
+    """Both of its ends may lie beyond both ends of the line."""
+    barrier = Occluder(((-60.0, 2.6), (7.0, 2.6)))
+    x = np.array([-20.0, 0.0, 10.0, 14.9, 15.3, 30.0])
+    expected = [True, True, True, True, False, False]
+    assert hidden_by([barrier], x, np.full(6, 5.6), (0.0, 0.0)).tolist() == expected
+    detour = detours(barrier, x, np.full(6, 5.6), (0.0, 0.0))[0]
+    assert np.all((detour > 0.0) == expected)
+
+
+@pytest.mark.parametrize("name", sorted(OCCLUSIONS))
+def test_occluded_vehicles_come_into_sight_when_told_and_their_detour_has_no_jumps(name):
+    scene = occluded_scene(name)
+    told = SimulationSettings(scene.site, scene.approach, entry_s=6.0, speed_mps=9.0, route_m=scene.route_m)
+    time = np.linspace(-2.0, 10.0, 12_001)
+    (path,) = trajectories(told, time)
+    x, y = path.behind(0.0)
+    assert np.hypot(np.interp(6.0, time, x), np.interp(6.0, time, y)) > 4.0
+    hidden = hidden_by(scene.site.occluders, x, y, (0.0, 0.0))
+    assert hidden[(time > 2.0) & (time < 5.5)].all()
+    assert not hidden[time > 6.3].any()
+    for occluder in scene.site.occluders:
+        detour = detours(occluder, x, y, (0.0, 0.0))[0]
+        near = np.abs(detour) < 0.2  # beyond, nothing is screened any more
+        assert np.abs(np.diff(detour))[near[1:] & near[:-1]].max() < 0.012  # 9 m/s, 1 ms
+
+
+@pytest.mark.parametrize(
+    "corners", [((0.0, 1.0),), tuple((float(i), 1.0) for i in range(17)), ((0.0, np.nan),) * 2]
+)
+def test_outlines_that_are_none_are_refused(corners):
+    with pytest.raises(InvalidArgumentError, match="corners_m"):
+        Occluder(corners)
+
+
+def test_unknown_names_are_named():
+    for ask in (vehicle_kind, occluded_scene, site):
+        with pytest.raises(InvalidArgumentError, match="nowhere"):
+            ask("nowhere")
+
+
+def test_a_moving_site_is_the_same_place_and_only_there_the_ego_moves():
+    rng = np.random.default_rng(3)
+    for name in ("A1", "B2", "B3"):
+        assert replace(site("D" + name), name="S" + name) == site("S" + name)
+        moving = draw_settings("D" + name, "left", rng)
+        assert 10.0 / 3.6 <= moving.ego.speed_mps <= 30.0 / 3.6
+        assert moving.ego.stop_s > moving.entry_s - 0.5
+        assert draw_settings("S" + name, "left", rng).ego.stands
+
+
+def test_thin_bodies_are_bodies_too():
+    assert box(1.0, 2.0, -1.0, 1.0).corners_m[2] == (2.0, 1.0)
+    assert hidden_by([Occluder(((5.0, -1.0), (5.0, 1.0)))], np.array([9.0]), np.zeros(1), (0.0, 0.0)).all()
+    assert LIGHT.label == "car"

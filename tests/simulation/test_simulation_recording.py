@@ -1,0 +1,332 @@
+"""Recordings and data sets: continuity, layout, determinism, and no silence whatever the settings."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.adapters.camera.detections import read_detections
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad import OvadDataset
+from worldstate.adapters.simulation import (
+    KINDS,
+    OCCLUSIONS,
+    SITES,
+    DatasetSettings,
+    SimulationSettings,
+    Site,
+    draw_settings,
+    preset,
+    simulate_recording,
+    site,
+    write_dataset,
+    write_recording,
+)
+from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
+from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, PRESETS
+from worldstate.adapters.simulation.scene.vehicle import drive, propulsion_level_db, rolling_level_db
+from worldstate.adapters.simulation.sound.background import far_passages_s
+from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
+from worldstate.adapters.simulation.sound.paths import trace_paths
+from worldstate.adapters.simulation.sound.propagation import add_sources
+from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.cli.main import main
+from worldstate.cli.users import simulate as cli
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.direction.feature import published_feature
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+FS = 48_000.0
+PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
+
+
+def pass_by(tone_hz: float, name: str, approach: str) -> np.ndarray:
+    """A steady tone that drives past a site, alone; one microphone; entry at 2.5 of 5 s."""
+    plan = site(name)
+    lane = plan.lanes_m[0 if approach == "left" else 1]
+    right, left = plan.sight_m(lane)
+    blocks = int(5.0 * FS / KNOT_SAMPLES)
+    emission_time = -1.0 + np.arange((blocks + 400) * KNOT_SAMPLES) / FS
+    tone = np.cos(2 * np.pi * tone_hz * emission_time).astype(np.float32)
+    emission = Emission.of(tone, -1.0, FS)
+    entry = left if approach == "left" else right
+    path = drive(emission.knots_s, entry_s=2.5, entry_y_m=entry, lane_x_m=lane, speed_mps=9.0)
+    receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / FS)
+    out = np.zeros((1, blocks * KNOT_SAMPLES), np.float32)
+    static = StaticSources(out, FS)
+    add_sources(out, static, [MovingSource(emission, lane, path.axle_y_m())], plan, receiver, 24.0)
+    static.render()
+    return out[0].astype(float)
+
+
+@pytest.mark.parametrize(("name", "approach"), [("SA1", "left"), ("SA2", "right"), ("SB1", "left")])
+def test_paths_come_and_go_without_clicks(name, approach):
+    """A 500-Hz tone stays a 500-Hz tone (Doppler aside): a click would spread beyond 2 kHz."""
+    sound = pass_by(500.0, name, approach)
+    spectrum = np.abs(np.fft.rfft(sound * np.hanning(len(sound)))) ** 2
+    frequency = np.fft.rfftfreq(len(sound), 1 / FS)
+    beyond_db = 10 * np.log10(spectrum[frequency > 2000].sum() / spectrum.sum())
+    assert beyond_db < -60.0
+
+
+@pytest.mark.parametrize("name", SITES)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_energy_is_continuous_across_line_of_sight_entry(name, side):
+    """The paths' energies, octaves up to 2 kHz, add up without steps from one millimetre to the next."""
+    plan = site(name)
+    y = side * np.arange(12.0, -12.0, -0.001)
+    for lane in plan.lanes_m:
+        energy = np.zeros((len(y), 6))
+        for path in trace_paths(plan, lane, y, 1.4, 24.0):
+            straight = np.hypot(np.hypot(path.source.x_m, y - path.receiver.offset_m), 1.4)
+            length = path.lit * straight + (1.0 - path.lit) * path.bent_m
+            energy += (path.gain[:, :6] / length[:, None]) ** 2
+        level_db = 10 * np.log10(energy)
+        assert np.abs(np.diff(level_db, axis=0)).max() < 0.1
+        seen = np.abs(y) < 1.0
+        hidden = np.abs(y) > 10.0
+        assert level_db[seen].mean() > level_db[hidden].mean() + 6.0
+
+
+@given(st.floats(3.0, 30.0), st.floats(1.02, 2.0))
+def test_faster_is_louder_by_the_published_law(speed, factor):
+    rolling = rolling_level_db(np.array([speed, factor * speed]))
+    assert np.all(np.diff(rolling) > 0.0)
+    assert np.diff(rolling)[4, 0] == pytest.approx(32.5 * np.log10(factor), abs=1e-9)
+    assert np.all(np.diff(propulsion_level_db(np.array([speed, factor * speed])))[1:] > 0.0)
+
+
+@given(st.floats(0.0, 8.0), st.floats(1.0, 30.0), st.sampled_from([-5.0, 5.0]))
+def test_a_drive_enters_sight_when_told_and_never_turns(braking, speed, entry_y):
+    time = np.linspace(-2.0, 10.0, 4501)
+    path = drive(time, entry_s=7.0, entry_y_m=entry_y, lane_x_m=6.0, speed_mps=speed, braking_mps2=braking)
+    assert np.interp(7.0, time, path.front_y_m) == pytest.approx(entry_y, abs=1e-9)
+    assert np.all(np.diff(path.front_y_m) * path.heading > 0.0)
+    assert path.heading == -np.sign(entry_y)
+
+
+@st.composite
+def scenes(draw):
+    numbers = st.floats(0.0, 1.0)
+    corner = draw(st.tuples(st.floats(1.0, 6.0), st.floats(1.0, 6.0), st.floats(1.0, 8.0)))
+    back = draw(st.tuples(numbers, numbers))
+    street = draw(st.floats(3.0, 12.0))
+    plan = Site(
+        name="Any1",
+        corner_left_m=corner[0],
+        corner_right_m=corner[1],
+        corner_ahead_m=corner[2],
+        opposite_wall_m=draw(st.sampled_from([None, corner[2] + street])),
+        side_wall_left_m=corner[0] + back[0],
+        side_wall_right_m=corner[1] + back[1],
+        street_width_m=street,
+        side_reflection=0.98 * draw(numbers),
+        facade_reflection=0.98 * draw(numbers),
+        side_order=draw(st.integers(0, 3)),
+        facade_order=draw(st.integers(0, 4)),
+    )
+    return SimulationSettings(
+        site=plan,
+        approach=draw(st.sampled_from(["left", "none", "right"])),
+        duration_s=draw(st.floats(0.5, 1.2)),
+        entry_s=draw(st.floats(0.0, 0.5)),
+        speed_mps=draw(st.floats(1.0, 30.0)),
+        braking_mps2=draw(st.floats(0.0, 8.0)),
+        parked_car=draw(st.booleans()),
+        sample_rate_hz=draw(st.floats(8_000.0, 24_000.0)),
+        preset=replace(preset(), late_decay_s=draw(st.floats(0.05, 2.0)), ambient_waves=8),
+    )
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes(), st.integers(0, 2**32 - 1))
+def test_no_setting_gives_silence_or_nan(scene, seed):
+    recording = simulate_recording(scene, np.random.default_rng(seed), PAIR)
+    assert recording.audio.shape == (round(scene.duration_s * scene.sample_rate_hz), 2)
+    assert recording.audio.dtype == np.float32
+    assert np.isfinite(recording.audio).all()
+    assert recording.audio.std(axis=0).min() > 1e-6
+    assert 0 <= recording.t0_frame < len(recording.detections)
+    assert len(recording.detections) == max(round(10 * scene.duration_s), 1)
+    json.dumps(recording.truth, allow_nan=False)
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.sampled_from(SITES), st.sampled_from(["left", "right"]), st.integers(0, 1000))
+def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed):
+    rng = np.random.default_rng(seed)
+    scene = replace(draw_settings(name, approach, rng, 10.0), parked_car=False, sample_rate_hz=8_000.0)
+    recording = simulate_recording(scene, rng, PAIR)
+    t0 = recording.t0_frame
+    frames = recording.truth["frames"]
+    sides = 1 if approach == "left" else -1
+    assert all(not seen for seen in recording.detections[:t0])
+    assert any(recording.detections[t0 : t0 + 10])
+    assert abs(t0 / 10 - scene.entry_s) <= 0.1
+    assert not frames[t0 - 1]["line_of_sight"]
+    assert frames[t0]["line_of_sight"]
+    assert frames[0]["azimuth_rad"] * sides > 0.3
+
+
+def test_boxes_lie_where_the_camera_adapter_looks_for_them():
+    scene = replace(draw_settings("SB1", "left", np.random.default_rng(4), 10.0), sample_rate_hz=8_000.0)
+    scene = replace(scene, parked_car=False, braking_mps2=0.0, speed_mps=6.0)
+    recording = simulate_recording(scene, np.random.default_rng(4), PAIR)
+    camera, compared = PinholeCamera(), 0
+    for frame, seen in zip(recording.truth["frames"], recording.detections, strict=True):
+        x, front = frame["position_m"]
+        whole_in_view = abs(front) < 2.5 and abs(front + 4.3) < 2.5
+        if seen and whole_in_view:
+            left, _, right, _ = seen[0].box_px
+            middle = np.arctan2(front + 4.3 / 2, x)
+            assert float(camera.azimuth(0.5 * (left + right))) == pytest.approx(middle, abs=0.06)
+            compared += 1
+    assert compared
+
+
+def test_line_of_sight_is_the_straight_line_past_the_corner():
+    plan, camera = site("SA1"), PinholeCamera()
+    path = drive(np.linspace(0, 4, 4001), entry_s=2, entry_y_m=3.9, lane_x_m=6.0, speed_mps=5.0)
+    first = int(np.flatnonzero(line_of_sight(path, plan, camera))[0])
+    eye_x, eye_y = camera.position_m[:2]
+    at_corner = eye_y + (path.front_y_m[first] - eye_y) * (plan.corner_ahead_m - eye_x) / (6.0 - eye_x)
+    assert at_corner == pytest.approx(plan.corner_left_m, abs=0.01)
+
+
+def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp_path):
+    """Two of a standing ego, one of a moving one; OVAD has no camera results of the latter."""
+    wanted = DatasetSettings(n_static=2, n_dynamic=1, seed=5, duration_s=0.5, kind="bicycle")
+    rows = write_dataset(tmp_path / "one", wanted)
+    seen = []
+    write_dataset(tmp_path / "two", wanted, jobs=2, progress=seen.append)
+    assert seen == rows
+    files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
+    assert len(files) == 2 * 3 + 2 + 1
+    for name in files:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+    with (tmp_path / "one" / "DataLog.csv").open() as log:
+        table = list(csv.DictReader(log))
+    assert [list(row) for row in table] == [["ID", "Environment", "Class", "T0"]] * 3
+    assert [(row["ID"], row["Environment"], row["Class"]) for row in table] == [
+        ("1_00_0000", "SA1", "left"), ("2_00_0001", "SA1", "none"), ("1_05_0002", "DA1", "left"),
+    ]  # fmt: skip
+    folder = tmp_path / "one" / "SA1" / "left" / "1_00_0000"
+    about = soundfile.info(folder / "out_multi.wav")
+    assert (about.channels, about.samplerate, about.subtype) == (56, 47_998, "PCM_24")
+    assert about.frames == round(0.5 * 47_998)
+    assert len(read_detections(folder / "camera_baseline_results.json")) == 5
+    truth = json.loads((folder / "truth.json").read_text())
+    assert (truth["settings"]["approach"], truth["settings"]["kind"]) == ("left", "bicycle")
+    assert len(truth["frames"]) == 5
+    found = OvadDataset(tmp_path / "one").recordings
+    assert [recording.moving_ego for recording in found] == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"n_static": 0}, "n_static"),
+        ({"n_dynamic": -1}, "n_dynamic"),
+        ({"scene": "tunnel"}, "scene"),
+        ({"kind": "horse"}, "kind"),
+        ({"scene": "merge", "n_dynamic": 1}, "n_dynamic"),
+        ({"n_dynamic": 1, "video": True}, "video"),
+    ],
+)
+def test_data_sets_that_cannot_be_are_named(wrong, named):
+    with pytest.raises(InvalidArgumentError, match=named):
+        DatasetSettings(**wrong)
+
+
+def test_other_seeds_give_other_sound():
+    scene = SimulationSettings(site("SA1"), "none", duration_s=0.5, sample_rate_hz=8_000.0)
+    one, two = (simulate_recording(scene, np.random.default_rng(seed), PAIR).audio for seed in (1, 2))
+    assert np.abs(np.corrcoef(one[:, 0], two[:, 0])[0, 1]) < 0.2
+
+
+def test_a_foreign_folder_is_not_replaced(tmp_path):
+    scene = SimulationSettings(site("SA1"), "none", duration_s=0.5, sample_rate_hz=8_000.0)
+    recording = simulate_recording(scene, np.random.default_rng(1), PAIR)
+    foreign = tmp_path / "SA1" / "none" / "2_00_0003"
+    foreign.mkdir(parents=True)
+    (foreign / "notes.txt").write_text("mine")
+    with pytest.raises(InputFileError, match="2_00_0003"):
+        write_recording(tmp_path, recording, 3)
+    assert (foreign / "notes.txt").read_text() == "mine"
+    row = write_recording(tmp_path, recording, 4)
+    assert write_recording(tmp_path, recording, 4) == row  # its own kind is
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"duration_s": 0.1}, "duration_s"),
+        ({"duration_s": float("nan")}, "duration_s"),
+        ({"speed_mps": 0.0}, "speed_mps"),
+        ({"approach": "above"}, "approach"),
+        ({"entry_s": 11.0}, "entry_s"),
+    ],
+)
+def test_settings_out_of_range_are_named(change, named):
+    with pytest.raises(InvalidArgumentError, match=named):
+        SimulationSettings(**({"site": site("SA1"), "approach": "left"} | change))
+
+
+def test_the_command_writes_and_reports(tmp_path, capsys):
+    arguments = ["simulate", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
+    assert main([*arguments, "--scene", "merge", "--kind", "electric"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["approaches"], summary["folders"]) == (1, ["SM1/left/1_12_0000"])
+    truth = json.loads((tmp_path / "d" / summary["folders"][0] / "truth.json").read_text())
+    assert (truth["settings"]["kind"], truth["settings"]["site"]["name"]) == ("electric", "SM1")
+    assert main(["simulate", "--out", str(tmp_path / "e"), "--static", "0"]) == 2
+    assert "n_static" in capsys.readouterr().err
+
+
+def test_the_command_offers_what_the_simulation_has():
+    assert sorted(cli.KINDS) == sorted(KINDS)
+    assert sorted(cli.SCENES) == sorted(["junction", *OCCLUSIONS])
+    assert list(cli.PRESETS) == list(PRESETS)
+    assert cli.PRESETS[0] == DEFAULT_PRESET
+
+
+def test_a_calm_street_is_another_sound_of_the_same_drive(tmp_path, capsys):
+    truths = {}
+    for name in PRESETS:
+        arguments = ["simulate", "--out", str(tmp_path / name), "--static", "1", "--duration", "0.5"]
+        assert main([*arguments, "--preset", name]) == 0
+        truth = json.loads((tmp_path / name / "SA1/left/1_00_0000/truth.json").read_text())
+        assert truth["settings"]["preset"]["name"] == name
+        truths[name] = truth["frames"]
+    assert truths["street-5"] == truths["street-5-calm"]
+
+
+@pytest.mark.parametrize("duration_s", [2.0, 30.0])
+def test_distant_vehicles_are_as_frequent_in_a_short_recording_as_in_a_long_one(duration_s):
+    rng = np.random.default_rng(3)
+    busy = replace(preset(), far_rate=1.2)
+    found = np.concatenate([far_passages_s(busy, duration_s, rng) for _ in range(2000)])
+    inside = ((found >= 0.0) & (found < duration_s)).sum() / 2000.0
+    outside = (found < 0.0).sum() / 2000.0
+    assert inside == pytest.approx(0.12 * duration_s, rel=0.1)
+    assert outside == pytest.approx(0.12 * 8.0, rel=0.1)  # they are heard before and after they are loudest
+
+
+def test_hidden_approaches_are_louder_and_sharper_than_empty_streets():
+    """Direction of the effect that everything else rests on, with two sites and one seed."""
+    peaks = {"left": [], "none": []}
+    for name in ("SA1", "SB1"):
+        for approach, found in peaks.items():
+            rng = np.random.default_rng(11)
+            scene = SimulationSettings(site(name), approach, duration_s=1.3, entry_s=1.2)
+            audio = simulate_recording(scene, rng).audio
+            found.append(published_feature(audio[-47_998 - 4800 : -4800], roof_array_56(), 47_998.0).max())
+    assert min(peaks["left"]) > max(peaks["none"])

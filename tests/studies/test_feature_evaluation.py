@@ -1,0 +1,193 @@
+"""Protocols on made-up windows: nothing of a recording on both sides, every figure recomputable."""
+
+import argparse
+import csv
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.metrics import roc_auc_score
+
+from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
+from worldstate.adapters.files.model_file import load_model
+from worldstate.cli.studies import evaluate_features
+from worldstate.cli.users import train
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.operations.training.feature_evaluation import cross_validate
+from worldstate.operations.training.splits import junction_folds, recording_folds, recording_labels
+
+JUNCTIONS = ("SA1", "SB1", "SB2")
+KEYS = {
+    "accuracy", "auroc_macro", "auroc_pooled", "worst_group_auroc", "alpha", "tpr", "fpr",
+    "ece_raw", "ece", "ece_floor", "n_windows", "per_group",
+}  # fmt: skip
+
+
+def made_up_table(seed=0, recordings=72, spread=1.5):
+    """Half of the recordings hazard-free, the others a hazard and a front window."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
+    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
+    rows = []
+    for number in range(recordings):
+        side = ("left", "right")[number // 6 % 2]
+        for label in ("none",) if number % 2 else (side, "front"):
+            feature = shape[label] + 0.2 + spread * rng.normal(size=60)
+            rows.append((feature, label, f"{label}_{number}", JUNCTIONS[number % 3], str(number)))
+    features, *labels = zip(*rows, strict=True)
+    return FeatureTable(np.array(features), *map(np.array, labels), (None,) * len(rows))
+
+
+def write_csv(path, table):
+    columns = [table.labels, table.ids, table.environments, table.recordings]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*FEATURE_COLUMNS, *LABEL_COLUMNS])
+        for feature, label, name, place, recording in zip(table.features, *columns, strict=True):
+            writer.writerow([*feature.tolist(), label, name, place, "", recording])
+    return path
+
+
+@pytest.fixture(scope="module")
+def csv_path(tmp_path_factory):
+    return write_csv(tmp_path_factory.mktemp("table") / "windows.csv", made_up_table())
+
+
+def command(*words):
+    parser = argparse.ArgumentParser()
+    subparsers = parser.add_subparsers(required=True)
+    for module in (train, evaluate_features):
+        module.add_parser(subparsers)
+    arguments = parser.parse_args([str(word) for word in words])
+    return arguments.run(arguments)
+
+
+@given(st.integers(0, 1000), st.integers(12, 60), st.integers(2, 5))
+def test_folds_never_part_a_recording_and_share_out_every_stratum(seed, recordings, n_folds):
+    table = made_up_table(recordings=recordings)
+    folds = recording_folds(table, np.random.default_rng(seed), n_folds)
+    keys, labels = table.recording_keys, recording_labels(table)
+    fold_of = dict(zip(keys.tolist(), folds.tolist(), strict=True))
+    assert all(fold_of[key] == fold for key, fold in zip(keys.tolist(), folds.tolist(), strict=True))
+    for stratum in {(key.split("/")[0], label) for key, label in labels.items()}:
+        members = [fold_of[k] for k, label in labels.items() if (k.split("/")[0], label) == stratum]
+        counts = [members.count(str(fold)) for fold in range(n_folds)]
+        assert max(counts) - min(counts) <= 1
+
+
+def test_a_recording_is_labelled_by_its_hazard():
+    assert set(recording_labels(made_up_table()).values()) == {"left", "right", "none"}
+
+
+class Spy(PublishedClassifier):
+    """Remembers what it was trained on and refuses to be asked about it."""
+
+    def fit(self, X, y):
+        self.seen = {row.tobytes() for row in X}
+        return super().fit(X, y)
+
+    def predict_proba(self, X):
+        assert not self.seen & {row.tobytes() for row in X}
+        return super().predict_proba(X)
+
+
+@pytest.mark.parametrize("split", [recording_folds, junction_folds])
+def test_nothing_is_predicted_by_what_it_was_trained_on(split):
+    table = made_up_table(recordings=60)
+    passes = cross_validate(table, split, Spy, np.random.default_rng(0), alpha=0.1)
+    assert set(passes) == {0.0, 1.0}
+    for predictions in passes.values():
+        np.testing.assert_allclose(predictions.probabilities.sum(axis=1), 1.0)
+        assert ((predictions.risk >= 0) & (predictions.risk <= 1)).all()
+
+
+def most_probable(row):
+    return max(("front", "left", "none", "right"), key=lambda label: float(row[f"p_{label}"]))
+
+
+@pytest.mark.parametrize("protocol", ["cv", "lojo"])
+def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path, capsys, protocol):
+    out = tmp_path / "p.csv"
+    words = ("--method", "baseline", "--protocol", protocol, "--seeds", 2, "--json", "--predictions", out)
+    assert command("evaluate-features", csv_path, *words) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert set(figures) >= KEYS
+    rows = list(csv.DictReader(out.open()))
+    assert len(rows) == 2 * figures["n_windows"]
+    accuracy, areas, rates = [], [], []
+    for seed in ("0", "1"):
+        mine = [row for row in rows if row["seed"] == seed]
+        accuracy.append(np.mean([most_probable(row) == row["class"] for row in mine]))
+        scored = [r for r in mine if r["class"] != "front"]
+        hazard = np.array([r["class"] != "none" for r in scored])
+        score, decision = (np.array([float(r[key]) for r in scored]) for key in ("score", "decision"))
+        areas.append(roc_auc_score(hazard, score))
+        rates.append((decision[hazard].mean(), decision[~hazard].mean()))
+        sides = [float(r["p_left"]) + float(r["p_right"]) for r in scored]
+        np.testing.assert_allclose(score, sides, atol=1e-9)
+    assert figures["accuracy"] == pytest.approx(np.mean(accuracy))
+    assert figures["auroc_pooled"] == pytest.approx(np.mean(areas))
+    assert (figures["tpr"], figures["fpr"]) == pytest.approx(tuple(np.mean(rates, axis=0)))
+    by_junction = [group["auroc"] for group in figures["per_group"].values()]
+    assert figures["auroc_macro"] == pytest.approx(np.mean(by_junction))
+
+
+def test_the_same_command_prints_the_same(csv_path, capsys):
+    outputs = []
+    for _ in range(2):
+        command("evaluate-features", csv_path, "--method", "baseline", "--seeds", 1, "--json")
+        outputs.append(capsys.readouterr().out)
+    assert outputs[0] == outputs[1]
+
+
+def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_path, capsys):
+    ids = tmp_path / "ids.csv"
+    ids.write_text("ID\n" + "\n".join(f"none_{n}" for n in (1, 3, 5, 7)) + "\nleft_0\nright_6\n")
+    model = tmp_path / "m"
+    words = ("--method", "baseline", "--exclude", ids, "--out", model, "--json")
+    assert command("train", csv_path, *words) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["n_recordings"] == 66
+    assert summary["n_excluded_windows"] == 8
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ids.csv", "m"]
+    with pytest.raises(InvalidArgumentError, match=r"trained on 66 of these 72 recordings.*--exclude"):
+        command("evaluate-features", csv_path, "--model", model)
+    assert command("evaluate-features", csv_path, "--model", model, "--only", ids, "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["n_windows"] == 8
+    assert set(figures) >= KEYS
+
+
+def test_what_ships_is_what_train_makes_if_nothing_else_is_asked_for(csv_path, tmp_path):
+    assert command("train", csv_path, "--out", tmp_path / "m") == 0
+    assert type(load_model(tmp_path / "m")[0]) is type(load_model(None)[0])
+
+
+def test_a_site_with_one_recording_is_told_what_else_to_use(csv_path, tmp_path):
+    table = made_up_table()
+    lonely = table.select((table.environments != "SA1") | (table.recordings == table.recordings[0]))
+    with pytest.raises(InvalidArgumentError, match=r"another recording of its junction.*baseline"):
+        command("train", write_csv(tmp_path / "lonely.csv", lonely), "--out", tmp_path / "m")
+
+
+def test_figures_for_people_show_every_junction(csv_path, capsys):
+    assert command("evaluate-features", csv_path, "--method", "baseline", "--seeds", 1) == 0
+    printed = capsys.readouterr().out
+    assert all(junction in printed for junction in JUNCTIONS)
+
+
+def test_bad_requests_are_refused(csv_path, tmp_path):
+    with pytest.raises(InvalidArgumentError, match="dynamic"):
+        command("evaluate-features", csv_path, "--group", "dynamic")
+    with pytest.raises(InvalidArgumentError, match="seeds"):
+        command("evaluate-features", csv_path, "--seeds", 0)
+    with pytest.raises(InvalidArgumentError, match="alpha"):
+        command("evaluate-features", csv_path, "--alpha", 1.5, "--seeds", 1)
+    with pytest.raises(InputFileError, match="nowhere"):
+        command("train", csv_path, "--out", tmp_path / "nowhere" / "m")
+    one = made_up_table().select(made_up_table().environments == "SA1")
+    with pytest.raises(InvalidArgumentError, match="two junctions"):
+        command("evaluate-features", write_csv(tmp_path / "one.csv", one), "--protocol", "lojo")

@@ -1,0 +1,1 @@
+"""Commands for users with recordings of their own."""

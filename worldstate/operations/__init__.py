@@ -1,0 +1,1 @@
+"""What users do with recordings of their own: train, calibrate, inspect, draw."""

@@ -1,0 +1,1 @@
+"""What an array allows, how near the estimators come to it, and what they cost."""

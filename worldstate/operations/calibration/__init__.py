@@ -1,0 +1,1 @@
+"""Thresholds and risk maps from recordings without hazards."""

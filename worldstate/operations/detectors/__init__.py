@@ -1,0 +1,1 @@
+"""How often a camera's detector misses what is there."""

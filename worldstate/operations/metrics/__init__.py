@@ -1,0 +1,1 @@
+"""Figures of merit that need nothing but labels and scores."""

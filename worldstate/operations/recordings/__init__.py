@@ -1,0 +1,1 @@
+"""One recording through the whole chain: hops, advisories, channel health, the timeline figure."""

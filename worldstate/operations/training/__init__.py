@@ -1,0 +1,1 @@
+"""Training of signature models on labelled feature windows."""

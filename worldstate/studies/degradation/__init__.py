@@ -1,0 +1,1 @@
+"""Hazard awareness while the camera fails."""

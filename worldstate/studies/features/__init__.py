@@ -1,0 +1,1 @@
+"""Signature and cueing on labelled feature windows, with intervals and paired differences."""

@@ -1,0 +1,1 @@
+"""Ablations (section IX) and identifiability (section VI) of the paper."""

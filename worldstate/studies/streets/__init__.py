@@ -1,0 +1,1 @@
+"""Published figures on simulated streets, and how far these are from real ones."""
