@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
+from worldstate.ground.typing import FloatArray
 
 SCHEMA = "worldstate.MissRateTable"
 VERSION = "1.0.0"
@@ -163,7 +163,7 @@ def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
 
 
 def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
-    rates: NDArray[np.float64] = finite_array(name, rows, shape)
+    rates: FloatArray = finite_array(name, rows, shape)
     if (rates < 0).any() or (rates > 1).any():
         raise InvalidArgumentError(f"{name}: expected miss rates in [0, 1]")
     if (np.diff(rates, axis=0) < 0).any() or (np.diff(rates, axis=1) < 0).any():

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import check_shape, finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 from .co_evidence import CoEvidence
 from .evidence import SignatureEvidence
@@ -45,7 +46,7 @@ class Posterior:
     log_evidence: float
 
     @property
-    def probabilities(self) -> NDArray[np.float64]:
+    def probabilities(self) -> FloatArray:
         """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,)."""
         return np.exp(self.log_probabilities)
 
@@ -219,7 +220,7 @@ def statistic(
         return abduce(np.log(prior), evidence, co_evidence).hidden_total
 
 
-def _checked_log_prior(log_prior: ArrayLike, directions: int) -> NDArray[np.float64]:
+def _checked_log_prior(log_prior: ArrayLike, directions: int) -> FloatArray:
     prior = np.asarray(log_prior, dtype=np.float64)
     check_shape("log_prior", prior.shape, (directions + 2,))
     if not np.isfinite(prior.max()):
@@ -227,7 +228,7 @@ def _checked_log_prior(log_prior: ArrayLike, directions: int) -> NDArray[np.floa
     return prior
 
 
-def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> NDArray[np.float64]:
+def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> FloatArray:
     hidden, visible, none = co_evidence.log_likelihoods()
     log_likelihood = evidence.log_likelihoods
     log_likelihood[:-2] += hidden
@@ -235,7 +236,7 @@ def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> NDA
     return log_likelihood
 
 
-def _log_ratio(prior: NDArray[np.float64], log_likelihood: NDArray[np.float64]) -> float:
+def _log_ratio(prior: FloatArray, log_likelihood: FloatArray) -> float:
     hidden, others = prior[:-2], prior[-2:]
     if np.isneginf(hidden).all():
         hidden = np.zeros_like(hidden)
@@ -245,7 +246,7 @@ def _log_ratio(prior: NDArray[np.float64], log_likelihood: NDArray[np.float64]) 
     return hidden_mean - (_log_sum(others + log_likelihood[-2:]) - _log_sum(others))
 
 
-def _log_sum(values: NDArray[np.float64]) -> float:
+def _log_sum(values: FloatArray) -> float:
     """log(sum(exp(values))) without overflow; a sum of nothing possible is -inf."""
     largest = float(values.max())
     if largest == -np.inf:

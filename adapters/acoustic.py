@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
@@ -13,6 +12,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
+from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel, Side
@@ -111,6 +111,7 @@ class AcousticAdapter:
     >>> class Flat:
     ...     def evidence(self, feature): return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     >>> adapter = AcousticAdapter(roof_array_56(), 48_000, Flat())
+    >>> import numpy as np
     >>> noise = np.random.default_rng(0).standard_normal((52_800, 56)).astype(np.float32)
     >>> [(m.stamp_ns, m.co_evidence.reason) for m in adapter.measure(noise)]
     [(1000000000, 'no camera'), (1100000000, 'no camera')]
@@ -136,7 +137,7 @@ class AcousticAdapter:
         self._settings = settings or AcousticSettings()
         self._grounding = grounding
 
-    def measure(self, block: NDArray[np.float32], /) -> list[Measurement]:
+    def measure(self, block: Float32Array, /) -> list[Measurement]:
         """Take the next samples; return a measurement for each hop that ends in them.
 
         Parameters
@@ -156,7 +157,7 @@ class AcousticAdapter:
         """
         return [self.interpret(frame) for frame in self.front_end.process(block)]
 
-    def believe(self, none_probability: float) -> None:
+    def set_no_source_probability(self, none_probability: float) -> None:
         """Say how likely it is, after the last measurement, that no source is there.
 
         Where the front-end's settings have `ego_noise`, what is heard while nothing is there is learned as

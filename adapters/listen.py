@@ -250,7 +250,7 @@ def measure_steps(
     """
     strict, n_microphones = not source.mask_dead, source.array.n_microphones
     with open_audio(source.audio_path, expect_channels=n_microphones, strict=strict) as audio:
-        sight = line_of_sight(source.context)
+        sight = unoccluded_sector(source.context)
         rates = source.miss_rates
         vision = VisionQuery(
             PinholeCamera(),
@@ -272,15 +272,15 @@ def measure_steps(
             for frame in adapter.front_end.process(block):
                 yield frame, adapter.interpret(frame)
                 if none_probability is not None:
-                    adapter.believe(none_probability())
+                    adapter.set_no_source_probability(none_probability())
 
 
-def line_of_sight(context: Context) -> Sector:
+def unoccluded_sector(context: Context) -> Sector:
     """Return the directions that no occluder of the context hides.
 
     Examples
     --------
-    >>> sector = line_of_sight(Context())
+    >>> sector = unoccluded_sector(Context())
     >>> bool(sector.touches(0.5)), bool(sector.touches(0.7))
     (True, False)
     """

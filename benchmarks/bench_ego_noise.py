@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
-from worldstate.frontend.ego_noise.elevation_split import FromBelow
+from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.phat import whiten
@@ -66,7 +66,7 @@ def _ego_noise(engine: bool) -> EgoNoise:
     canceller = HarmonicCanceller(BINS[SRP], RATE, NFFT)
     if engine:
         canceller.follow(50.0)
-    judge = FromBelow.of(array, frequencies)
+    judge = ElevationSplit.of(array, frequencies)
     ego = EgoNoise(EgoNoiseSettings(), 2.0 * RATE / NFFT, 56, [(beams, SRP)], canceller, judge)
     ego.weight = 1.0
     return ego

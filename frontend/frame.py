@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone_stage import ToneReading
 from worldstate.frontend.array.geometry import Ambiguity
 from worldstate.frontend.direction.music_stage import MusicReading
 from worldstate.frontend.direction.peaks import Peak
 from worldstate.frontend.health.channel_health import ArrayHealth
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 _NOT_WATCHED = NotUsable("microphones were not watched")
@@ -45,7 +43,7 @@ class AcousticFrame:
         All peaks of that spectrum, highest first, at most `max_peaks`; the first is the bearing.
     ambiguity : str
         What the array cannot tell apart: see `MicrophoneArray.ambiguity`.
-    twin_bearing_rad : float or NotUsable
+    mirror_bearing_rad : float or NotUsable
         The azimuth that sounds the same as the bearing to this array.
     music : MusicReading or NotUsable
         MUSIC on the decision window; not usable when it is off.
@@ -64,6 +62,7 @@ class AcousticFrame:
 
     Examples
     --------
+    >>> import numpy as np
     >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> from worldstate.frontend.stream import FrontEnd
     >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
@@ -75,21 +74,21 @@ class AcousticFrame:
 
     stamp_ns: int
     sample_index: int
-    azimuths_rad: NDArray[np.float64]
-    srp: NDArray[np.float64]
-    elevations_rad: NDArray[np.float64]
-    srp_map: NDArray[np.float64]
+    azimuths_rad: FloatArray
+    srp: FloatArray
+    elevations_rad: FloatArray
+    srp_map: FloatArray
     bearing_rad: float
     bearing_std_rad: float
     prominence: float
     elevation_rad: float
     peaks: tuple[Peak, ...]
     ambiguity: Ambiguity
-    twin_bearing_rad: float | NotUsable
+    mirror_bearing_rad: float | NotUsable
     music: MusicReading | NotUsable
-    band_log_energy: NDArray[np.float64]
+    band_log_energy: FloatArray
     looming: Looming | NotUsable
-    feature: NDArray[np.float64]
+    feature: FloatArray
     bearing_age_s: float = 0.0
     health: ArrayHealth | NotUsable = _NOT_WATCHED
     tone: ToneReading | NotUsable = TONE_IS_OFF

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -12,18 +11,18 @@ from worldstate.frontend.direction.feature import feature_steering, pair_sum, pa
 from worldstate.frontend.direction.music_stage import MusicStage
 from worldstate.frontend.direction.srp import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, spanned
-from worldstate.frontend.ego_noise.elevation_split import FromBelow
+from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
 from worldstate.frontend.spectra.phat import power, whiten
 from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array, FloatArray
 
 from .settings import FrontEndSettings
 
-Spectra = NDArray[np.complex64]
-Steered = tuple[Spectra, Steering]
+Steered = tuple[Complex64Array, Steering]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,13 +55,13 @@ class HopSums:
 
     n_frames: int
     centre: float
-    power: NDArray[np.float64]
-    pairs: NDArray[np.complex128]
-    energies: NDArray[np.float64]
+    power: FloatArray
+    pairs: Complex128Array
+    energies: FloatArray
     health: ArrayHealth
 
 
-class Listener:
+class HopSpectra:
     """Transform, whiten and steer, hop by hop; only the transform remembers the past.
 
     Parameters
@@ -77,7 +76,7 @@ class Listener:
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0.1], [0, -0.1, 0]])
-    >>> listener = Listener(array, 48_000, FrontEndSettings())
+    >>> listener = HopSpectra(array, 48_000, FrontEndSettings())
     >>> hop = np.random.default_rng(0).standard_normal((4800, 3)).astype(np.float32)
     >>> listener.push(hop).power.shape
     (181,)
@@ -104,7 +103,7 @@ class Listener:
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
 
-    def push(self, samples: NDArray[np.float32]) -> HopSums:
+    def push(self, samples: Float32Array) -> HopSums:
         """Sum over the frames that these samples (n, M) complete; at least one frame.
 
         Parameters
@@ -131,19 +130,17 @@ class Listener:
         centre = self._centre(len(spectra))
         return HopSums(len(spectra), centre, srp, pairs, energies.mean(axis=0), health)
 
-    def _frame_energies(self, powers: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _frame_energies(self, powers: Float32Array) -> FloatArray:
         """Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`."""
         total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
         return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
 
-    def _watch(
-        self, samples: NDArray[np.float32], energies: NDArray[np.float64], matrices: Spectra
-    ) -> ArrayHealth:
+    def _watch(self, samples: Float32Array, energies: FloatArray, matrices: Complex64Array) -> ArrayHealth:
         if self.monitor is None:
             return self._unwatched
         return self.monitor.push(samples, energies, matrices)
 
-    def _whitened(self, spectra: Spectra, mask: ChannelMask) -> list[Steered]:
+    def _whitened(self, spectra: Complex64Array, mask: ChannelMask) -> list[Steered]:
         """Prewhitened spectra, phase transform included, and their beams; none without ego-noise settings."""
         if self.ego_noise is None:
             return []
@@ -154,7 +151,7 @@ class Listener:
         return quiet
 
     def _push_music(
-        self, music: MusicStage, spectra: Spectra, powers: NDArray[np.float32], quiet: list[Steered]
+        self, music: MusicStage, spectra: Complex64Array, powers: Float32Array, quiet: list[Steered]
     ) -> None:
         """MUSIC hears raw spectra, or whitened ones at the level of the raw ones."""
         if not quiet or quiet[0][1] is self._beams:
@@ -165,8 +162,8 @@ class Listener:
             music.push(heard * level, beams)
 
     def _sums(
-        self, quiet: list[Steered], whitened: Spectra, matrices: Spectra, mask: ChannelMask
-    ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+        self, quiet: list[Steered], whitened: Complex64Array, matrices: Complex64Array, mask: ChannelMask
+    ) -> tuple[FloatArray, Complex128Array]:
         """Steered power and pair sums of one hop, as of all microphones."""
         srp = quiet[0] if quiet else (whitened[:, self._srp], self._beams)
         if len(quiet) > 1:
@@ -205,7 +202,7 @@ class Listener:
         heard = bins[part]
         engine = HarmonicCanceller(heard, sample_rate_hz, nfft, harmonics=chosen.harmonics)
         frequencies, speed = bin_frequencies_hz(heard, sample_rate_hz, nfft), settings.speed_of_sound_m_s
-        judge = FromBelow.of(array, frequencies, speed) if chosen.only_from_below else None
+        judge = ElevationSplit.of(array, frequencies, speed) if chosen.only_from_below else None
         frames_per_s = 2.0 * sample_rate_hz / nfft
         return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, judge)
 

@@ -1,12 +1,12 @@
 """Band levels of a stream, from a few of its microphones."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.spectra.bands import band_edges, log_band_energy, mean_square_per_bin
 from worldstate.frontend.spectra.bins import band_bins
 from worldstate.frontend.spectra.phat import power
 from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 from .settings import FrontEndSettings
 
@@ -44,9 +44,7 @@ class LevelMeter:
         self._channels = slice(None, None, step)
         self._stft = StreamingStft(-(-n_channels // step), settings.nfft, self._bins)
 
-    def push(
-        self, samples: NDArray[np.float32], keep: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.float64]:
+    def push(self, samples: Float32Array, keep: BoolArray | None = None) -> FloatArray:
         r"""Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame.
 
         .. math:: L_b = \ln \sum_{k \in b} \overline{x^2}[k]

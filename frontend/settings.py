@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
@@ -11,6 +10,7 @@ from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, FEATURE_NFFT,
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 Band = tuple[float, float]
 
@@ -134,7 +134,7 @@ class FrontEndSettings:
         in_range("elevation_step_deg", self.elevation_step_deg, 0.01, 180.0)
         _divides("elevation_step_deg", self.elevation_step_deg, highest - lowest)
 
-    def azimuths_rad(self) -> NDArray[np.float64]:
+    def azimuths_rad(self) -> FloatArray:
         """Grid of azimuths, ascending from right to left, radians, shape (A,).
 
         ``theta_i = first + i step``
@@ -150,7 +150,7 @@ class FrontEndSettings:
         """
         return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
 
-    def elevations_rad(self) -> NDArray[np.float64]:
+    def elevations_rad(self) -> FloatArray:
         """Grid of elevations, ascending, radians, shape (E,).
 
         ``phi_i = first + i step``
@@ -171,7 +171,7 @@ class FrontEndSettings:
         """
         return _grid_rad(self.elevation_span_deg, self.elevation_step_deg)
 
-    def directions_rad(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def directions_rad(self) -> tuple[FloatArray, FloatArray]:
         """Azimuth and elevation of every direction, row by row of elevations, shape (E * A,) each.
 
         ``(theta, phi)_i = (theta_(i mod A), phi_(i div A))``
@@ -189,7 +189,7 @@ class FrontEndSettings:
         return azimuths.ravel(), elevations.ravel()
 
 
-def _grid_rad(span_deg: tuple[float, float], step_deg: float) -> NDArray[np.float64]:
+def _grid_rad(span_deg: tuple[float, float], step_deg: float) -> FloatArray:
     first, last = span_deg
     return np.radians(np.linspace(first, last, round((last - first) / step_deg) + 1))
 

@@ -3,11 +3,11 @@
 from collections import deque
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.approach.looming import Looming, looming
 from worldstate.frontend.approach.tone_stage import ToneReading, ToneStage
-from worldstate.frontend.array.front_back_ambiguity import twin_azimuth_rad, twin_reflection
+from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, segment_feature
@@ -20,10 +20,11 @@ from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 
 from .frame import TONE_IS_OFF, AcousticFrame
-from .hop_spectra import HopSums, Listener
+from .hop_spectra import HopSpectra, HopSums
 from .levels import LevelMeter
 from .settings import FrontEndSettings
 
@@ -91,10 +92,10 @@ class FrontEnd:
         self._azimuths = settings.azimuths_rad()
         self._elevations = settings.elevations_rad()
         self._azimuths.flags.writeable = self._elevations.flags.writeable = False
-        self._ambiguity, self._twin = array.ambiguity, twin_reflection(array)
+        self._ambiguity, self._twin = array.ambiguity, mirror_reflection(array)
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
         with one_blas_thread():
-            self._listener = Listener(array, self.sample_rate_hz, settings)
+            self._listener = HopSpectra(array, self.sample_rate_hz, settings)
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._tone = self._tone_stage()
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
@@ -175,7 +176,7 @@ class FrontEnd:
             raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")
         return self._listener.ego_noise
 
-    def _checked(self, block: ArrayLike) -> NDArray[np.float32]:
+    def _checked(self, block: ArrayLike) -> Float32Array:
         try:
             with np.errstate(over="ignore"):
                 samples = np.ascontiguousarray(block, dtype=np.float32)
@@ -191,7 +192,7 @@ class FrontEnd:
         return samples
 
     @staticmethod
-    def _refuse_unless_quiet(samples: NDArray[np.float32]) -> None:
+    def _refuse_unless_quiet(samples: Float32Array) -> None:
         # NaN compares false.
         loud = ~(np.abs(samples).max(axis=0) <= _LOUDEST)
         if loud.any():
@@ -208,7 +209,7 @@ class FrontEnd:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
             return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
-    def _frame(self, hop: Hop, levels: NDArray[np.float64]) -> AcousticFrame:
+    def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         settings = self.settings
         recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
         peaks = find_peaks(recent.max(axis=0), self._azimuths, max_peaks=settings.max_peaks)
@@ -226,7 +227,7 @@ class FrontEnd:
             elevation_rad=self._elevation_rad(recent, bearing.azimuth_rad),
             peaks=peaks,
             ambiguity=self._ambiguity,
-            twin_bearing_rad=twin_azimuth_rad(self._twin, bearing.azimuth_rad),
+            mirror_bearing_rad=mirror_azimuth_rad(self._twin, bearing.azimuth_rad),
             music=self._music(),
             band_log_energy=levels,
             looming=self._looming(hop.end),
@@ -240,11 +241,11 @@ class FrontEnd:
         return list(self._hops)[-n_hops:]
 
     @property
-    def _keep(self) -> NDArray[np.bool_]:
+    def _keep(self) -> BoolArray:
         """Microphones that count now."""
         return self._hops[-1].health.mask.keep
 
-    def _srp(self, n_hops: int) -> NDArray[np.float64]:
+    def _srp(self, n_hops: int) -> FloatArray:
         """SRP-PHAT of the last hops, (E, A)."""
         hops = self._last(n_hops)
         total = np.sum([hop.power for hop in hops], axis=0)
@@ -252,7 +253,7 @@ class FrontEnd:
         power = normalised(total, n_frames, len(self._listener.srp_bins), self.array.n_microphones)
         return power.reshape(len(self._elevations), len(self._azimuths))
 
-    def _elevation_rad(self, spectrum: NDArray[np.float64], azimuth_rad: float) -> float:
+    def _elevation_rad(self, spectrum: FloatArray, azimuth_rad: float) -> float:
         """Elevation of the peak next to an azimuth, interpolated where the grid has three."""
         column = spectrum[:, np.abs(self._azimuths - azimuth_rad).argmin()]
         if len(column) < 3 or not column.any():
@@ -279,7 +280,7 @@ class FrontEnd:
         centre = sum(hop.n_frames * hop.centre for hop in hops) / sum(hop.n_frames for hop in hops)
         return (end - centre) / self.sample_rate_hz
 
-    def _feature(self) -> NDArray[np.float64]:
+    def _feature(self) -> FloatArray:
         hops = self._last(self.settings.window_hops)
         length = len(hops) // FEATURE_SEGMENTS
         segments = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]

@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
 
 BINS = 10
 _FLOOR_DRAWS = 400
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +30,9 @@ class ReliabilityCurve:
     array([2, 1])
     """
 
-    predicted: Numbers
-    observed: Numbers
-    counts: NDArray[np.intp]
+    predicted: FloatArray
+    observed: FloatArray
+    counts: IndexArray
 
 
 def reliability_curve(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> ReliabilityCurve:
@@ -224,11 +223,11 @@ def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
     return float(np.mean((predicted - labels) ** 2))
 
 
-def _bin_index(predicted: Numbers, bins: int) -> NDArray[np.intp]:
+def _bin_index(predicted: FloatArray, bins: int) -> IndexArray:
     return np.minimum((predicted * bins).astype(np.intp), bins - 1)
 
 
-def _checked_sample(risk: ArrayLike, hazards: ArrayLike) -> tuple[Numbers, Numbers]:
+def _checked_sample(risk: ArrayLike, hazards: ArrayLike) -> tuple[FloatArray, FloatArray]:
     predicted = finite_array("risk", risk, (None,))
     labels = (finite_array("hazards", hazards, predicted.shape) > 0.5).astype(np.float64)
     if not predicted.size or predicted.min() < 0.0 or predicted.max() > 1.0:

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 from .cueing_policy import sustained_statistic
 
@@ -16,8 +17,8 @@ from .cueing_policy import sustained_statistic
 class _Losses(NamedTuple):
     """Sustained statistics of all windows, falling, with the share of its recording that each stands for."""
 
-    held: NDArray[np.float64]
-    shares: NDArray[np.float64]
+    held: FloatArray
+    shares: FloatArray
     recordings: int
     single: bool
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_number, read_numbers
+from worldstate.ground.typing import BoolArray, FloatArray
 
 from .adaptive_threshold import AdaptiveBudget
 from .risk_map import RiskMap, risk_map_from_dict
@@ -246,7 +247,7 @@ class CueingPolicies:
         raise InvalidArgumentError(f"alpha: expected a calibrated budget ({held}), got {alpha:g}")
 
 
-def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.float64]:
+def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
     r"""Return the smallest statistic of the last k hops; -inf where there are fewer.
 
     .. math:: h_t = \min(s_{t-k+1}, \dots, s_t)
@@ -282,7 +283,7 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> NDArray[np.f
     return held
 
 
-def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
+def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
     """Return where the last k hops all held, shape (windows,): `SustainedRule` over a whole recording.
 
     ``alarm_t = held_(t-k+1) and .. and held_t``
@@ -311,7 +312,7 @@ def sustained_alarm(held: ArrayLike, sustain_hops: int) -> NDArray[np.bool_]:
     return sustained_statistic(np.asarray(held, dtype=bool), sustain_hops) >= 0.5
 
 
-def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1, 3)) -> NDArray[np.bool_]:
+def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1, 3)) -> BoolArray:
     r"""Return where the most probable class is a hazard: the published rule's decision, shape (windows,).
 
     .. math:: \hat c = \arg\max_c P_c, \qquad \hat c \in \{left, right\}

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 
 def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
@@ -52,7 +53,7 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
     return float(max(2.0 * pairs[:last].sum() - 1.0, 1.0))
 
 
-def _autocorrelation(values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _autocorrelation(values: list[FloatArray]) -> FloatArray:
     """Pooled autocorrelation up to half the longest stream, lag 0 first."""
     mean = np.concatenate(values).mean()
     lags = max(value.size for value in values) // 2 + 2

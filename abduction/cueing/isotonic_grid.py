@@ -1,18 +1,17 @@
 """Least squares on a grid whose values may fall along neither axis."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 _SWEEPS = 2000
 _TOLERANCE = 1e-10
 
-Grid = NDArray[np.float64]
 
-
-def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> Grid:
+def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
     r"""Return the grid closest to `values` that does not fall along rows or columns.
 
     .. math:: \min_g \sum_{ij} w_{ij} (g_{ij} - v_{ij})^2 \quad \text{subject to} \quad
@@ -63,12 +62,12 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> Grid:
     return np.maximum.accumulate(np.maximum.accumulate(grid, axis=0), axis=1)
 
 
-def _pooled_rows(values: Grid, weights: Grid) -> Grid:
+def _pooled_rows(values: FloatArray, weights: FloatArray) -> FloatArray:
     rows = [_pooled(value, weight) for value, weight in zip(values, weights, strict=True)]
     return np.array(rows)
 
 
-def _pooled(values: Grid, weights: Grid) -> Grid:
+def _pooled(values: FloatArray, weights: FloatArray) -> FloatArray:
     """Pool adjacent violators of one sequence."""
     means: list[float] = []
     masses: list[float] = []

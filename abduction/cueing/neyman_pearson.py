@@ -3,10 +3,11 @@ r"""The threshold of a false-alarm budget: gamma(alpha)."""
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 from .cueing_policy import sustained_statistic
 
@@ -53,7 +54,7 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
     budget = in_range("alpha", alpha, 0.0, 1.0, open_high=True)
     streams = [finite_array("hazard_free", stream, (None,)) for stream in hazard_free]
     held = [sustained_statistic(stream, sustain_hops) for stream in streams]
-    statistic: NDArray[np.float64] = np.sort(np.concatenate(held) if held else np.empty(0))[::-1]
+    statistic: FloatArray = np.sort(np.concatenate(held) if held else np.empty(0))[::-1]
     if not statistic.size:
         raise InvalidArgumentError("hazard_free: expected at least one window")
     # The next float above the first window that the budget cannot pay for; alpha < 1 leaves at least one.

@@ -6,10 +6,11 @@ Source: Lin, Lin, Weng, "A note on Platt's probabilistic outputs for support vec
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 _ITERATIONS = 100
 _SMALLEST_STEP = 1e-10
@@ -17,7 +18,7 @@ _GRADIENT_TOLERANCE = 1e-6
 _RIDGE = 1e-12
 
 
-def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> NDArray[np.float64]:
+def sigmoid(value: FloatArray, slope: ArrayLike, offset: ArrayLike) -> FloatArray:
     r"""Return a falling or rising sigmoid without overflow, broadcast.
 
     .. math:: p(f) = 1 / (1 + \exp(A f + B))
@@ -43,7 +44,7 @@ def sigmoid(value: NDArray[np.float64], slope: ArrayLike, offset: ArrayLike) -> 
     >>> sigmoid(np.array([0.0, 1e6]), -1.0, 0.0)
     array([0.5, 1. ])
     """
-    exponent: NDArray[np.float64] = np.asarray(slope) * value + np.asarray(offset)
+    exponent: FloatArray = np.asarray(slope) * value + np.asarray(offset)
     return np.asarray(np.exp(-np.logaddexp(0.0, exponent)))
 
 
@@ -92,7 +93,7 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
     return slope / unit, offset
 
 
-def _newton(decision: NDArray[np.float64], target: NDArray[np.float64], offset: float) -> tuple[float, float]:
+def _newton(decision: FloatArray, target: FloatArray, offset: float) -> tuple[float, float]:
     point = np.array([0.0, offset])
     loss = _loss(decision, target, point)
     for _ in range(_ITERATIONS):
@@ -111,14 +112,14 @@ def _newton(decision: NDArray[np.float64], target: NDArray[np.float64], offset: 
     return float(point[0]), float(point[1])
 
 
-def _loss(decision: NDArray[np.float64], target: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+def _loss(decision: FloatArray, target: FloatArray, point: FloatArray) -> float:
     exponent = point[0] * decision + point[1]
     return float(np.sum(np.logaddexp(0.0, exponent) - (1.0 - target) * exponent))
 
 
 def _derivatives(
-    decision: NDArray[np.float64], target: NDArray[np.float64], point: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    decision: FloatArray, target: FloatArray, point: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     probability = sigmoid(decision, point[0], point[1])
     design = np.stack([decision, np.ones_like(decision)])
     gradient = design @ (target - probability)

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_number, read_numbers
+from worldstate.ground.typing import BoolArray, FloatArray
 
 from .platt import fit_sigmoid, sigmoid
 
@@ -22,7 +23,7 @@ class RiskMap(Protocol):
     @overload
     def __call__(self, statistic: float) -> float: ...
     @overload
-    def __call__(self, statistic: NDArray[np.float64]) -> NDArray[np.float64]: ...
+    def __call__(self, statistic: FloatArray) -> FloatArray: ...
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
@@ -65,8 +66,8 @@ class IsotonicMap:
     @overload
     def __call__(self, statistic: float) -> float: ...
     @overload
-    def __call__(self, statistic: NDArray[np.float64]) -> NDArray[np.float64]: ...
-    def __call__(self, statistic: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+    def __call__(self, statistic: FloatArray) -> FloatArray: ...
+    def __call__(self, statistic: float | FloatArray) -> float | FloatArray:
         """Return the risk at a statistic or an array of them."""
         risk = np.interp(statistic, self.statistics, self.risks)
         return float(risk) if np.ndim(statistic) == 0 else risk
@@ -111,8 +112,8 @@ class PlattMap:
     @overload
     def __call__(self, statistic: float) -> float: ...
     @overload
-    def __call__(self, statistic: NDArray[np.float64]) -> NDArray[np.float64]: ...
-    def __call__(self, statistic: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+    def __call__(self, statistic: FloatArray) -> FloatArray: ...
+    def __call__(self, statistic: float | FloatArray) -> float | FloatArray:
         """Return the risk at a statistic or an array of them."""
         risk = sigmoid(_logit(np.asarray(statistic, dtype=np.float64)), self.slope, self.offset)
         return float(risk) if np.ndim(statistic) == 0 else risk
@@ -269,14 +270,12 @@ def risk_map_from_dict(data: object) -> RiskMap:
     raise InvalidArgumentError("risk_map: expected kind isotonic or platt")
 
 
-def _logit(statistic: NDArray[np.float64]) -> NDArray[np.float64]:
+def _logit(statistic: FloatArray) -> FloatArray:
     bounded = np.clip(statistic, 1e-9, 1.0 - 1e-9)
     return np.asarray(np.log(bounded / (1.0 - bounded)))
 
 
-def _checked_sample(
-    statistics: ArrayLike, hazards: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _checked_sample(statistics: ArrayLike, hazards: ArrayLike) -> tuple[FloatArray, BoolArray]:
     scores = finite_array("statistics", statistics, (None,))
     labels = finite_array("hazards", hazards, scores.shape) > 0.5
     if not labels.any() or labels.all():

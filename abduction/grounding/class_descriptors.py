@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 SPEED_OF_SOUND_M_S = 343.0
 # Total ratio of gearbox and final drive, first to fifth gear: ordinary numbers of a passenger car (3.6, 2.05,
@@ -26,8 +27,6 @@ WHEEL_RADIUS_M = 0.3
 FIRINGS_PER_TURN = 2.0
 IDLE_HZ = 25.0
 REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 / 3.6, 20.0 / 3.6
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,7 @@ class Coupling:
             finite_array("curves", curve, (knots.size,))
         in_range("std", self.std, 0.0, np.inf, open_low=True, open_high=True)
 
-    def expected(self, radial_speed_m_s: ArrayLike) -> Numbers:
+    def expected(self, radial_speed_m_s: ArrayLike) -> FloatArray:
         r"""Return the value on every curve, shape (curves, n).
 
         .. math:: f_g(v) = f_{g,i} + (f_{g,i+1} - f_{g,i})\, \frac{v - v_i}{v_{i+1} - v_i}, \qquad
@@ -88,7 +87,7 @@ class Coupling:
         speed = np.asarray(radial_speed_m_s, dtype=np.float64)
         return np.stack([np.interp(speed, self.speed_m_s, curve) for curve in self.curves])
 
-    def log_likelihood(self, value: float, value_std: float, radial_speed_m_s: ArrayLike) -> Numbers:
+    def log_likelihood(self, value: float, value_std: float, radial_speed_m_s: ArrayLike) -> FloatArray:
         r"""Return log p(value | c, v_r) at each speed, shape (n,), nats.
 
         .. math:: p = \frac{1}{G} \sum_g N\big(value;\ f_g(v_r),\ \sigma_c^2 + \sigma_{value}^2\big)
@@ -153,7 +152,7 @@ class Descriptor:
         if len(set(names)) != len(names):
             raise InvalidArgumentError(f"couplings: expected each observable once, got {names}")
 
-    def log_speed_prior(self, radial_speed_m_s: Numbers) -> Numbers:
+    def log_speed_prior(self, radial_speed_m_s: FloatArray) -> FloatArray:
         r"""Return log P(v_r | c) on a grid, normalised to one over it, shape (n,), nats.
 
         .. math:: P(v_i) \propto \exp\big(-\tfrac12 (v_i - \mu)^2 / \sigma^2\big), \qquad \sum_i P(v_i) = 1
@@ -301,12 +300,14 @@ def motorcycle() -> Descriptor:
     return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
 
 
-def _octave_db(speed_m_s: Numbers, rolling: tuple[float, float], propulsion: tuple[float, float]) -> Numbers:
+def _octave_db(
+    speed_m_s: FloatArray, rolling: tuple[float, float], propulsion: tuple[float, float]
+) -> FloatArray:
     ratio = speed_m_s / REFERENCE_SPEED_M_S
     rolling_db = rolling[0] + rolling[1] * np.log10(ratio)
     propulsion_db = propulsion[0] + propulsion[1] * (ratio - 1.0)
     return np.asarray(10.0 * np.log10(10.0 ** (rolling_db / 10.0) + 10.0 ** (propulsion_db / 10.0)))
 
 
-def _tuple(values: Numbers) -> tuple[float, ...]:
+def _tuple(values: FloatArray) -> tuple[float, ...]:
     return tuple(values.tolist())

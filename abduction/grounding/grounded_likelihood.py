@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 from .class_descriptors import Descriptor
@@ -28,8 +28,6 @@ _AZIMUTHS_RAD = np.radians(np.arange(-90.0, 90.5, 1.0))
 _SPEED_CELL_M_S = 0.25
 _AZIMUTH_CELL_RAD = float(np.radians(1.0))
 _RANGES_M = np.geomspace(5.0, 60.0, 24)
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +75,7 @@ BACKGROUNDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Sector:
+class AzimuthPrior:
     """Where a source may stand under one explanation: a normal law about an azimuth, cut off at +-90 degrees.
 
     Parameters
@@ -87,14 +85,14 @@ class Sector:
 
     Examples
     --------
-    >>> Sector(0.0, np.inf).log_prior(np.zeros(2)).round(2)
+    >>> AzimuthPrior(0.0, np.inf).log_prior(np.zeros(2)).round(2)
     array([-0.69, -0.69])
     """
 
     azimuth_rad: float
     std_rad: float
 
-    def log_prior(self, azimuths_rad: Numbers) -> Numbers:
+    def log_prior(self, azimuths_rad: FloatArray) -> FloatArray:
         r"""Return log P(theta) on a grid, normalised over it, shape (n,), nats.
 
         .. math:: P(\theta_i) \propto \exp\big(-\tfrac12 (\theta_i - \theta_0)^2 / \sigma^2\big), \qquad
@@ -119,10 +117,10 @@ class GroundedSettings:
 
     Parameters
     ----------
-    hidden : Sector
+    hidden : AzimuthPrior
         Of the strongest direction of a hidden source. It is a wall or an edge that is heard, whose side says
         little of the side that the vehicle comes from: by default any azimuth alike, from both sides.
-    visible : Sector
+    visible : AzimuthPrior
         Of a source in plain view.
     without : frozenset of str
         Observables whose coupling is switched off, for ablations.
@@ -135,8 +133,8 @@ class GroundedSettings:
     inf
     """
 
-    hidden: Sector = Sector(0.0, np.inf)
-    visible: Sector = Sector(0.0, np.radians(35.0))
+    hidden: AzimuthPrior = AzimuthPrior(0.0, np.inf)
+    visible: AzimuthPrior = AzimuthPrior(0.0, np.radians(35.0))
     without: frozenset[str] = frozenset()
     backgrounds: Mapping[str, Background] = field(default_factory=lambda: BACKGROUNDS)
 
@@ -268,7 +266,7 @@ def ground(
 
 def _over_speed(
     observation: GroundedObservation, descriptors: Sequence[Descriptor], settings: GroundedSettings
-) -> Numbers:
+) -> FloatArray:
     """Log of P(c) P(v_r | c) p(o | c, v_r) p(v | v_r) over the background, shape (classes, speeds)."""
     weights = np.log([descriptor.weight for descriptor in descriptors])
     weights -= np.logaddexp.reduce(weights)
@@ -282,7 +280,7 @@ def _over_speed(
 
 def _log_couplings(
     observation: GroundedObservation, descriptor: Descriptor, settings: GroundedSettings
-) -> Numbers:
+) -> FloatArray:
     """Log of p(o | c, v_r) over the background; an observable that a class leaves open adds nothing."""
     total = np.zeros(_SPEEDS_M_S.size)
     for coupling in descriptor.couplings:
@@ -296,7 +294,7 @@ def _log_couplings(
     return total
 
 
-def _log_approach(observation: GroundedObservation, settings: GroundedSettings) -> Numbers:
+def _log_approach(observation: GroundedObservation, settings: GroundedSettings) -> FloatArray:
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable):
@@ -310,7 +308,7 @@ def _log_approach(observation: GroundedObservation, settings: GroundedSettings) 
     return np.zeros(_SPEEDS_M_S.size)
 
 
-def _over_azimuth(bearing: Observable | NotUsable, sector: Sector) -> Numbers:
+def _over_azimuth(bearing: Observable | NotUsable, sector: AzimuthPrior) -> FloatArray:
     """Log of P(theta | h) p(bearing | theta) over that of any azimuth alike, shape (azimuths,)."""
     prior = sector.log_prior(_AZIMUTHS_RAD)
     if isinstance(bearing, NotUsable):
@@ -319,14 +317,17 @@ def _over_azimuth(bearing: Observable | NotUsable, sector: Sector) -> Numbers:
     return np.asarray(prior + fit - np.logaddexp.reduce(fit - np.log(fit.size)))
 
 
-def _log_normal(seen: Observable, expected: Numbers, cell: Numbers | float) -> Numbers:
+def _log_normal(seen: Observable, expected: FloatArray, cell: FloatArray | float) -> FloatArray:
     """Log density of what was seen; a spread below half a cell of the grid is held there."""
     std = np.maximum(seen.std, np.asarray(cell) / 2.0)
     return np.asarray(-0.5 * ((seen.value - expected) / std) ** 2 - np.log(std * np.sqrt(2 * pi)))
 
 
 def _best(
-    evidence: SignatureEvidence, descriptors: Sequence[Descriptor], over_speed: Numbers, over_azimuth: Numbers
+    evidence: SignatureEvidence,
+    descriptors: Sequence[Descriptor],
+    over_speed: FloatArray,
+    over_azimuth: FloatArray,
 ) -> HiddenState:
     """Return arg max of p(k, c, theta, v_r | y, hidden): its factors part, so each is taken by itself."""
     sides = np.array(evidence.hidden) - np.logaddexp.reduce(evidence.hidden)

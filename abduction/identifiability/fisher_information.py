@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
-Matrix = NDArray[np.float64]
 _SLACK = 1e-9
 
 
-def combined_information(parts: Sequence[ArrayLike]) -> Matrix:
+def combined_information(parts: Sequence[ArrayLike]) -> FloatArray:
     r"""Return :math:`J = \sum_m J_m`, which independent noise given the state (A1) allows, shape (p, p).
 
     Parameters
@@ -46,7 +46,7 @@ def combined_information(parts: Sequence[ArrayLike]) -> Matrix:
     return np.asarray(sum((_information("parts", part, first.shape) for part in parts[1:]), first))
 
 
-def gaussian_information(slope: ArrayLike, covariance: ArrayLike) -> Matrix:
+def gaussian_information(slope: ArrayLike, covariance: ArrayLike) -> FloatArray:
     r"""Return the information of an observation with Gaussian noise of known covariance.
 
     .. math:: J = H^T R^{-1} H
@@ -88,7 +88,7 @@ def gaussian_information(slope: ArrayLike, covariance: ArrayLike) -> Matrix:
 
 def common_cause_information(
     slopes: Sequence[ArrayLike], covariances: Sequence[ArrayLike], effects: Sequence[ArrayLike]
-) -> Matrix:
+) -> FloatArray:
     r"""Return the information of modalities that a common disturbance reaches: (A1) fails.
 
     Rain soils the lens and raises the noise of the microphones. With a disturbance w of unit variance that
@@ -140,7 +140,7 @@ def common_cause_information(
 
 def claimed_covariance(
     slopes: Sequence[ArrayLike], covariances: Sequence[ArrayLike], effects: Sequence[ArrayLike]
-) -> tuple[Matrix, Matrix]:
+) -> tuple[FloatArray, FloatArray]:
     r"""Return what a fusion that assumes (A1) claims, and what it has, when the noise has a common cause.
 
     .. math:: P_{claimed} = J_s^{-1}, \qquad P_{true} = J_s^{-1} (J_s + C)\, J_s^{-1}, \qquad
@@ -224,7 +224,7 @@ def at_least(larger: ArrayLike, smaller: ArrayLike) -> bool:
 
 def _stacked(
     slopes: Sequence[ArrayLike], covariances: Sequence[ArrayLike], effects: Sequence[ArrayLike]
-) -> tuple[Matrix, Matrix]:
+) -> tuple[FloatArray, FloatArray]:
     if not len(slopes) == len(covariances) == len(effects) or not len(slopes):
         raise InvalidArgumentError("slopes, covariances, effects: expected one of each for every modality")
     H = [finite_array("slopes", slope, (None, None)) for slope in slopes]
@@ -240,14 +240,14 @@ def _stacked(
     return np.concatenate(H), R
 
 
-def _information(name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Matrix:
+def _information(name: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
     J = _symmetric(name, value, shape or (None, None))
     if np.linalg.eigvalsh(J)[0] < -_SLACK * max(float(np.abs(J).max()), 1.0):
         raise InvalidArgumentError(f"{name}: expected a positive semi-definite matrix")
     return J
 
 
-def _symmetric(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Matrix:
+def _symmetric(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:
     matrix = finite_array(name, value, shape)
     if matrix.shape[0] != matrix.shape[1] or not matrix.size or not np.allclose(matrix, matrix.T):
         raise InvalidArgumentError(f"{name}: expected a symmetric matrix, got shape {matrix.shape}")

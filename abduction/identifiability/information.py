@@ -4,12 +4,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import check_shape, finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
 
-Numbers = NDArray[np.float64]
 _BITS = 1.0 / math.log(2.0)
 _SMALLEST = 1e-12
 
@@ -366,7 +366,7 @@ def conditional_information(acoustic: ArrayLike, both: ArrayLike, states: ArrayL
     return float(np.log2(ratio).mean())
 
 
-def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> Numbers:
+def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> FloatArray:
     r"""Return posteriors of both channels under (A1), independence given the state, shape (n, K).
 
     .. math:: q(z | x_{ac}, x_{vis}) \propto q(z | x_{ac})\, q(z | x_{vis}) / p(z)
@@ -419,13 +419,13 @@ def _fano_function(error: float, states: int) -> float:
     return spread + error * math.log2(states - 1) if states > 2 else spread
 
 
-def _distribution(name: str, values: Numbers) -> Numbers:
+def _distribution(name: str, values: FloatArray) -> FloatArray:
     if not values.size or (values < 0.0).any() or not math.isclose(float(values.sum()), 1.0, abs_tol=1e-6):
         raise InvalidArgumentError(f"{name}: expected probabilities that sum to one")
     return values
 
 
-def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[Numbers, NDArray[np.intp]]:
+def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[FloatArray, IndexArray]:
     q = finite_array("posteriors", posteriors, (None, None))
     z = np.asarray(states)
     check_shape("states", z.shape, (len(q),))

@@ -3,16 +3,15 @@
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 from .pairwise_coupling import SMALLEST_PROBABILITY
 from .published_signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS
-
-Numbers = NDArray[np.float64]
 
 
 class FittedClassifier(Protocol):
@@ -80,7 +79,7 @@ class ClassifierSignature:
         """Training prior in the order of the explanations (left, right, visible, none)."""
         return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of front, left, none, right, shape (n, 4).
 
         .. math:: P_c = \frac{\max(p_c, 10^{-7})}{\sum_{c'} \max(p_{c'}, 10^{-7})}

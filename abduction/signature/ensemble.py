@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_numbers
+from worldstate.ground.typing import FloatArray
 
 from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
 from .mirror import SEGMENTS, mirror_features
@@ -38,8 +39,6 @@ from .site_reference import KINDS, SiteReference, log_levels
 MOST_EXPERTS = 32
 KIND = "ensemble"
 MIRRORED_CLASSES = [{LEFT: RIGHT, RIGHT: LEFT}.get(column, column) for column in range(len(CLASSES))]
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,9 +71,9 @@ class EnsembleModel:
     """
 
     experts: tuple[Expert, ...]
-    class_prior: Numbers
+    class_prior: FloatArray
     home: SiteReference
-    empty: Numbers
+    empty: FloatArray
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
@@ -130,7 +129,7 @@ class EnsembleModel:
         """
         return replace(self, home=reference)
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
 
         .. math:: P(c \mid x) \propto \exp \tfrac{1}{2 E} \sum_e
@@ -155,7 +154,7 @@ class EnsembleModel:
         posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
         return np.asarray(posteriors / total(posteriors))
 
-    def log_likelihoods(self, X: ArrayLike) -> Numbers:
+    def log_likelihoods(self, X: ArrayLike) -> FloatArray:
         r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
 
         .. math:: \log \ell_c = \log P_c - \log \pi_c
@@ -231,7 +230,7 @@ class EnsembleModel:
             np.array(read_numbers(data.get("empty"), "empty")),
         )
 
-    def _split(self, X: ArrayLike) -> tuple[Numbers, Numbers]:
+    def _split(self, X: ArrayLike) -> tuple[FloatArray, FloatArray]:
         n_features = self.n_features
         inputs = finite_array("X", X, (None, None))
         if inputs.shape[1] not in (n_features, n_features * (1 + len(KINDS))):
@@ -243,7 +242,7 @@ class EnsembleModel:
             return split_reference(inputs)
         return log_levels(inputs), np.broadcast_to(self.home.row, (len(inputs), self.home.row.size))
 
-    def _log_posteriors(self, levels: Numbers, reference: Numbers) -> Numbers:
+    def _log_posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:
         n, wanted = len(levels), {expert.view for expert in self.experts}
         views = expert_views(
             wanted,

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.linear_model import LogisticRegression
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
 
 from .ensemble import MIRRORED_CLASSES, EnsembleModel
 from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
@@ -20,8 +21,6 @@ from .site_reference import KINDS, SiteReference
 from .standardisation import standardisation
 
 _ITERATIONS = 1000
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +124,7 @@ class SiteEnsembleClassifier:
         )
         return self
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         """Return posteriors of front, left, none, right, shape (n, 4).
 
         Parameters
@@ -137,8 +136,8 @@ class SiteEnsembleClassifier:
 
 
 def _with_mirror_images(
-    levels: Numbers, reference: Numbers, codes: NDArray[np.intp]
-) -> tuple[Numbers, Numbers, NDArray[np.intp]]:
+    levels: FloatArray, reference: FloatArray, codes: IndexArray
+) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Append the mirror image of every window, front and none included: no class becomes more frequent."""
     mirrored_reference = mirror_features(reference, SEGMENTS * len(KINDS))
     return (
@@ -148,7 +147,7 @@ def _with_mirror_images(
     )
 
 
-def _fit_expert(recipe: Recipe, seen: Numbers, codes: NDArray[np.intp]) -> Expert:
+def _fit_expert(recipe: Recipe, seen: FloatArray, codes: IndexArray) -> Expert:
     mean, scale = standardisation(seen)
     machine = LogisticRegression(C=1.0 / (recipe.ridge * len(seen)), max_iter=_ITERATIONS)
     machine.fit((seen - mean) / scale, codes)

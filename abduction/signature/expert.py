@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_numbers, read_rows
+from worldstate.ground.typing import FloatArray
 
 from .mirror import SEGMENTS
 from .pattern_features import shape_features
@@ -17,8 +17,6 @@ from .site_reference import KINDS, log_levels
 
 SHAPE, SHAPE_CHANGE = "shape", "shape_change"
 VIEWS = (*KINDS, SHAPE, SHAPE_CHANGE)
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,10 +47,10 @@ class Expert:
     """
 
     view: str
-    mean: Numbers
-    scale: Numbers
-    weights: Numbers
-    intercepts: Numbers
+    mean: FloatArray
+    scale: FloatArray
+    weights: FloatArray
+    intercepts: FloatArray
 
     def __post_init__(self) -> None:
         if self.view not in VIEWS:
@@ -66,7 +64,7 @@ class Expert:
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
 
-    def log_posteriors(self, seen: Numbers) -> Numbers:
+    def log_posteriors(self, seen: FloatArray) -> FloatArray:
         r"""Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4).
 
         .. math:: \ell = \log \mathrm{softmax}\, \big( W (v - \mu) / \sigma + b \big)
@@ -110,7 +108,7 @@ class Expert:
         return cls(view=str(data.get("view")), weights=np.array(rows), **vectors)
 
 
-def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -> dict[str, Numbers]:
+def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
     r"""Return what experts look at, each of shape (n, inputs); what several share is computed once.
 
     .. math:: v = x - r \text{ (mean, median, quiet)}, \qquad v = \phi(x) \text{ (shape)}, \qquad
@@ -150,7 +148,7 @@ def expert_views(wanted: Collection[str], levels: Numbers, reference: Numbers) -
     return views
 
 
-def log_softmax(sums: Numbers) -> Numbers:
+def log_softmax(sums: FloatArray) -> FloatArray:
     r"""Return the rows less the log of their summed exponentials.
 
     .. math:: \ell_c = a_c - \log \sum_{c'} e^{a_{c'}}
@@ -178,7 +176,7 @@ def log_softmax(sums: Numbers) -> Numbers:
     return np.asarray(below - np.log(total(np.exp(below))))
 
 
-def total(values: Numbers) -> Numbers:
+def total(values: FloatArray) -> FloatArray:
     r"""Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand.
 
     .. math:: s_i = \sum_j x_{ij}
@@ -205,7 +203,7 @@ def total(values: Numbers) -> Numbers:
     return np.asarray(np.sort(values, axis=1).sum(axis=1, keepdims=True))
 
 
-def split_reference(X: Numbers) -> tuple[Numbers, Numbers]:
+def split_reference(X: FloatArray) -> tuple[FloatArray, FloatArray]:
     r"""Part windows with a reference behind them into log-levels and references.
 
     .. math:: x = \ln \max(X, 10^{-4})

@@ -1,14 +1,11 @@
 """The mirror image of a feature vector: what the same scene with its sides exchanged would give."""
 
-import numpy as np
-from numpy.typing import NDArray
+from worldstate.ground.typing import FloatArray
 
 SEGMENTS = 2
 
-Numbers = NDArray[np.float64]
 
-
-def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
+def mirror_features(X: FloatArray, segments: int = SEGMENTS) -> FloatArray:
     r"""Return the features of the mirrored scene: azimuths reversed within each segment.
 
     .. math:: \bar x_{s,a} = x_{s, A - 1 - a}
@@ -31,6 +28,7 @@ def mirror_features(X: Numbers, segments: int = SEGMENTS) -> Numbers:
 
     Examples
     --------
+    >>> import numpy as np
     >>> mirror_features(np.array([[1, 2, 3, 4, 5, 6]]))
     array([[3, 2, 1, 6, 5, 4]])
     """

@@ -13,7 +13,8 @@ second method.
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import FloatArray
 
 # As in libsvm: no pair is ever certain, and so no log-likelihood is ever infinite.
 SMALLEST_PROBABILITY = 1e-7
@@ -40,7 +41,7 @@ def class_pairs(n_classes: int) -> list[tuple[int, int]]:
     return list(combinations(range(n_classes), 2))
 
 
-def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]:
+def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
     r"""Return class probabilities, shape (n, classes), positive and summing to one.
 
     .. math:: \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2, \qquad \sum_i p_i = 1
@@ -71,11 +72,11 @@ def couple(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]
     right_side[n_classes] = 1.0
     solution = np.linalg.solve(_optimality_matrix(bounded, n_classes), right_side)[:, :n_classes, 0]
     positive = np.maximum(solution, SMALLEST_PROBABILITY)
-    probabilities: NDArray[np.float64] = positive / positive.sum(axis=1, keepdims=True)
+    probabilities: FloatArray = positive / positive.sum(axis=1, keepdims=True)
     return probabilities
 
 
-def _optimality_matrix(pairwise: NDArray[np.float64], n_classes: int) -> NDArray[np.float64]:
+def _optimality_matrix(pairwise: FloatArray, n_classes: int) -> FloatArray:
     """Bordered quadratic form [[Q, 1], [1', 0]], shape (n, classes + 1, classes + 1)."""
     matrix = np.zeros((len(pairwise), n_classes + 1, n_classes + 1))
     matrix[:, :n_classes, n_classes] = matrix[:, n_classes, :n_classes] = 1.0

@@ -1,14 +1,13 @@
 """The shape of a window in a few numbers: how high, how wide, on which side, rising or falling."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import FloatArray
 
 _SHARPNESS = 4.0
 
-Numbers = NDArray[np.float64]
 
-
-def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
+def shape_features(levels: FloatArray, segments: int = 2) -> FloatArray:
     r"""Return peaks, sides, widths and changes of log-levels over directions, shape (n, 13 * segments + 5).
 
     .. math:: p = \sum_a w_a u_a, \qquad \sigma^2 = \sum_a w_a u_a^2 - p^2, \qquad
@@ -48,7 +47,7 @@ def shape_features(levels: Numbers, segments: int = 2) -> Numbers:
     return np.concatenate([by_segment, change], axis=1)
 
 
-def _columns(levels: Numbers) -> list[Numbers]:
+def _columns(levels: FloatArray) -> list[FloatArray]:
     """Numbers of each stretch, every one of shape (n, segments)."""
     n_directions = levels.shape[2]
     peak, middle = levels.max(axis=2), np.median(levels, axis=2)
@@ -62,7 +61,7 @@ def _columns(levels: Numbers) -> list[Numbers]:
     return [*heights, *sides, levels.std(axis=2), width, np.diff(levels, axis=2).std(axis=2)]
 
 
-def _centroid(levels: Numbers) -> tuple[Numbers, Numbers]:
+def _centroid(levels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and spread of the direction, on [-1, 1], weighted by the levels above their peak's foot."""
     direction = np.linspace(-1.0, 1.0, levels.shape[2])
     weights = np.exp(_SHARPNESS * (levels - levels.max(axis=2, keepdims=True)))
@@ -72,7 +71,7 @@ def _centroid(levels: Numbers) -> tuple[Numbers, Numbers]:
     return position, np.sqrt(np.maximum(square - position**2, 0.0))
 
 
-def _change(first: Numbers, last: Numbers) -> list[Numbers]:
+def _change(first: FloatArray, last: FloatArray) -> list[FloatArray]:
     change = last - first
     peak = last.max(axis=1) - first.max(axis=1)
     return [change.max(axis=1), change.min(axis=1), change.mean(axis=1), peak, change.std(axis=1)]

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.cueing.platt import sigmoid
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_numbers, read_rows
+from worldstate.ground.typing import FloatArray
 
 from .pairwise_coupling import class_pairs, couple
 
@@ -27,8 +28,6 @@ FRONT, LEFT, NONE, RIGHT = range(4)
 EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
 PAIRS = len(class_pairs(len(CLASSES)))
 VECTORS = ("mean", "scale", "intercepts", "slopes", "offsets", "class_prior")
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,13 +67,13 @@ class SignatureModel:
     array([[0.25, 0.25, 0.25, 0.25]])
     """
 
-    mean: Numbers
-    scale: Numbers
-    coefficients: Numbers
-    intercepts: Numbers
-    slopes: Numbers
-    offsets: Numbers
-    class_prior: Numbers
+    mean: FloatArray
+    scale: FloatArray
+    coefficients: FloatArray
+    intercepts: FloatArray
+    slopes: FloatArray
+    offsets: FloatArray
+    class_prior: FloatArray
 
     def __post_init__(self) -> None:
         features = np.size(self.mean)
@@ -116,7 +115,7 @@ class SignatureModel:
         """Training prior in the order of the explanations (left, right, visible, none)."""
         return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
 
-    def decision_values(self, X: ArrayLike) -> Numbers:
+    def decision_values(self, X: ArrayLike) -> FloatArray:
         r"""Return f, shape (n, 6): positive where the first class of the pair is the better one.
 
         .. math:: f_{ij}(x) = w_{ij}^T (x - \mu) / \sigma + b_{ij}
@@ -136,10 +135,10 @@ class SignatureModel:
         Machine Learning 20, 1995.
         """
         features = finite_array("X", X, (None, self.n_features))
-        values: Numbers = (features - self.mean) / self.scale @ self.coefficients.T + self.intercepts
+        values: FloatArray = (features - self.mean) / self.scale @ self.coefficients.T + self.intercepts
         return values
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
 
         .. math:: r_{ij} = 1 / (1 + \exp(A_{ij} f_{ij} + B_{ij})), \qquad
@@ -159,7 +158,7 @@ class SignatureModel:
         """
         return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
 
-    def log_likelihoods(self, X: ArrayLike) -> Numbers:
+    def log_likelihoods(self, X: ArrayLike) -> FloatArray:
         r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
 
         .. math:: \log \ell_c = \log P_c - \log \pi_c
@@ -226,7 +225,7 @@ class SignatureModel:
         return cls(coefficients=np.array(rows), **vectors)
 
 
-def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Numbers:
+def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatArray:
     r"""Return eq. (post) at the training prior for many windows at once, shape (n,).
 
     .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
@@ -254,11 +253,11 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> Number
     """
     posteriors = finite_array("probabilities", probabilities, (None, len(CLASSES)))
     hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]
-    statistic: Numbers = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
+    statistic: FloatArray = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
     return statistic
 
 
-def explanation_ratios(posteriors: Numbers, class_prior: ArrayLike) -> Numbers:
+def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatArray:
     r"""Return log-likelihoods of left, right, visible, none by window, shape (n, 4), nats.
 
     .. math:: \log \ell_c = \log P_c - \log \pi_c
@@ -288,7 +287,7 @@ def explanation_ratios(posteriors: Numbers, class_prior: ArrayLike) -> Numbers:
     return np.asarray(ratios[:, EXPLANATION_COLUMNS])
 
 
-def evidence_of(log_likelihoods: Numbers) -> SignatureEvidence:
+def evidence_of(log_likelihoods: FloatArray) -> SignatureEvidence:
     """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
 
     Parameters

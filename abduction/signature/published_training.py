@@ -7,12 +7,13 @@ they cannot be taken out as plain numbers. The recipe is repeated here on top of
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.svm import SVC
 
 from worldstate.abduction.cueing.platt import fit_sigmoid
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 
 from .mirror import mirror_features as mirror_features
 from .pairwise_coupling import class_pairs
@@ -20,9 +21,6 @@ from .published_signature import CLASSES, FRONT, LEFT, NONE, RIGHT, SignatureMod
 from .standardisation import standardisation
 
 PLATT_FOLDS = 5
-
-Numbers = NDArray[np.float64]
-Labels = NDArray[np.str_]
 
 
 class Classifier(Protocol):
@@ -45,7 +43,7 @@ class Classifier(Protocol):
         """
         ...
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         """Return posteriors of front, left, none, right, shape (n, 4).
 
         Parameters
@@ -134,7 +132,7 @@ class PublishedClassifier:
         )
         return self
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         """Return posteriors of front, left, none, right, shape (n, 4).
 
         Parameters
@@ -144,7 +142,7 @@ class PublishedClassifier:
         """
         return self.model_.predict_proba(X)
 
-    def _fit_sigmoids(self, standard: Numbers, codes: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
+    def _fit_sigmoids(self, standard: FloatArray, codes: IndexArray) -> tuple[FloatArray, FloatArray]:
         fits = []
         for first, second in class_pairs(len(CLASSES)):
             chosen = (codes == first) | (codes == second)
@@ -153,7 +151,7 @@ class PublishedClassifier:
         slopes, offsets = np.array(fits).T
         return slopes, offsets
 
-    def _held_out_decisions(self, standard: Numbers, is_first: NDArray[np.bool_]) -> Numbers:
+    def _held_out_decisions(self, standard: FloatArray, is_first: BoolArray) -> FloatArray:
         """Decision values of machines that did not see the sample, positive for the first class."""
         decisions = np.empty(len(standard))
         fold = self.rng.permutation(len(standard)) % PLATT_FOLDS
@@ -167,7 +165,7 @@ class PublishedClassifier:
         return decisions
 
 
-def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
+def mirror_hazards(X: FloatArray, y: TextArray) -> tuple[FloatArray, TextArray]:
     r"""Append the mirror images of all left and right windows, sides swapped.
 
     .. math:: (x, left) \to (\bar x, right), \qquad (x, right) \to (\bar x, left), \qquad
@@ -199,7 +197,7 @@ def mirror_hazards(X: Numbers, y: Labels) -> tuple[Numbers, Labels]:
     return np.concatenate([X, mirror_features(X[hazard])]), np.concatenate([y, swapped])
 
 
-def checked_labels(y: ArrayLike, n: int) -> Labels:
+def checked_labels(y: ArrayLike, n: int) -> TextArray:
     """Return class names as an array; the sides stand in for each other, the other classes must be there.
 
     Parameters

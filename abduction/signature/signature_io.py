@@ -31,7 +31,7 @@ def signature_from_dict(data: object) -> AnySignature:
     >>> signature_from_dict({"kind": "ensemble"})
     Traceback (most recent call last):
         ...
-    worldstate.ground.errors.InvalidArgumentError: signature: expected an object of classes front, left, none, right
+    worldstate...InvalidArgumentError: signature: expected an object of classes front, left, none, right
     """
     if isinstance(data, Mapping) and data.get("kind") == KIND:
         return EnsembleModel.from_dict(data)

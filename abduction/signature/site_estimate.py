@@ -19,16 +19,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_number, read_numbers
+from worldstate.ground.typing import FloatArray
 
 from .ensemble import EnsembleModel
 from .site_reference import SiteReference, log_levels
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +84,7 @@ class SiteEstimate:
     (array([0., 1.]), 0.1)
     """
 
-    level: Numbers = field()
+    level: FloatArray = field()
     heard_s: float = 0.0
 
     def __post_init__(self) -> None:

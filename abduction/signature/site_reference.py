@@ -7,16 +7,15 @@ window of a junction shares drop out, and a classifier trained elsewhere meets w
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 SMALLEST_LEVEL = 1e-4
 QUIET_SHARE = 0.35
 KINDS = ("mean", "median", "quiet")
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,9 +41,9 @@ class SiteReference:
     array([0.  , 1.39])
     """
 
-    mean: Numbers
-    median: Numbers
-    quiet: Numbers
+    mean: FloatArray
+    median: FloatArray
+    quiet: FloatArray
 
     def __post_init__(self) -> None:
         for name in KINDS:
@@ -53,7 +52,7 @@ class SiteReference:
             object.__setattr__(self, name, value)
 
     @property
-    def row(self) -> Numbers:
+    def row(self) -> FloatArray:
         """The three summaries one after the other, shape (3 * features,): what stands behind a window."""
         return np.concatenate([getattr(self, kind) for kind in KINDS])
 
@@ -93,7 +92,7 @@ class SiteReference:
         return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
 
 
-def log_levels(X: ArrayLike) -> Numbers:
+def log_levels(X: ArrayLike) -> FloatArray:
     r"""Return the natural logarithm of levels, silence held at 1e-4.
 
     .. math:: x = \ln \max(X, 10^{-4})

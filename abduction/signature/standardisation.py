@@ -1,12 +1,11 @@
 """Mean and scale of training inputs."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray
 
 
-def standardisation(inputs: Numbers) -> tuple[Numbers, Numbers]:
+def standardisation(inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
     r"""Return mean and standard deviation of each column; 1 where a column never changes.
 
     .. math:: \mu = \frac1n \sum_i x_i, \qquad \sigma^2 = \frac1n \sum_i (x_i - \mu)^2

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import soundfile
-from numpy.typing import NDArray
 
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import Float32Array
 
 from .riff import data_size
-
-Samples = NDArray[np.float32]
 
 CONTAINERS = ("WAV", "WAVEX", "RF64", "W64", "FLAC")
 # Lossy codecs keep what the ear needs and lose the phase between microphones.
@@ -55,7 +53,7 @@ class AudioSource:
         """Length in seconds."""
         return self.frames / self.sample_rate_hz
 
-    def blocks(self, frames: int = 4800) -> Iterator[Samples]:
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the recording from its start in blocks of `frames` samples; the last may be shorter.
 
         Parameters
@@ -101,7 +99,7 @@ class AudioSource:
         self._seek(self.frames - 1)
         self._read(1)
 
-    def first_second(self) -> Samples:
+    def first_second(self) -> Float32Array:
         """Return the first second, shape (sample_rate_hz, M)."""
         self._seek(0)
         return self._read(self.sample_rate_hz)
@@ -114,9 +112,9 @@ class AudioSource:
         except soundfile.SoundFileError as error:
             raise _cut_short(self.path, self.frames) from error
 
-    def _read(self, frames: int) -> Samples:
+    def _read(self, frames: int) -> Float32Array:
         try:
-            block: Samples = self._file.read(frames, dtype="float32", always_2d=True)
+            block: Float32Array = self._file.read(frames, dtype="float32", always_2d=True)
         except soundfile.SoundFileError as error:
             raise _cut_short(self.path, self.frames) from error
         if len(block) < frames:
@@ -232,7 +230,7 @@ def _cut_short(path: Path, frames: int) -> InputFileError:
     return InputFileError(path, f"cut short or damaged: expected {frames} samples a channel by its header")
 
 
-def _refuse_non_finite(path: Path, block: Samples, start: int) -> None:
+def _refuse_non_finite(path: Path, block: Float32Array, start: int) -> None:
     finite = np.isfinite(block)
     if not finite.all():
         sample, channel = np.argwhere(~finite)[0]

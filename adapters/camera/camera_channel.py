@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import ImageArray
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.sector import Sector
 
@@ -18,8 +18,6 @@ from .miss_rates import MissRates
 from .pinhole import PinholeCamera
 from .video import Video
 from .vision_query import VisionQuery, VisionSettings
-
-Frame = NDArray[np.uint8]
 
 # Health is read this often: a lens that soils or a night that falls takes longer than a frame.
 HEALTH_PERIOD_NS = 400_000_000
@@ -98,7 +96,7 @@ class Watcher:
         self._levels: list[float] = []
         self._found: list[DetectionFrame] = []
 
-    def look(self, stamp_ns: int, frame: Frame) -> None:
+    def look(self, stamp_ns: int, frame: ImageArray) -> None:
         """Take the next frame, in the order of time."""
         self._stamps_ns.append(stamp_ns)
         self._found.append(self._detector.detect(frame))
@@ -121,7 +119,7 @@ class Watcher:
         )
 
 
-def watch(frames: Iterable[tuple[int, Frame]], detector: Detector, rates: MissRates) -> Watched:
+def watch(frames: Iterable[tuple[int, ImageArray]], detector: Detector, rates: MissRates) -> Watched:
     """Run a detector over stamped frames and read the camera's health from the same frames.
 
     Parameters

@@ -6,16 +6,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.schema import read_number, read_numbers
+from worldstate.ground.typing import FloatArray, ImageArray, IntArray
 
 from .degradation import LEVELS, degrade, level_of
 from .image_quality import ImageQuality, image_quality
-
-Frame = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +118,7 @@ class CameraHealth:
         )
 
 
-def learn_health(clean: Iterable[Frame], rng: np.random.Generator) -> CameraHealth:
+def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> CameraHealth:
     """Learn the scale of a camera from clean images, by degrading them itself.
 
     Parameters
@@ -242,8 +240,8 @@ class DegradationLog:
     (0.0, 0.0, 0.5)
     """
 
-    stamps_ns: NDArray[np.int64]
-    degradation: NDArray[np.float64]
+    stamps_ns: IntArray
+    degradation: FloatArray
 
     def __post_init__(self) -> None:
         d = finite_array("degradation", self.degradation, (np.size(self.stamps_ns),))
@@ -257,7 +255,7 @@ class DegradationLog:
 
 
 def degradation_log(
-    frames: Iterable[tuple[int, Frame]],
+    frames: Iterable[tuple[int, ImageArray]],
     health: CameraHealth,
     level: Callable[[Health], float] = lambda health: health.worst,
 ) -> DegradationLog:

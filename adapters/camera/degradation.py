@@ -10,6 +10,7 @@ from scipy.special import ndtri
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import ImageArray
 
 from .opencv import opencv
 
@@ -33,8 +34,6 @@ _NO_BLUR_PX = 0.25
 _WIDE_PX = 4.0
 # Of the staged noise; it ends at 4.3 sigma.
 _QUANTILES = 1 << 16
-
-Frame = NDArray[np.uint8]
 
 
 def strength(family: str, degradation: float) -> float:
@@ -99,7 +98,7 @@ def level_of(family: str, staged: float) -> float:
     return float(np.interp(staged, knots, LEVELS))
 
 
-def degrade(frame: Frame, family: Family, degradation: float, rng: np.random.Generator) -> Frame:
+def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.random.Generator) -> ImageArray:
     r"""Return a frame as a degraded camera would have taken it.
 
     .. math:: y = \mathrm{clip}(\mathrm{round}(a\,(G_\sigma * x) + n)), \qquad n \sim N(0, s^2)
@@ -149,7 +148,7 @@ def degrade(frame: Frame, family: Family, degradation: float, rng: np.random.Gen
     return frame
 
 
-def _blurred(frame: Frame, sigma_px: float, rng: np.random.Generator) -> Frame:
+def _blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> ImageArray:
     """Blur; a wide one on a reduced image, whose pixels are themselves a box of variance (f^2 - 1) / 12."""
     cv2 = opencv()
     if sigma_px < _NO_BLUR_PX:
@@ -163,16 +162,16 @@ def _blurred(frame: Frame, sigma_px: float, rng: np.random.Generator) -> Frame:
     left_px = np.sqrt(sigma_px**2 - (factor**2 - 1) / 12.0) / factor
     # The border is mirrored in its pixel's middle, which in a reduced image lies nearer to the pixel's edge.
     border = cv2.BORDER_REFLECT if factor > 1 else cv2.BORDER_REFLECT_101
-    blurred: Frame = cv2.GaussianBlur(frame, (0, 0), left_px, borderType=border)
+    blurred: ImageArray = cv2.GaussianBlur(frame, (0, 0), left_px, borderType=border)
     return cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR) if factor > 1 else blurred
 
 
-def _darkened(frame: Frame, factor: float, rng: np.random.Generator) -> Frame:
+def _darkened(frame: ImageArray, factor: float, rng: np.random.Generator) -> ImageArray:
     table = np.round(np.arange(256) * factor).astype(np.uint8)
     return table[frame]
 
 
-def _noisy(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
+def _noisy(frame: ImageArray, sigma: float, rng: np.random.Generator) -> ImageArray:
     # Grey levels are whole, so the noise may be too: quantiles looked up, a third of the time of drawing it.
     quantiles = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
     grey = np.rint(sigma * ndtri(quantiles)).astype(np.int16)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import nanoseconds
 
 MAX_BYTES = 64 << 20
@@ -42,14 +42,14 @@ class DetectionFrame:
     (1, array([0]), array([], dtype=int64))
     """
 
-    boxes_px: NDArray[np.float64]
-    scores: NDArray[np.float64]
+    boxes_px: FloatArray
+    scores: FloatArray
     labels: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.labels)
 
-    def select(self, keep: "DetectionFilter") -> NDArray[np.int64]:
+    def select(self, keep: "DetectionFilter") -> IntArray:
         """Return the indices of the boxes that `keep` lets through."""
         heights_px = self.boxes_px[:, 3] - self.boxes_px[:, 1]
         named = np.array([label in keep.labels for label in self.labels], dtype=bool)
@@ -116,7 +116,7 @@ class DetectionLog:
     """
 
     frames: tuple[DetectionFrame, ...]
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: IntArray
     source: str = "detections"
 
     def __post_init__(self) -> None:
@@ -266,7 +266,7 @@ def _list(row: Any, key: str) -> list[Any]:
     return value
 
 
-def _numbers(name: str, values: list[Any]) -> NDArray[np.float64]:
+def _numbers(name: str, values: list[Any]) -> FloatArray:
     # numpy alone would take True and "1" for numbers.
     wrong = next((type(v).__name__ for v in values if type(v) not in (int, float)), None)
     if wrong is not None:

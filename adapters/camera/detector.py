@@ -3,7 +3,8 @@
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import FloatArray, ImageArray, IntArray
 
 from .detections import DetectionFrame
 
@@ -22,12 +23,12 @@ class Detector(Protocol):
     0
     """
 
-    def detect(self, frame: NDArray[np.uint8], /) -> DetectionFrame:
+    def detect(self, frame: ImageArray, /) -> DetectionFrame:
         """Return boxes in pixels, scores in [0, 1] and labels of a frame (height, width, 3), blue first."""
         ...
 
 
-def overlaps(boxes_px: NDArray[np.float64], others_px: NDArray[np.float64]) -> NDArray[np.float64]:
+def overlaps(boxes_px: FloatArray, others_px: FloatArray) -> FloatArray:
     r"""Return the intersection over union of every box with every other one.
 
     .. math:: IoU = |A \cap B| / |A \cup B|
@@ -54,9 +55,7 @@ def overlaps(boxes_px: NDArray[np.float64], others_px: NDArray[np.float64]) -> N
     return np.asarray(np.divide(common, union, out=np.zeros_like(common), where=union > 0))
 
 
-def suppress(
-    boxes_px: NDArray[np.float64], scores: NDArray[np.float64], most_overlap: float
-) -> NDArray[np.int64]:
+def suppress(boxes_px: FloatArray, scores: FloatArray, most_overlap: float) -> IntArray:
     """Return the indices of boxes that no better one overlaps by more, the best first.
 
     Parameters
@@ -88,5 +87,5 @@ def suppress(
     return np.array(kept, dtype=np.int64)
 
 
-def _areas(boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+def _areas(boxes_px: FloatArray) -> FloatArray:
     return np.asarray(np.clip(boxes_px[:, 2:] - boxes_px[:, :2], 0.0, None).prod(axis=1))

@@ -1,10 +1,10 @@
 """Is a change in the image an object or light? An object has an outline, light fades out."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, Float32Array, ImageArray
 
 from .opencv import opencv
 
@@ -13,10 +13,8 @@ _SMOOTHING_PX = 0.7
 # The contrast of a change is the level that it reaches over most of its area.
 _CONTRAST_PERCENTILE = 75.0
 
-Image = NDArray[np.float32]
 
-
-def difference(frame: NDArray[np.uint8], background: NDArray[np.uint8]) -> Image:
+def difference(frame: ImageArray, background: ImageArray) -> Float32Array:
     """Return how far a frame differs from its background, the largest over the colours, (height, width).
 
     Parameters
@@ -44,11 +42,11 @@ def difference(frame: NDArray[np.uint8], background: NDArray[np.uint8]) -> Image
     cv2 = opencv()
     apart = cv2.absdiff(frame, background)
     apart = apart if apart.ndim == 2 else apart.max(axis=2)
-    smooth: Image = cv2.GaussianBlur(apart.astype(np.float32), (0, 0), _SMOOTHING_PX)
+    smooth: Float32Array = cv2.GaussianBlur(apart.astype(np.float32), (0, 0), _SMOOTHING_PX)
     return smooth
 
 
-def outlined_share(apart: Image, region: NDArray[np.bool_], width_px: float) -> float:
+def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> float:
     r"""Return the share of a region's outline that is an edge.
 
     A pixel of the outline counts where, within `width_px` of it, the change rises by its whole contrast over

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter, sobel
 
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Float32Array, ImageArray
 
 # Side of the central part that is looked at, at full resolution: reducing it would hide blur and noise.
 LARGEST_PX = 640
@@ -16,8 +16,6 @@ _GAIN = 6.0
 _MAD_TO_STD = 1.4826
 # Rounding to whole grey levels.
 _QUANTISATION = 1.0 / 12.0
-
-Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class ImageQuality:
     sharpness: float | None
 
 
-def image_quality(frame: NDArray[np.uint8]) -> ImageQuality:
+def image_quality(frame: ImageArray) -> ImageQuality:
     r"""Measure a frame.
 
     The noise is that of the median absolute deviation of a second difference, in which smooth surfaces and
@@ -91,14 +89,14 @@ def image_quality(frame: NDArray[np.uint8]) -> ImageQuality:
     return ImageQuality(float(grey.mean()), noise, _sharpness(grey, noise))
 
 
-def _central_grey(frame: NDArray[np.uint8]) -> Image:
+def _central_grey(frame: ImageArray) -> Float32Array:
     top, left = (max((side - LARGEST_PX) // 2, 0) for side in frame.shape[:2])
     centre = frame[top : top + LARGEST_PX, left : left + LARGEST_PX]
     # One colour: an average over the three would hide part of the noise of each.
     return np.asarray(centre if centre.ndim == 2 else centre[:, :, 1], dtype=np.float32)
 
 
-def _sharpness(grey: Image, noise: float) -> float | None:
+def _sharpness(grey: Float32Array, noise: float) -> float | None:
     fine, fine_noise = _gradient_energy(grey, FINE_PX, noise)
     coarse, coarse_noise = _gradient_energy(grey, COARSE_PX, noise)
     if coarse <= coarse_noise or fine < fine_noise:
@@ -106,7 +104,7 @@ def _sharpness(grey: Image, noise: float) -> float | None:
     return max(fine, 0.0) / coarse
 
 
-def _gradient_energy(grey: Image, scale_px: float, noise: float) -> tuple[float, float]:
+def _gradient_energy(grey: Float32Array, scale_px: float, noise: float) -> tuple[float, float]:
     """Energy of the gradient without, and of, the noise."""
     smooth = gaussian_filter(grey, scale_px)
     total = sum(float(np.mean((sobel(smooth, axis) / 8.0) ** 2)) for axis in (0, 1))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.absence import MissRateTable
 from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
@@ -17,6 +16,7 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.reading import decode_json
 from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
+from worldstate.ground.typing import FloatArray
 
 from .camera_health import CameraHealth, Health
 from .degradation import LEVELS
@@ -29,7 +29,6 @@ MOST_FAMILIES = 100
 PRIOR = 0.5
 
 Rows = tuple[tuple[float, ...], ...]
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +68,7 @@ class FamilyCounts:
         if (misses < 0).any() or (misses > looks).any() or (clutter < 0).any() or (clutter > sectors).any():
             raise InvalidArgumentError("counts: expected 0 <= misses <= looks and 0 <= clutter <= sectors")
 
-    def miss_rates(self, repeats: float = 1.0) -> Numbers:
+    def miss_rates(self, repeats: float = 1.0) -> FloatArray:
         """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation.
 
         A cell that nobody looked at is at one half, as far as its neighbours let it: not known is neither
@@ -84,7 +83,7 @@ class FamilyCounts:
         weight = looks + 2.0 * PRIOR
         return isotonic_grid((misses + PRIOR) / weight, weight)
 
-    def interval(self, repeats: float = 1.0) -> tuple[Numbers, Numbers]:
+    def interval(self, repeats: float = 1.0) -> tuple[FloatArray, FloatArray]:
         """Return the 95 % limits of each cell's own Beta posterior, two of shape (bins, levels)."""
         from scipy.stats import beta
 
@@ -93,7 +92,7 @@ class FamilyCounts:
         return beta.ppf(0.025, a, b), beta.ppf(0.975, a, b)
 
     @property
-    def clutter_rates(self) -> Numbers:
+    def clutter_rates(self) -> FloatArray:
         """P(a false detection in a query sector) at each level, shape (levels,), in (0, 1)."""
         return (np.array(self.clutter) + PRIOR) / (np.array(self.sectors) + 2.0 * PRIOR)
 
@@ -203,7 +202,7 @@ class MissRates:
         except InvalidArgumentError as error:
             raise InputFileError(source, str(error)) from error
 
-    def _table(self, beta: Numbers) -> MissRateTable:
+    def _table(self, beta: FloatArray) -> MissRateTable:
         edges = np.array(self.azimuth_deg)
         middles = (edges[1:] + edges[:-1]) / 2.0
         knots = [0.0, *middles.tolist(), float(edges[-1])]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 
 from .detections import DetectionFrame
 from .edge_sharpness import difference, outlined_share
@@ -114,7 +115,7 @@ class MotionDetector:
         self._background = self._make_background()
         self._seen = 0
 
-    def detect(self, frame: NDArray[np.uint8], /) -> DetectionFrame:
+    def detect(self, frame: ImageArray, /) -> DetectionFrame:
         """Return what moves; the score is the share of its box that does.
 
         Raises
@@ -142,26 +143,24 @@ class MotionDetector:
         model.setVarMin(least / MOG2_VARIANCES)
         return model
 
-    def _reduced(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _reduced(self, frame: ImageArray) -> ImageArray:
         height, width = frame.shape[:2]
         if width <= self.settings.width_px:
             return frame
         size = (self.settings.width_px, max(round(height * self.settings.width_px / width), 1))
-        reduced: NDArray[np.uint8] = self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
+        reduced: ImageArray = self._cv2.resize(frame, size, interpolation=self._cv2.INTER_AREA)
         return reduced
 
-    def _moving(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _moving(self, frame: ImageArray) -> ImageArray:
         """Mask of what moves: specks removed, parts of one object joined."""
         mask = self._background.apply(frame)
         speck = np.ones((3, 3), dtype=np.uint8)
         joint = np.ones((frame.shape[1] // 80 * 2 + 1,) * 2, dtype=np.uint8)
         mask = self._cv2.morphologyEx(mask, self._cv2.MORPH_OPEN, speck)
-        joined: NDArray[np.uint8] = self._cv2.morphologyEx(mask, self._cv2.MORPH_CLOSE, joint)
+        joined: ImageArray = self._cv2.morphologyEx(mask, self._cv2.MORPH_CLOSE, joint)
         return joined
 
-    def _objects(
-        self, frame: NDArray[np.uint8], mask: NDArray[np.uint8], scale: NDArray[np.float64]
-    ) -> DetectionFrame:
+    def _objects(self, frame: ImageArray, mask: ImageArray, scale: FloatArray) -> DetectionFrame:
         _, labels, stats, _ = self._cv2.connectedComponentsWithStats(mask, connectivity=8)
         share = stats[:, 4] / mask.size
         kept = (share >= self.settings.min_area) & (share <= self.settings.max_area)
@@ -173,9 +172,7 @@ class MotionDetector:
         boxes = np.stack([left, top, left + width, top + height], axis=1) * scale
         return DetectionFrame(boxes, area / (width * height), (self.settings.label,) * numbers.size)
 
-    def _has_outline(
-        self, frame: NDArray[np.uint8], labels: NDArray[np.int32], numbers: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
+    def _has_outline(self, frame: ImageArray, labels: NDArray[np.int32], numbers: IntArray) -> BoolArray:
         """Tell which regions are objects and not light."""
         apart = difference(frame, self._background.getBackgroundImage())
         width_px = max(self.settings.edge_width * frame.shape[1], NARROWEST_EDGE_PX)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
+from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
 
 from .detections import MAX_BOXES_A_FRAME, DetectionFrame
 from .detector import suppress
@@ -19,8 +20,6 @@ MAX_BYTES = 2 << 30
 # What a letterbox is filled up with.
 GREY = 114
 
-Floats = NDArray[np.float64]
-
 
 class Session(Protocol):
     """What is used of an `onnxruntime.InferenceSession`."""
@@ -29,7 +28,7 @@ class Session(Protocol):
         """Descriptions of the inputs."""
         ...
 
-    def run(self, output_names: None, feed: dict[str, NDArray[np.float32]], /) -> Sequence[Any]:
+    def run(self, output_names: None, feed: dict[str, Float32Array], /) -> Sequence[Any]:
         """All outputs."""
         ...
 
@@ -103,7 +102,7 @@ class OnnxDetector:
             side if isinstance(side, int) and side > 0 else settings.size_px for side in inputs[0].shape[2:]
         )
 
-    def detect(self, frame: NDArray[np.uint8], /) -> DetectionFrame:
+    def detect(self, frame: ImageArray, /) -> DetectionFrame:
         """Return the model's boxes in pixels of the frame.
 
         Raises
@@ -119,7 +118,7 @@ class OnnxDetector:
         limits = np.array([frame.shape[1], frame.shape[0]] * 2, dtype=np.float64)
         return self._best(np.clip(boxes / scale, 0.0, limits), scores, classes)
 
-    def _letterbox(self, frame: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
+    def _letterbox(self, frame: ImageArray) -> tuple[Float32Array, float]:
         cv2 = opencv()
         height, width = frame.shape[:2]
         scale = min(self._size[0] / height, self._size[1] / width)
@@ -129,7 +128,7 @@ class OnnxDetector:
         planes = np.ascontiguousarray(square[:, :, ::-1].transpose(2, 0, 1), dtype=np.float32)
         return planes[None] / np.float32(255.0), scale
 
-    def _best(self, boxes: Floats, scores: Floats, classes: NDArray[np.int64]) -> DetectionFrame:
+    def _best(self, boxes: FloatArray, scores: FloatArray, classes: IntArray) -> DetectionFrame:
         kept = np.flatnonzero(scores >= self.settings.min_score)
         kept = kept[np.argsort(-scores[kept], kind="stable")][: 10 * MAX_BOXES_A_FRAME]
         # Boxes of different classes never suppress each other: each class lies in a plane of its own.
@@ -178,7 +177,7 @@ def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
         raise InputFileError(name, f"expected an ONNX detector, it does not open: {error}") from error
 
 
-def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, FloatArray, IntArray]:
     r"""Turn the raw output of a YOLO model into boxes.
 
     Three forms are told apart by their shape, with C classes and n candidates: (1, 4 + C, n), centre and size
@@ -225,14 +224,14 @@ def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[Floats, Floa
     raise InvalidArgumentError(f"output: expected {expected} for {classes} classes, got {array.shape}")
 
 
-def _from_centres(centres: Floats, per_class: Floats) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def _from_centres(centres: FloatArray, per_class: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     half = centres[:, 2:] / 2
     boxes = np.concatenate([centres[:, :2] - half, centres[:, :2] + half], axis=1)
     best = per_class.argmax(axis=1)
     return boxes, np.clip(per_class.max(axis=1), 0.0, 1.0), best.astype(np.int64)
 
 
-def _from_corners(rows: Floats, classes: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def _from_corners(rows: FloatArray, classes: int) -> tuple[FloatArray, FloatArray, IntArray]:
     found = rows[:, 5].astype(np.int64)
     if ((found < 0) | (found >= classes)).any():
         raise InvalidArgumentError(f"output: expected classes 0 to {classes - 1}")

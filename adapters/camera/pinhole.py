@@ -4,14 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
-
-Angles = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +84,7 @@ class PinholeCamera:
         """Azimuths of the right and the left edge of the image, in `base_link` at the nominal range."""
         return float(self.azimuth(self.width_px)), float(self.azimuth(0.0))
 
-    def azimuth(self, column_px: ArrayLike) -> Angles:
+    def azimuth(self, column_px: ArrayLike) -> FloatArray:
         """Return the azimuth in `base_link` of an image column.
 
         Parameters
@@ -101,7 +100,7 @@ class PinholeCamera:
         column = np.asarray(column_px, dtype=np.float64)
         return self._to_base_link(np.arctan(self._slope * (1.0 - 2.0 * column / self.width_px)))
 
-    def column(self, azimuth_rad: ArrayLike) -> NDArray[np.float64]:
+    def column(self, azimuth_rad: ArrayLike) -> FloatArray:
         """Return the image column of an azimuth in `base_link`: the inverse of `azimuth`.
 
         Parameters
@@ -118,7 +117,7 @@ class PinholeCamera:
         ahead = np.where(np.abs(off_axis) < math.pi / 2, off_axis, np.nan)
         return np.asarray(0.5 * self.width_px * (1.0 - np.tan(ahead) / self._slope))
 
-    def off_axis(self, azimuth_rad: ArrayLike) -> Angles:
+    def off_axis(self, azimuth_rad: ArrayLike) -> FloatArray:
         """Return the azimuth off the optical axis, at the camera, of an azimuth in `base_link`, (-pi, pi]."""
         azimuth = np.asarray(azimuth_rad, dtype=np.float64)
         x, y, _ = self.position_m
@@ -128,7 +127,7 @@ class PinholeCamera:
         seen = np.arctan2(reach * np.sin(azimuth) - y, reach * np.cos(azimuth) - x)
         return np.asarray(wrap_angle(np.asarray(seen - self.yaw_rad)))
 
-    def sees(self, azimuth_rad: ArrayLike) -> NDArray[np.bool_]:
+    def sees(self, azimuth_rad: ArrayLike) -> BoolArray:
         """Tell whether an azimuth in `base_link` lies between the edges of the image."""
         return np.asarray(np.abs(self.off_axis(azimuth_rad)) <= math.atan(self._slope))
 
@@ -183,7 +182,7 @@ class PinholeCamera:
     def _slope(self) -> float:
         return math.cos(self.pitch_rad) * math.tan(self.half_angle_rad)
 
-    def _to_base_link(self, off_axis_rad: Angles) -> Angles:
+    def _to_base_link(self, off_axis_rad: FloatArray) -> FloatArray:
         seen = off_axis_rad + self.yaw_rad
         x = self.position_m[0] + self.nominal_range_m * np.cos(seen)
         y = self.position_m[1] + self.nominal_range_m * np.sin(seen)

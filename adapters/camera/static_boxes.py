@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
+from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.ground.values import nanoseconds
 
 from .detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
@@ -48,9 +48,7 @@ class ParkedRule:
         in_range("share", self.share, 0.0, 1.0, open_low=True)
 
 
-def parked(
-    log: DetectionLog, frame: int, boxes_px: NDArray[np.float64], rule: ParkedRule
-) -> NDArray[np.bool_]:
+def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule) -> BoolArray:
     """Tell which boxes of `frame` have stood still, from that frame and earlier ones alone.
 
     Parameters
@@ -89,7 +87,7 @@ def parked(
 
 def kept_and_parked(
     log: DetectionLog, frame: int, keep: DetectionFilter, rule: ParkedRule
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+) -> tuple[IntArray, BoolArray]:
     """Return the indices of the boxes of `frame` that count, and which of those are parked.
 
     Parameters
@@ -115,9 +113,7 @@ def kept_and_parked(
     return kept, parked(log, frame, here.boxes_px[kept], rule)
 
 
-def _held(
-    earlier_px: NDArray[np.float64], boxes_px: NDArray[np.float64], tolerance_px: float
-) -> NDArray[np.bool_]:
+def _held(earlier_px: FloatArray, boxes_px: FloatArray, tolerance_px: float) -> BoolArray:
     """Which of `boxes_px` (n, 4) some earlier box was at the place of, shape (n,)."""
     distances = np.abs(boxes_px[:, None, :] - earlier_px[None, :, :])
     return np.asarray(np.any(np.all(distances <= tolerance_px, axis=2), axis=1))

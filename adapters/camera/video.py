@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import ImageArray
 
 from .detections import MAX_FRAMES
 from .opencv import opencv
@@ -16,8 +14,6 @@ from .opencv import opencv
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
 MAX_SIDE_PX = 8192
-
-Frame = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +38,7 @@ class Video:
     frame_rate_hz: float
     count: int
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[ImageArray]:
         """Yield frames of shape (height, width, 3), uint8, blue first, from the beginning.
 
         Raises

@@ -5,12 +5,12 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Bearing, Sighting
 from worldstate.measurement.protocols import Side
@@ -228,7 +228,7 @@ class VisionQuery:
 
 def moving_boxes(
     log: DetectionLog, stamps_ns: Collection[int], settings: VisionSettings | None = None
-) -> list[NDArray[np.float64]]:
+) -> list[FloatArray]:
     """Return the moving boxes that count, of the frame at each stamp.
 
     Parameters

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
@@ -14,6 +13,7 @@ from worldstate.adapters.files.csv_rows import read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .feature_table import FeatureTable
 from .ovad_layout import AUDIO_NAME
@@ -82,7 +82,7 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
     return [_labelled(name, root, line, row) for line, row in rows]
 
 
-def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[NDArray[np.float64]]:
+def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[FloatArray]:
     """Yield the published feature of each window, shape (60,).
 
     Parameters
@@ -107,7 +107,7 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
             yield published_feature(_last_second(source, window), array, source.sample_rate_hz)
 
 
-def feature_table(windows: list[LabelledWindow], features: list[NDArray[np.float64]]) -> FeatureTable:
+def feature_table(windows: list[LabelledWindow], features: list[FloatArray]) -> FeatureTable:
     """Return windows and features, in the same order, as a table.
 
     Parameters
@@ -128,7 +128,7 @@ def feature_table(windows: list[LabelledWindow], features: list[NDArray[np.float
     return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames)
 
 
-def _last_second(source: AudioSource, window: LabelledWindow) -> NDArray[np.float32]:
+def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
     """Return the second before the end of the window, shape (n, M)."""
     rate = source.sample_rate_hz
     end = source.frames if window.end_s is None else round(window.end_s * rate)

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.files.csv_rows import read_rows
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 
 N_FEATURES = 60
 FEATURE_COLUMNS = tuple(f"feat{i}" for i in range(N_FEATURES))
@@ -51,32 +51,32 @@ class FeatureTable:
     (2, array(['DB1/1'], dtype='<U5'))
     """
 
-    features: NDArray[np.float64]
-    labels: NDArray[np.str_]
-    ids: NDArray[np.str_]
-    environments: NDArray[np.str_]
-    recordings: NDArray[np.str_]
+    features: FloatArray
+    labels: TextArray
+    ids: TextArray
+    environments: TextArray
+    recordings: TextArray
     t0_frames: tuple[int | None, ...]
 
     def __len__(self) -> int:
         return len(self.labels)
 
     @property
-    def recording_keys(self) -> NDArray[np.str_]:
+    def recording_keys(self) -> TextArray:
         """Environment and recording of each window, as ``SA1/34``: what splits and overlaps go by."""
         return np.char.add(np.char.add(self.environments, "/"), self.recordings)
 
     @property
-    def hazards(self) -> NDArray[np.bool_]:
+    def hazards(self) -> BoolArray:
         """Where a window is labelled left or right."""
         return np.isin(self.labels, ("left", "right"))
 
     @property
-    def hazard_free(self) -> NDArray[np.bool_]:
+    def hazard_free(self) -> BoolArray:
         """Where a window is labelled none."""
         return np.asarray(self.labels == "none")
 
-    def select(self, chosen: NDArray[np.bool_]) -> "FeatureTable":
+    def select(self, chosen: BoolArray) -> "FeatureTable":
         """Return the rows where `chosen` is true."""
         kept = np.flatnonzero(chosen)
         return FeatureTable(
@@ -121,12 +121,12 @@ class FeatureTable:
         """
         return self._not_empty(~self._of_recordings(ids), "expected a window that is not listed")
 
-    def _not_empty(self, chosen: NDArray[np.bool_], expected: str) -> "FeatureTable":
+    def _not_empty(self, chosen: BoolArray, expected: str) -> "FeatureTable":
         if not chosen.any():
             raise InvalidArgumentError(f"ids: {expected}, found none")
         return self.select(chosen)
 
-    def _of_recordings(self, ids: Collection[str]) -> NDArray[np.bool_]:
+    def _of_recordings(self, ids: Collection[str]) -> BoolArray:
         keys = self.recording_keys
         return np.isin(keys, keys[np.isin(self.ids, list(ids))])
 

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Literal, TypeGuard, final, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
 from worldstate.adapters.files.csv_rows import read_rows
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
 from .ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
@@ -204,7 +204,7 @@ def read_id_list(path: str | Path) -> frozenset[str]:
     return frozenset(ids)
 
 
-def to_base_link(ovad_azimuth_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_base_link(ovad_azimuth_rad: FloatArray) -> FloatArray:
     """Turn azimuths that grow to the right, as OVAD counts them, into left-positive ones.
 
     Parameters

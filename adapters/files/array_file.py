@@ -8,10 +8,10 @@ from xml.sax.saxutils import quoteattr
 import defusedxml.ElementTree as SafeElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 from .atomic import write_text
 
@@ -131,16 +131,16 @@ def _coordinate(path: Path, number: int, axis: str, text: str | None) -> float:
     return value
 
 
-def _check_aperture(path: Path, positions_m: NDArray[np.float64]) -> None:
+def _check_aperture(path: Path, positions_m: FloatArray) -> None:
     aperture_m = float(np.ptp(positions_m, axis=0).max())
     if aperture_m > MAX_APERTURE_M:
         problem = f"expected positions in metres, got an array {aperture_m:g} wide: millimetres?"
         raise InputFileError(path, problem)
 
 
-def _to_base_link(in_file: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_base_link(in_file: FloatArray) -> FloatArray:
     return in_file[:, [2, 0, 1]] * [1.0, -1.0, 1.0] + 0.0
 
 
-def _to_file(in_base_link: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_file(in_base_link: FloatArray) -> FloatArray:
     return in_base_link[:, [1, 2, 0]] * [-1.0, 1.0, 1.0] + 0.0

@@ -14,17 +14,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 from .engine_line import HarmonicTrack
 from .pass_by import PARAMETERS, PassBy, fit_pass_by, radial_speed_gradient, radial_speed_m_s
-
-FloatArray = NDArray[np.float64]
 
 # A drifting engine: up to a cubic in time, which has as many parameters as the S-curve.
 DRIFT_DEGREES = (1, 2, 3)

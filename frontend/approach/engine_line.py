@@ -11,13 +11,14 @@ Sources: at the head of `comb` and `lines`.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import signal
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
 
-from .harmonic_sum import ZERO_PADDING, FloatArray, HarmonicSettings, best_path, spectrum_and_floor
+from .harmonic_sum import ZERO_PADDING, HarmonicSettings, best_path, spectrum_and_floor
 from .partials import Fundamental, Windows, measure_fundamental
 
 __all__ = ["HarmonicSettings", "HarmonicTrack", "track_fundamental"]
@@ -59,7 +60,7 @@ class HarmonicTrack:
     time_s: FloatArray
     frequency_hz: FloatArray
     variance_hz2: FloatArray
-    lines: NDArray[np.intp]
+    lines: IndexArray
     misfit: FloatArray
     level_db: FloatArray
     windows: int

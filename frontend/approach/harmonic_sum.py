@@ -14,12 +14,10 @@ spectrum and a maximum likelihood estimate", 1969; the track by A. J. Viterbi's 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from worldstate.ground.checks import in_range
-
-FloatArray = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray, IndexArray
 
 ZERO_PADDING = 4
 # Median of an exponential variable over its mean: from a median of powers to the noise power.
@@ -179,7 +177,7 @@ def _comb_evidence(
     return evidence
 
 
-def _viterbi(evidence: FloatArray, reach: int) -> NDArray[np.intp]:
+def _viterbi(evidence: FloatArray, reach: int) -> IndexArray:
     """Index of the best path whose steps are at most `reach`; a full step costs one nat."""
     offsets = np.arange(-reach, reach + 1)
     cost = (offsets / reach) ** 2

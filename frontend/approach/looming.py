@@ -27,10 +27,11 @@ D. Lee, A theory of visual control of braking based on information about time-to
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 MIN_POINTS = 4
@@ -155,7 +156,7 @@ class _Line:
     covariance: float
 
 
-def _fit_line(times: NDArray[np.float64], values: NDArray[np.float64], scale: NDArray[np.float64]) -> _Line:
+def _fit_line(times: FloatArray, values: FloatArray, scale: FloatArray) -> _Line:
     """Fit a line whose errors are in proportion to `scale`: closed form of weighted least squares."""
     weights = scale**-2.0
     s0, s1, s2 = float(weights.sum()), float(weights @ times), float(weights @ times**2)

@@ -18,9 +18,10 @@ Source: the variance is the first-order perturbation of the windowed maximum of 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .harmonic_sum import ZERO_PADDING, FloatArray, HarmonicSettings
+from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
+
+from .harmonic_sum import ZERO_PADDING, HarmonicSettings
 
 # Largest correction, in resolutions 1 / window, that one Newton step may make to a tooth.
 REACH = 0.75
@@ -50,7 +51,7 @@ class Fundamental:
 
     frequency_hz: FloatArray
     variance_hz2: FloatArray
-    lines: NDArray[np.intp]
+    lines: IndexArray
     misfit: FloatArray
     power: FloatArray
 
@@ -138,7 +139,7 @@ def measure_fundamental(
 
 def _tooth(
     windows: Windows,
-    demodulated: NDArray[np.complex128],
+    demodulated: Complex128Array,
     expected_hz: FloatArray,
     settings: HarmonicSettings,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -158,7 +159,7 @@ def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
     return np.asarray(windows.floor[np.arange(len(bins)), np.minimum(bins, windows.floor.shape[1] - 1)])
 
 
-def _newton_shift(demodulated: NDArray[np.complex128], n: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Newton step from d = 0, rad per sample, to the maximum of |sum z exp(-j d n)|^2, and its height."""
     s0, s1, s2 = (demodulated @ np.stack([np.ones_like(n), n, n**2], axis=1)).T
     height = np.abs(s0) ** 2
@@ -177,7 +178,7 @@ def _line_variance(window: FloatArray, n: FloatArray) -> float:
 
 
 def _combined(
-    frequency: FloatArray, variance: FloatArray, power: FloatArray, teeth: NDArray[np.intp]
+    frequency: FloatArray, variance: FloatArray, power: FloatArray, teeth: IndexArray
 ) -> Fundamental:
     """Weigh all teeth, (K, H), into one fundamental per window."""
     weight = 1.0 / variance

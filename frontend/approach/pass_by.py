@@ -15,10 +15,9 @@ Source: P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
 
-FloatArray = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray
 
 SLOWEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 0.3, 300.0
 # Starting points of the fit: places of the closest approach along the track, speeds and ranges.

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
-from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.frontend.spectra.spectra import finite_complex
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import ComplexArray, FloatArray
 from worldstate.ground.values import wrap_angle
 
 FEWEST_SAMPLES = 8
@@ -136,7 +137,7 @@ def _coarse_peak(y: ComplexArray, rate: float, low: float, high: float) -> float
 
 
 def climb(
-    y: NDArray[np.float64] | ComplexArray,
+    y: FloatArray | ComplexArray,
     omega: float,
     bounds: tuple[float, float] = (-np.inf, np.inf),
     tolerance: float = 1e-7,
@@ -179,7 +180,7 @@ def climb(
     >>> round(omega, 9), round(abs(amplitude), 6)
     (1.0, 1.0)
     """
-    n: NDArray[np.float64] = np.arange(len(y), dtype=np.float64) - 0.5 * (len(y) - 1)
+    n: FloatArray = np.arange(len(y), dtype=np.float64) - 0.5 * (len(y) - 1)
     reach = np.pi / len(y)
     for _ in range(steps):
         step, fit = _step(y, omega, n)
@@ -223,8 +224,8 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
 
 
 def _step(
-    y: NDArray[np.float64] | ComplexArray, omega: float, n: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64] | ComplexArray]:
+    y: FloatArray | ComplexArray, omega: float, n: FloatArray
+) -> tuple[float, FloatArray | ComplexArray]:
     """Least-squares step in frequency, the amplitude being refitted along with it (variable projection).
 
     Everything is a product of few rows: the tone's H, its derivative by omega, and y.
@@ -245,9 +246,7 @@ def _step(
     return float((image @ rest).real) / size if size > 0.0 else 0.0, fit
 
 
-def _rows(
-    y: NDArray[np.float64] | ComplexArray, omega: float, n: NDArray[np.float64]
-) -> NDArray[np.float64] | ComplexArray:
+def _rows(y: FloatArray | ComplexArray, omega: float, n: FloatArray) -> FloatArray | ComplexArray:
     """Columns of H, their derivatives by omega, and y: (3, n) complex, or (5, n) real."""
     wave = tone_wave(omega, len(y))
     if np.iscomplexobj(y):
@@ -261,7 +260,7 @@ def _rows(
     return rows
 
 
-def _tone(y: NDArray[np.float64] | ComplexArray, omega: float, amplitude: complex, rate: float) -> Tone:
+def _tone(y: FloatArray | ComplexArray, omega: float, amplitude: complex, rate: float) -> Tone:
     complex_signal, count, size = np.iscomplexobj(y), len(y), abs(amplitude)
     model = amplitude * tone_wave(omega, count)
     residual = y - (model if complex_signal else model.real)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -21,6 +20,7 @@ from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
 from worldstate.frontend.spectra.decimator import Decimator
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.ground.values import NotUsable
 
 from .harmonic_sum import MEDIAN_OF_EXPONENTIAL
@@ -122,10 +122,10 @@ class ToneStage:
         self._rate = self._decimator.rate_hz
         self._n_pushed = 0
         self._n_out = 0
-        self._heard: NDArray[np.float64] = np.zeros(_window(window_s * sample_rate_hz, self._decimator))
+        self._heard: FloatArray = np.zeros(_window(window_s * sample_rate_hz, self._decimator))
         self._spectrum = _Spectrum(len(self._heard), self._rate, band_hz)
 
-    def push(self, samples: NDArray[np.float32], mask: ChannelMask) -> None:
+    def push(self, samples: Float32Array, mask: ChannelMask) -> None:
         r"""Take the samples of a hop (n, M), of which the microphones of a mask count.
 
         .. math:: y[m] = \sum_n h[n]\, \frac1{|C|} \sum_{i \in C} x_i[m D + n]
@@ -183,7 +183,7 @@ class ToneStage:
         frequency = omega * self._rate / (2.0 * np.pi)
         return ToneReading(frequency, std, snr, 0.5 * abs(amplitude) ** 2, self._age_s())
 
-    def _mean_of(self, keep: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _mean_of(self, keep: BoolArray) -> tuple[Float32Array, BoolArray]:
         """Weights of the nearest living microphones; of the nearest, where none lives."""
         living = self._nearest[keep[self._nearest]] if keep.any() else self._nearest
         chosen = living[: self._n_channels]
@@ -221,15 +221,15 @@ class _Spectrum:
         self.omega_range = (low, high)
         self._band = slice(int(np.ceil(low / self._step)), int(high / self._step) + 1)
 
-    def offset(self, sound: NDArray[np.float64]) -> float:
+    def offset(self, sound: FloatArray) -> float:
         """Mean under the window, to which no tone of a few periods contributes."""
         return float(self._window @ sound) / float(self._window.sum())
 
-    def power(self, sound: NDArray[np.float64]) -> NDArray[np.float64]:
+    def power(self, sound: FloatArray) -> FloatArray:
         spectrum = scipy.fft.rfft(sound * self._window, self._size)
         return np.asarray(np.square(spectrum.real) + np.square(spectrum.imag))
 
-    def peak(self, power: NDArray[np.float64]) -> float:
+    def peak(self, power: FloatArray) -> float:
         """Radians a sample where the power stands highest over that of its block."""
         inside = power[self._band]
         width = min(_PADDING * _BLOCK, len(inside))
@@ -241,7 +241,7 @@ class _Spectrum:
         near = np.log(power[index - 1 : index + 2] + _least(power))
         return self._step * (index + _vertex(float(near[0]), float(near[1]), float(near[2])))
 
-    def floor_near(self, power: NDArray[np.float64], omega: float) -> float:
+    def floor_near(self, power: FloatArray, omega: float) -> float:
         """Mean square of white noise as strong as that around a line."""
         centre = round(omega / self._step)
         inner, outer = (_PADDING * r for r in _RING)
@@ -257,6 +257,6 @@ def _vertex(left: float, middle: float, right: float) -> float:
     return min(max(0.5 * (left - right) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
 
 
-def _least(power: NDArray[np.float64]) -> float:
+def _least(power: FloatArray) -> float:
     """Noise that single precision makes by itself."""
     return float(np.finfo(np.float32).eps ** 2 * power.max()) + np.finfo(np.float64).tiny

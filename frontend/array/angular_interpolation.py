@@ -18,14 +18,15 @@ N. J. Higham, "Analysis of the Cholesky decomposition of a semi-definite matrix"
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
 # What no direction's power is missed by, relative to the largest that there can be: single precision's own.
 _TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nodes:
+class AngularInterpolation:
     """Directions that are computed, and how the others follow.
 
     Parameters
@@ -40,17 +41,17 @@ class Nodes:
     Two microphones: power is a constant and a wave, so that three directions say it all.
 
     >>> phase = np.linspace(-1.5, 1.5, 31)
-    >>> nodes = Nodes.of(np.stack([np.exp(1j * phase), np.exp(-1j * phase)])[None])
+    >>> nodes = AngularInterpolation.of(np.stack([np.exp(1j * phase), np.exp(-1j * phase)])[None])
     >>> power = 1.0 + 0.5 * np.cos(2 * phase + 0.3)
     >>> len(nodes.index), bool(np.allclose(power[nodes.index] @ nodes.spread, power))
     (3, True)
     """
 
-    index: NDArray[np.intp]
-    spread: NDArray[np.float64]
+    index: IndexArray
+    spread: FloatArray
 
     @classmethod
-    def of(cls, vectors: NDArray[np.complex128]) -> "Nodes | None":
+    def of(cls, vectors: Complex128Array) -> "AngularInterpolation | None":
         r"""Choose for steering vectors (bins, M, directions); None where more than half would be needed.
 
         .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta), \qquad s = G_{NN}^{-1} G_{N\theta}
@@ -64,7 +65,7 @@ class Nodes:
 
         Returns
         -------
-        Nodes or None
+        AngularInterpolation or None
             None where more than half of the directions would be needed.
 
         References
@@ -87,7 +88,7 @@ class Nodes:
         return None
 
 
-def _kernel(vectors: NDArray[np.complex128], index: int) -> NDArray[np.float64]:
+def _kernel(vectors: Complex128Array, index: int) -> FloatArray:
     """G between one direction and all, (directions,)."""
     inner = (vectors[:, None, :, index].conj() @ vectors)[:, 0]
     return np.asarray((np.square(inner.real) + np.square(inner.imag)).sum(axis=0))

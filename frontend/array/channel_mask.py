@@ -9,7 +9,8 @@ windows may hold hops of different masks.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import BoolArray, Complex64Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +29,7 @@ class ChannelMask:
     (3, 1.778, 2.0)
     """
 
-    keep: NDArray[np.bool_]
+    keep: BoolArray
 
     @classmethod
     def all_of(cls, n_channels: int) -> "ChannelMask":
@@ -67,7 +68,7 @@ class ChannelMask:
         whole, kept = len(self.keep), max(self.n_kept, 2)
         return whole * (whole - 1) / (kept * (kept - 1))
 
-    def silence(self, spectra: NDArray[np.complex64]) -> None:
+    def silence(self, spectra: Complex64Array) -> None:
         """Set the channels left out to zero in place, (..., M).
 
         ``X_m = 0`` where microphone m does not count.
@@ -84,7 +85,7 @@ class ChannelMask:
         if not self.is_whole:
             spectra[..., ~self.keep] = 0.0
 
-    def cross(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def cross(self, matrices: Complex64Array) -> Complex64Array:
         """Return cross-spectra (..., M, M) without the channels left out; the same array if there are none.
 
         ``R'_ij = k_i k_j R_ij`` with k one for the channels kept and else zero.

@@ -8,8 +8,8 @@ u' = 2 (u . a) a - u if the axis is level.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 from .microphone_array import MicrophoneArray
@@ -18,7 +18,7 @@ from .microphone_array import MicrophoneArray
 _LEVEL = 1e-6
 
 
-def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
+def mirror_reflection(array: MicrophoneArray) -> FloatArray | NotUsable:
     r"""Matrix that turns a horizontal direction into its twin, shape (3, 3).
 
     .. math:: T = I - 2 n n^T \text{ (planar)}, \qquad T = 2 a a^T - I \text{ (linear, level)}
@@ -43,7 +43,7 @@ def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    >>> twin_reflection(array).round(3) + 0.0
+    >>> mirror_reflection(array).round(3) + 0.0
     array([[-1.,  0.,  0.],
            [ 0.,  1.,  0.],
            [ 0.,  0.,  1.]])
@@ -62,7 +62,7 @@ def twin_reflection(array: MicrophoneArray) -> NDArray[np.float64] | NotUsable:
     return np.asarray(2.0 * np.outer(axis, axis) - np.eye(3))
 
 
-def twin_azimuth_rad(reflection: NDArray[np.float64] | NotUsable, azimuth_rad: float) -> float | NotUsable:
+def mirror_azimuth_rad(reflection: FloatArray | NotUsable, azimuth_rad: float) -> float | NotUsable:
     r"""Azimuth that sounds the same as this one, in (-pi, pi].
 
     .. math:: \theta' = \mathrm{atan2}(u'_y, u'_x), \qquad u' = T\, (\cos\theta, \sin\theta, 0)^T
@@ -70,7 +70,7 @@ def twin_azimuth_rad(reflection: NDArray[np.float64] | NotUsable, azimuth_rad: f
     Parameters
     ----------
     reflection : ndarray, shape (3, 3), or NotUsable
-        From `twin_reflection`.
+        From `mirror_reflection`.
     azimuth_rad : float
         Left positive.
 
@@ -86,7 +86,7 @@ def twin_azimuth_rad(reflection: NDArray[np.float64] | NotUsable, azimuth_rad: f
     Examples
     --------
     >>> front_back = np.diag([-1.0, 1.0, 1.0])
-    >>> round(math.degrees(twin_azimuth_rad(front_back, math.radians(30.0))), 6)
+    >>> round(math.degrees(mirror_azimuth_rad(front_back, math.radians(30.0))), 6)
     150.0
     """
     if isinstance(reflection, NotUsable):

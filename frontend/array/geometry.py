@@ -3,7 +3,9 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from worldstate.ground.typing import FloatArray
 
 SPEED_OF_SOUND_M_S = 343.0
 """In dry air at 20 degrees Celsius; the value that pyroomacoustics assumes."""
@@ -16,7 +18,7 @@ _FLAT = 1e-3
 _ALONG_AXIS = 0.985
 
 
-def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> NDArray[np.float64]:
+def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> FloatArray:
     r"""Give unit vectors that point towards far-field sources.
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
@@ -47,7 +49,7 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
-def nearest_spacings_m(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def nearest_spacings_m(positions_m: FloatArray) -> FloatArray:
     r"""Distance from every microphone to its nearest neighbour, metres.
 
     .. math:: d_m = \min_{j \ne m} \|p_m - p_j\|
@@ -74,7 +76,7 @@ def nearest_spacings_m(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(distance.min(axis=1))
 
 
-def ambiguity(positions_m: NDArray[np.float64]) -> Ambiguity:
+def ambiguity(positions_m: FloatArray) -> Ambiguity:
     r"""Directions that an array of this shape cannot tell apart, whatever the algorithm.
 
     With the singular values :math:`s_1 \ge s_2 \ge s_3` of the centred positions and n the direction of the

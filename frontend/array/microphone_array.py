@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Complex128Array, FloatArray
 
 from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vectors, nearest_spacings_m
 
@@ -51,7 +52,7 @@ class MicrophoneArray:
     array([-291.5,  291.5])
     """
 
-    positions_m: NDArray[np.float64]
+    positions_m: FloatArray
 
     def __post_init__(self) -> None:
         positions = finite_array("positions_m", self.positions_m, (None, 3)).copy()
@@ -74,12 +75,12 @@ class MicrophoneArray:
         return len(self.positions_m)
 
     @property
-    def centred_m(self) -> NDArray[np.float64]:
+    def centred_m(self) -> FloatArray:
         """Positions relative to their mean, shape (M, 3), metres."""
         return np.asarray(self.positions_m - self.positions_m.mean(axis=0))
 
     @property
-    def aperture_m(self) -> NDArray[np.float64]:
+    def aperture_m(self) -> FloatArray:
         """Extent along x, y and z, shape (3,), metres."""
         return np.asarray(np.ptp(self.positions_m, axis=0))
 
@@ -130,7 +131,7 @@ class MicrophoneArray:
         azimuths_rad: ArrayLike,
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-    ) -> NDArray[np.float64]:
+    ) -> FloatArray:
         r"""Far-field arrival time at every microphone relative to the origin, seconds, shape (..., M).
 
         .. math:: \tau_m(\theta, \phi) = -p_m^T u(\theta, \phi) / c
@@ -165,7 +166,7 @@ class MicrophoneArray:
         azimuths_rad: ArrayLike,
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-    ) -> NDArray[np.complex128]:
+    ) -> Complex128Array:
         r"""Steering vectors :math:`a_m = e^{-j 2 \pi f \tau_m}`, shape (frequencies, M, directions).
 
         Parameters
@@ -222,5 +223,5 @@ def roof_array_56() -> MicrophoneArray:
     return MicrophoneArray(np.stack([np.zeros_like(y), 0.5 * _WIDTH_M * y, 0.5 * _HEIGHT_M * z], axis=1))
 
 
-def _to_unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_unit(values: FloatArray) -> FloatArray:
     return np.asarray(2.0 * (values - values.min()) / np.ptp(values) - 1.0)

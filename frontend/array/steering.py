@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .angular_interpolation import Nodes
+from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray
+
+from .angular_interpolation import AngularInterpolation
 from .geometry import SPEED_OF_SOUND_M_S
 from .microphone_array import MicrophoneArray
 
@@ -42,9 +44,9 @@ class Steering:
     (3, True)
     """
 
-    basis: NDArray[np.complex64] | None
-    weights: NDArray[np.complex64]
-    conjugate: NDArray[np.complex64]
+    basis: Complex64Array | None
+    weights: Complex64Array
+    conjugate: Complex64Array
     nodes: "NodeBeams | None" = None
 
     @classmethod
@@ -87,7 +89,7 @@ class Steering:
         return cls._of(basis, weights if basis is None else basis.conj().transpose(0, 2, 1) @ weights)
 
     @classmethod
-    def _of(cls, basis: NDArray[np.complex128] | None, weights: NDArray[np.complex128]) -> "Steering":
+    def _of(cls, basis: Complex128Array | None, weights: Complex128Array) -> "Steering":
         single = weights.astype(np.complex64)
         thin = None if basis is None else np.ascontiguousarray(basis, np.complex64)
         return cls(thin, single, single.conj(), NodeBeams.of(weights))
@@ -97,7 +99,7 @@ class Steering:
         """Number of directions."""
         return int(self.weights.shape[2])
 
-    def covariance(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def covariance(self, spectra: Complex64Array) -> Complex64Array:
         r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
 
         .. math:: Q_k = \sum_t (B_k^T x_{t,k}) (B_k^T x_{t,k})^H
@@ -120,7 +122,7 @@ class Steering:
         projected = by_bin if self.basis is None else by_bin @ self.basis
         return cross_spectra(projected)
 
-    def compress(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def compress(self, matrices: Complex64Array) -> Complex64Array:
         r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r).
 
         Parameters
@@ -141,7 +143,7 @@ class Steering:
             return matrices
         return np.asarray(self.basis.transpose(0, 2, 1) @ (matrices @ self.basis.conj()))
 
-    def quadratic_form(self, matrices: NDArray[np.complex64]) -> NDArray[np.complex128]:
+    def quadratic_form(self, matrices: Complex64Array) -> Complex128Array:
         r"""Sum quadratic forms of the beams over bins, (bins, r, r) -> (directions,).
 
         .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
@@ -166,7 +168,7 @@ class Steering:
         total = np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
         return total if self.nodes is None else total @ self.nodes.spread
 
-    def power_within(self, vectors: NDArray[np.complex64]) -> NDArray[np.float64]:
+    def power_within(self, vectors: Complex64Array) -> FloatArray:
         r"""Power within columns (bins, M, k), -> (bins, directions).
 
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
@@ -191,7 +193,7 @@ class Steering:
         power = np.square(inner.real).sum(axis=1, dtype=np.float64) + np.square(inner.imag).sum(axis=1)
         return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
 
-    def squared_lengths(self, keep: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def squared_lengths(self, keep: BoolArray) -> FloatArray:
         r"""Squared length of steering vectors over the microphones kept (M,), (bins, directions).
 
         .. math:: \|a_k(\theta)\|^2 = \sum_{m \in kept} |a_{k,m}(\theta)|^2
@@ -237,12 +239,12 @@ class NodeBeams:
     (True, 61)
     """
 
-    weights: NDArray[np.complex64]
-    conjugate: NDArray[np.complex64]
-    spread: NDArray[np.float64]
+    weights: Complex64Array
+    conjugate: Complex64Array
+    spread: FloatArray
 
     @classmethod
-    def of(cls, weights: NDArray[np.complex128]) -> "NodeBeams | None":
+    def of(cls, weights: Complex128Array) -> "NodeBeams | None":
         r"""Choose them for all directions (bins, r or M, directions).
 
         .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta)
@@ -261,21 +263,21 @@ class NodeBeams:
         ----------
         N. J. Higham 1990: see `worldstate.frontend.array.angular_interpolation`.
         """
-        nodes = Nodes.of(weights)
+        nodes = AngularInterpolation.of(weights)
         if nodes is None:
             return None
         chosen = np.ascontiguousarray(weights[:, :, nodes.index], np.complex64)
         return cls(chosen, chosen.conj(), nodes.spread)
 
 
-def _thin_basis(weights: NDArray[np.complex128], max_rank: int) -> NDArray[np.complex128] | None:
+def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:
     """Find orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance.
 
     Gram-Schmidt with pivoting: the vector that is missed most is the next column. None if `max_rank` are
     not enough.
     """
     missed = weights.copy()
-    columns: list[NDArray[np.complex128]] = []
+    columns: list[Complex128Array] = []
     limit = _TOLERANCE * np.sqrt(weights.shape[1])
     for _ in range(max_rank):
         lengths = np.linalg.norm(missed, axis=1)
@@ -291,7 +293,7 @@ def _thin_basis(weights: NDArray[np.complex128], max_rank: int) -> NDArray[np.co
     return None
 
 
-def cross_spectra(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
+def cross_spectra(spectra: Complex64Array) -> Complex64Array:
     r"""Sum over frames :math:`R_{ij} = \sum_t x_{t,i} \overline{x_{t,j}}`, (bins, frames, M) -> (bins, M, M).
 
     Parameters

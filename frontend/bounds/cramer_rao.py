@@ -5,11 +5,12 @@ ratios are power ratios, not decibels.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S, direction_vectors
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 # Information below this share of its largest possible value is called none.
 NEGLIGIBLE = 1e-12
@@ -156,7 +157,7 @@ def bearing_information(
     elevation_rad: float = 0.0,
     random_signal: bool = False,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     r"""Fisher information of (azimuth, elevation) from an array, planar or not.
 
     .. math:: J = \frac{8\pi^2 N}{c^2} \Big(\sum_b f_b^2\,\mathrm{SNR}_b\Big)\, D^T S D,
@@ -202,7 +203,7 @@ def bearing_information(
     return np.asarray(weight * lever.T @ lever)
 
 
-def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> NDArray[np.float64]:
+def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> FloatArray:
     r"""Bearing information relative to the array's best direction: the lateral corollary.
 
     .. math:: \frac{J(\theta)}{\max_\theta J(\theta)} = \frac{\dot u^T S \dot u}{\lambda_{max}(S_{xy})}
@@ -371,7 +372,7 @@ def radial_speed_crb_m2_s2(
     return float((speed_of_sound_m_s / rest) ** 2 * variance)
 
 
-def _direction_slopes(azimuth_rad: float, elevation_rad: float) -> NDArray[np.float64]:
+def _direction_slopes(azimuth_rad: float, elevation_rad: float) -> FloatArray:
     """Derive the unit vector by azimuth and elevation, columns of (3, 2)."""
     azimuth = in_range("azimuth_rad", azimuth_rad, -np.inf, np.inf)
     elevation = in_range("elevation_rad", elevation_rad, -np.pi / 2, np.pi / 2)
@@ -380,7 +381,7 @@ def _direction_slopes(azimuth_rad: float, elevation_rad: float) -> NDArray[np.fl
     return np.stack([by_azimuth, by_elevation], axis=1)
 
 
-def _horizontal_moments(positions_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _horizontal_moments(positions_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Second moments S of the microphones in x and y, (2, 2), and the axis of the largest, (2,)."""
     positions = finite_array("positions_m", positions_m, (None, 3))
     horizontal = (positions - positions.mean(axis=0))[:, :2]

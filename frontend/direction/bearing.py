@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import FloatArray
 
 from .peaks import Peak, find_peaks
 
@@ -85,7 +86,7 @@ def bearing_std_rad(
 
 
 def strongest_bearing(
-    spectrum: NDArray[np.float64], azimuths_rad: NDArray[np.float64], broadside_std_rad: float
+    spectrum: FloatArray, azimuths_rad: FloatArray, broadside_std_rad: float
 ) -> AcousticBearing:
     r"""Read the highest peak of a spatial spectrum; in silence the middle, with the span's uncertainty.
 
@@ -120,9 +121,7 @@ def strongest_bearing(
     return bearing_of(find_peaks(spectrum, azimuths_rad, max_peaks=1), azimuths_rad, broadside_std_rad)
 
 
-def bearing_of(
-    peaks: Sequence[Peak], azimuths_rad: NDArray[np.float64], broadside_std_rad: float
-) -> AcousticBearing:
+def bearing_of(peaks: Sequence[Peak], azimuths_rad: FloatArray, broadside_std_rad: float) -> AcousticBearing:
     """Take the first of the peaks that were found on a grid, highest first, for a bearing.
 
     ``theta = theta_1`` with ``sigma = bearing_std_rad(theta_1, rho_1)``; in silence ``theta = (first + last)

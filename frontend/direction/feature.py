@@ -23,7 +23,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.signal
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -33,6 +33,7 @@ from worldstate.frontend.spectra.phat import whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array, FloatArray
 
 FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
 """The published azimuths in this library's convention (left positive), in the published order."""
@@ -85,7 +86,7 @@ def feature_steering(
     return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD, speed_of_sound_m_s=speed_of_sound_m_s)
 
 
-def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
+def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
     r"""Complex sum over frames, bins and microphone pairs i < j: what running sums are made of.
 
     .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
@@ -115,7 +116,7 @@ def pair_sum(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.
     return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
 
 
-def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[np.complex128]:
+def pair_sum_of(matrices: Complex64Array, steering: Steering) -> Complex128Array:
     r"""Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already.
 
     .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
@@ -148,8 +149,8 @@ def pair_sum_of(matrices: NDArray[np.complex64], steering: Steering) -> NDArray[
 
 
 def segment_feature(
-    sums: Sequence[NDArray[np.complex128]], n_frames: int, n_bins: int, n_microphones: int
-) -> NDArray[np.float64]:
+    sums: Sequence[Complex128Array], n_frames: int, n_bins: int, n_microphones: int
+) -> FloatArray:
     r"""Modulus of summed pair sums, per frame, bin and pair.
 
     .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_s S_s(\theta) \Big|, \qquad P = M (M - 1) / 2
@@ -179,9 +180,7 @@ def segment_feature(
     return np.asarray(np.abs(np.sum(sums, axis=0)) / (n_frames * n_bins * pairs))
 
 
-def published_feature(
-    window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float
-) -> NDArray[np.float64]:
+def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float) -> FloatArray:
     r"""Compute the feature of one whole window in the published way, its zero-padded edge frames included.
 
     .. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
@@ -233,7 +232,7 @@ def published_feature(
 
 
 @lru_cache(maxsize=8)
-def _pairs_mask(n_microphones: int) -> NDArray[np.float32]:
+def _pairs_mask(n_microphones: int) -> Float32Array:
     mask = np.triu(np.ones((n_microphones, n_microphones), np.float32), 1)
     mask.flags.writeable = False
     return mask

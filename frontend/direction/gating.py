@@ -10,10 +10,11 @@ the acoustic adapter is such a threshold.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 
 
@@ -37,9 +38,9 @@ class GatingCurve:
     (array([1.  , 0.75, 0.5 , 0.25]), array([0.16 , 0.02 , 0.015, 0.01 ]))
     """
 
-    threshold: NDArray[np.float64]
-    coverage: NDArray[np.float64]
-    median_error_rad: NDArray[np.float64]
+    threshold: FloatArray
+    coverage: FloatArray
+    median_error_rad: FloatArray
 
     def threshold_for(self, median_error_rad: float) -> float | NotUsable:
         r"""Return the lowest threshold from which on the median error stays within the given one.

@@ -17,11 +17,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.frontend.spectra.spectra import finite_complex
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 
 Weighting = Literal["none", "phat", "scot", "ml"]
 WEIGHTINGS: tuple[Weighting, ...] = ("none", "phat", "scot", "ml")
@@ -52,12 +53,12 @@ class PairDelays:
     [[0, 1]]
     """
 
-    pairs: NDArray[np.intp]
-    delay_s: NDArray[np.float64]
-    peak: NDArray[np.float64]
+    pairs: IndexArray
+    delay_s: FloatArray
+    peak: FloatArray
 
 
-def all_pairs(microphones: int) -> NDArray[np.intp]:
+def all_pairs(microphones: int) -> IndexArray:
     """Return every pair i < j, shape (M (M - 1) / 2, 2).
 
     Parameters
@@ -85,7 +86,7 @@ def all_pairs(microphones: int) -> NDArray[np.intp]:
     return np.column_stack(np.triu_indices(microphones, k=1))
 
 
-def pair_coherence(spectra: ArrayLike, pairs: ArrayLike) -> NDArray[np.float64]:
+def pair_coherence(spectra: ArrayLike, pairs: ArrayLike) -> FloatArray:
     r"""Estimate the magnitude-squared coherence of pairs, averaged over frames.
 
     .. math:: C_{ij}(f) = |G_{ij}|^2 / (G_{ii} G_{jj})
@@ -194,9 +195,7 @@ def gcc_delays(
     return PairDelays(index, delay, height)
 
 
-def _moments(
-    X: ComplexArray, pairs: NDArray[np.intp]
-) -> tuple[ComplexArray, NDArray[np.float64], NDArray[np.float64]]:
+def _moments(X: ComplexArray, pairs: IndexArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
     """Cross-spectra (P, bins) and the two auto-spectra, averaged over frames."""
     R = np.einsum("fbi,fbj->bij", X, X.conj(), optimize=True) / X.shape[0]
     i, j = pairs.T
@@ -204,16 +203,14 @@ def _moments(
     return R[:, i, j].T, power[i], power[j]
 
 
-def _coherence(
-    cross: ComplexArray, first: NDArray[np.float64], second: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _coherence(cross: ComplexArray, first: FloatArray, second: FloatArray) -> FloatArray:
     product = first * second
     ratio = np.divide(np.abs(cross) ** 2, product, out=np.zeros_like(product), where=product > 0)
     return np.asarray(np.minimum(ratio, 1.0))
 
 
 def _weighted(
-    cross: ComplexArray, first: NDArray[np.float64], second: NDArray[np.float64], weighting: Weighting
+    cross: ComplexArray, first: FloatArray, second: FloatArray, weighting: Weighting
 ) -> ComplexArray:
     if weighting == "none":
         return cross
@@ -225,9 +222,7 @@ def _weighted(
     return np.asarray(whitened * (coherence / (1.0 - coherence)))
 
 
-def _peaks(
-    cross: ComplexArray, frequencies: NDArray[np.float64], limit: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _peaks(cross: ComplexArray, frequencies: FloatArray, limit: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Coarse search on a lag grid, then Newton steps held within one grid step of it."""
     omega = 2.0 * np.pi * frequencies
     step = 1.0 / (LAGS_PER_PERIOD * frequencies[-1])
@@ -246,9 +241,7 @@ def _peaks(
     return delay, np.divide(height, reachable, out=np.zeros_like(delay), where=reachable > 0)
 
 
-def _newton_step(
-    cross: ComplexArray, omega: NDArray[np.float64], delay: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _newton_step(cross: ComplexArray, omega: FloatArray, delay: FloatArray) -> FloatArray:
     steered = cross * np.exp(1j * delay[:, None] * omega)
     slope = -(steered.imag @ omega)
     curvature = -(steered.real @ omega**2)
@@ -257,23 +250,21 @@ def _newton_step(
     return np.asarray(delay - step)
 
 
-def _checked_frequencies(frequencies_hz: ArrayLike, bins: int) -> NDArray[np.float64]:
+def _checked_frequencies(frequencies_hz: ArrayLike, bins: int) -> FloatArray:
     frequencies = finite_array("frequencies_hz", frequencies_hz, (bins,))
     if bins == 0 or frequencies[0] < 0 or frequencies[-1] <= 0 or np.any(np.diff(frequencies) <= 0):
         raise InvalidArgumentError("frequencies_hz: expected ascending values >= 0, at least one > 0")
     return frequencies
 
 
-def _checked_pairs(pairs: ArrayLike, microphones: int) -> NDArray[np.intp]:
+def _checked_pairs(pairs: ArrayLike, microphones: int) -> IndexArray:
     index = finite_array("pairs", pairs, (None, 2)).astype(np.intp)
     if len(index) == 0 or index.min() < 0 or index.max() >= microphones:
         raise InvalidArgumentError(f"pairs: expected at least one pair of indices in [0, {microphones})")
     return index
 
 
-def _checked_limit(
-    max_delay_s: ArrayLike, pairs: int, frequencies: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _checked_limit(max_delay_s: ArrayLike, pairs: int, frequencies: FloatArray) -> FloatArray:
     scalar = np.ndim(max_delay_s) == 0
     limit = np.broadcast_to(finite_array("max_delay_s", max_delay_s, () if scalar else (pairs,)), (pairs,))
     if limit.min() <= 0:

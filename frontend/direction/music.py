@@ -12,15 +12,13 @@ and signal parameter estimation", IEEE Trans. AP 34, 1986.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.frontend.spectra.spectra import finite_complex
 from worldstate.ground.errors import InvalidArgumentError
-
-FloatArray = NDArray[np.floating[Any]]
+from worldstate.ground.typing import ComplexArray, FloatArray, RealArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +39,7 @@ class Subspace:
     """
 
     vectors: ComplexArray
-    eigenvalues: FloatArray
+    eigenvalues: RealArray
 
 
 def covariance(spectra: ArrayLike) -> ComplexArray:
@@ -163,9 +161,7 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
     return _leading(R, sources)
 
 
-def music_spectrum(
-    subspace: Subspace, steering: ArrayLike, *, normalised: bool = False
-) -> NDArray[np.float64]:
+def music_spectrum(subspace: Subspace, steering: ArrayLike, *, normalised: bool = False) -> FloatArray:
     r"""Score every direction of a steering set, combined over bins.
 
     .. math:: P(\theta) = \frac1B \sum_b \frac{w_b}{\|a_b\|^2 - \|E_s^H a_b\|^2}
@@ -207,19 +203,19 @@ def music_spectrum(
     return _spectrum(E, A, _power(A, axis=1), normalised)
 
 
-def _spectrum(E: ComplexArray, A: ComplexArray, norm: FloatArray, normalised: bool) -> NDArray[np.float64]:
+def _spectrum(E: ComplexArray, A: ComplexArray, norm: RealArray, normalised: bool) -> FloatArray:
     outside = norm - _power(E.conj().transpose(0, 2, 1) @ A, axis=1)
     # Rounding may leave a tiny or negative remainder where the steering vector lies in the subspace.
     floor = np.finfo(outside.dtype).eps * norm
     score = 1.0 / np.maximum(outside, floor).astype(np.float64)
     if normalised:
         score /= score.max(axis=1, keepdims=True)
-    mean: NDArray[np.float64] = score.mean(axis=0)
+    mean: FloatArray = score.mean(axis=0)
     return mean
 
 
-def _power(values: ComplexArray, axis: int) -> FloatArray:
-    power: FloatArray = (values.real**2 + values.imag**2).sum(axis=axis)
+def _power(values: ComplexArray, axis: int) -> RealArray:
+    power: RealArray = (values.real**2 + values.imag**2).sum(axis=axis)
     return power
 
 

@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.spectra.spectra import ComplexArray
 from worldstate.frontend.spectra.window_sum import WindowSum
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Complex64Array, ComplexArray, FloatArray
 from worldstate.ground.values import NotUsable
 
 from .peaks import find_peaks
@@ -37,7 +36,7 @@ class MusicReading:
 
     azimuth_rad: float
     prominence: float
-    spectrum: NDArray[np.float64]
+    spectrum: FloatArray
 
 
 class MusicStage:
@@ -78,7 +77,7 @@ class MusicStage:
     def __init__(
         self,
         beams: Steering,
-        azimuths_rad: NDArray[np.float64],
+        azimuths_rad: FloatArray,
         sources: int,
         n_microphones: int,
         window_hops: int,
@@ -93,7 +92,7 @@ class MusicStage:
         self._window = WindowSum(window_hops, len(beams.weights), n_microphones)
         self._tracker = SubspaceTracker(sources)
 
-    def push(self, spectra: NDArray[np.complex64], beams: Steering | None = None) -> None:
+    def push(self, spectra: Complex64Array, beams: Steering | None = None) -> None:
         r"""Take the frames of a hop (frames, K, M), and their beams if they are whitened.
 
         .. math:: R_k = \sum_{t \in window} x_{t,k}\, x_{t,k}^H
@@ -145,7 +144,7 @@ class MusicStage:
         peak = find_peaks(profile, self._azimuths, max_peaks=1)[0]
         return MusicReading(peak.azimuth_rad, peak.prominence, profile)
 
-    def _spectrum(self, vectors: ComplexArray, mask: ChannelMask) -> NDArray[np.float64]:
+    def _spectrum(self, vectors: ComplexArray, mask: ChannelMask) -> FloatArray:
         """MUSIC as in `music.music_spectrum`, normalised."""
         beams = self._beams if self._whitened is None else self._whitened
         # A plain steering vector has the length of its microphones.

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +92,13 @@ def find_peaks(
     return tuple(peak for peak in peaks if peak.prominence >= min_prominence)
 
 
-def _local_maxima(values: NDArray[np.float64]) -> NDArray[np.intp]:
+def _local_maxima(values: FloatArray) -> IndexArray:
     """Find the points that rise from the left and do not rise to the right; of a plateau the first."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     return np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
 
 
-def _interpolate(
-    values: NDArray[np.float64], azimuths: NDArray[np.float64], index: int, median: float
-) -> Peak:
+def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: float) -> Peak:
     height, shift = float(values[index]), 0.0
     if 0 < index < len(values) - 1:
         left, right = float(values[index - 1]), float(values[index + 1])

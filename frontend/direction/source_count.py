@@ -12,10 +12,11 @@ signals in white noise using relatively few samples", IEEE Trans. SP 56, 2008.
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 Criterion = Literal["mdl", "aic", "few"]
 CRITERIA: tuple[Criterion, ...] = ("mdl", "aic", "few")
@@ -86,37 +87,31 @@ def count_sources(
     return int(np.argmin(scores))
 
 
-def _likelihood_score(
-    values: NDArray[np.float64], k: int, frames: int, criterion: Criterion
-) -> NDArray[np.float64]:
+def _likelihood_score(values: FloatArray, k: int, frames: int, criterion: Criterion) -> FloatArray:
     """AIC or MDL of k sources, one per bin."""
     microphones = values.shape[1]
     noise = np.maximum(values[:, k:], np.finfo(float).tiny)
     misfit = frames * (microphones - k) * (np.log(noise.mean(axis=1)) - np.log(noise).mean(axis=1))
     parameters = k * (2 * microphones - k)
     if criterion == "aic":
-        aic: NDArray[np.float64] = 2.0 * misfit + 2.0 * parameters
+        aic: FloatArray = 2.0 * misfit + 2.0 * parameters
         return aic
-    mdl: NDArray[np.float64] = misfit + 0.5 * parameters * np.log(frames)
+    mdl: FloatArray = misfit + 0.5 * parameters * np.log(frames)
     return mdl
 
 
-def _moment_score(
-    values: NDArray[np.float64], k: int, frames: int, _criterion: Criterion
-) -> NDArray[np.float64]:
+def _moment_score(values: FloatArray, k: int, frames: int, _criterion: Criterion) -> FloatArray:
     """Nadakuditi-Edelman score of k sources for complex data, one per bin."""
     microphones = values.shape[1]
     noise = values[:, k:]
     total = np.maximum(noise.sum(axis=1), np.finfo(float).tiny)
     ratio = (microphones - k) * (noise**2).sum(axis=1) / total**2
     t = microphones * (ratio - 1.0 - microphones / frames)
-    score: NDArray[np.float64] = 0.5 * (frames / microphones) ** 2 * t**2 + 2.0 * (k + 1)
+    score: FloatArray = 0.5 * (frames / microphones) ** 2 * t**2 + 2.0 * (k + 1)
     return score
 
 
-def _checked_largest(
-    values: NDArray[np.float64], frames: int, criterion: Criterion, max_sources: int | None
-) -> int:
+def _checked_largest(values: FloatArray, frames: int, criterion: Criterion, max_sources: int | None) -> int:
     microphones = values.shape[1]
     if values.min() < -1e-6 * values.max():
         raise InvalidArgumentError(f"eigenvalues: expected numbers >= 0, got {values.min()}")

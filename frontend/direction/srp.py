@@ -13,14 +13,14 @@ J. DiBiase, H. Silverman and M. Brandstein, Robust localization in reverberant r
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.spectra.phat import whiten
 from worldstate.ground.checks import check_shape
+from worldstate.ground.typing import Complex64Array, FloatArray
 
 
-def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
+def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
     r"""Sum of beam powers over frames and bins: what running sums are made of.
 
     .. math:: S(\theta) = \sum_{t,k} \Big| \sum_m \overline{a_{k,m}(\theta)}\, Z_{t,k,m} \Big|^2
@@ -49,9 +49,7 @@ def steered_power(whitened: NDArray[np.complex64], steering: Steering) -> NDArra
     return np.asarray(steering.quadratic_form(steering.covariance(whitened)).real)
 
 
-def normalised(
-    total: NDArray[np.float64], n_frames: int, n_bins: int, n_microphones: int
-) -> NDArray[np.float64]:
+def normalised(total: FloatArray, n_frames: int, n_bins: int, n_microphones: int) -> FloatArray:
     r"""Scale a sum of beam powers to 0..1; rounding below zero is cut.
 
     .. math:: P(\theta) = \frac{\max(S(\theta), 0)}{T K M^2}
@@ -80,7 +78,7 @@ def normalised(
     return np.asarray(np.maximum(total, 0.0) / (n_frames * n_bins * n_microphones**2))
 
 
-def srp_phat(spectra: NDArray[np.complex64], steering: Steering) -> NDArray[np.float64]:
+def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     r"""SRP-PHAT of a set of frames: 1 for a lone plane wave, 1/M for independent noise.
 
     .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}

@@ -12,18 +12,14 @@ any. Two things can go wrong, and both are looked for on every hop:
   go round again, and are decomposed in full where even that does not help.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.spectra import ComplexArray
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import ComplexArray, RealArray
 
 from .music import Subspace, checked_covariance
-
-FloatArray = NDArray[np.floating[Any]]
 
 ROUNDS = 2
 _MAX_DEGREE = 8
@@ -76,7 +72,7 @@ class SubspaceTracker:
         self._guard = guard
         self._tolerance = in_range("tolerance", tolerance, 0.0, 1.0, open_low=True)
         self._basis: ComplexArray | None = None
-        self._values: FloatArray | None = None
+        self._values: RealArray | None = None
         self.full_decompositions = 0
 
     def update(self, covariance: ArrayLike) -> Subspace:
@@ -136,8 +132,8 @@ class SubspaceTracker:
         return Subspace(vectors, self._values[:, -self._sources :])
 
     def _refreshed(
-        self, R: ComplexArray, basis: ComplexArray, values: FloatArray
-    ) -> tuple[ComplexArray, FloatArray]:
+        self, R: ComplexArray, basis: ComplexArray, values: RealArray
+    ) -> tuple[ComplexArray, RealArray]:
         """Bring all bins up to date, then those again that need more."""
         basis, values, angle = _improved(R, basis, values, self._sources)
         for _ in range(ROUNDS - 1):
@@ -151,22 +147,22 @@ class SubspaceTracker:
             basis[late], values[late] = self._decomposed(R[late], basis.shape[1])
         return basis, values
 
-    def _decomposed(self, R: ComplexArray, width: int) -> tuple[ComplexArray, FloatArray]:
+    def _decomposed(self, R: ComplexArray, width: int) -> tuple[ComplexArray, RealArray]:
         self.full_decompositions += len(R)
         values, vectors = np.linalg.eigh(R)
         return vectors[..., -width:].conj().transpose(0, 2, 1), values[..., -width:]
 
 
 def _improved(
-    R: ComplexArray, basis: ComplexArray, values: FloatArray, sources: int
-) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    R: ComplexArray, basis: ComplexArray, values: RealArray, sources: int
+) -> tuple[ComplexArray, RealArray, RealArray]:
     """One round: vectors as rows v^H (so that R works from the right), ascending values, angle missed."""
     guess = np.concatenate([_probe(R, basis, values), basis], axis=1)
     rows, found, angle = _ritz(R, _filtered(R, guess, values, sources), sources)
     return rows[:, 1:], found[:, 1:], angle
 
 
-def _probe(R: ComplexArray, rows: ComplexArray, values: FloatArray) -> ComplexArray:
+def _probe(R: ComplexArray, rows: ComplexArray, values: RealArray) -> ComplexArray:
     """Return the row of each covariance that the basis explains worst, shape (bins, 1, M)."""
     power = np.einsum("bmm->bm", R).real
     explained = (values[:, None, :] @ (np.square(rows.real) + np.square(rows.imag)))[:, 0]
@@ -175,7 +171,7 @@ def _probe(R: ComplexArray, rows: ComplexArray, values: FloatArray) -> ComplexAr
     return np.asarray((R[bins, worst] / scale[:, None])[:, None])
 
 
-def _filtered(R: ComplexArray, rows: ComplexArray, values: FloatArray, sources: int) -> ComplexArray:
+def _filtered(R: ComplexArray, rows: ComplexArray, values: RealArray, sources: int) -> ComplexArray:
     r"""Apply :math:`T_m(2 R / c - 1)` to vectors given as rows; c is where the noise begins."""
     strongest, weakest = values[:, -1], values[:, -sources]
     noise = np.maximum(values[:, 0], 1e-3 * weakest) + np.finfo(values.dtype).tiny
@@ -194,7 +190,7 @@ def _filtered(R: ComplexArray, rows: ComplexArray, values: FloatArray, sources: 
     return np.asarray(now)
 
 
-def _degree(strongest: FloatArray, weakest: FloatArray, noise: FloatArray) -> int:
+def _degree(strongest: RealArray, weakest: RealArray, noise: RealArray) -> int:
     """Lowest degree that reaches the gain in every bin, as far as precision allows."""
     contrast = np.maximum(2.0 * weakest / noise - 1.0, 1.0 + 1e-3)
     needed = int(np.ceil((np.arccosh(_GAIN) / np.arccosh(contrast)).max()))
@@ -203,7 +199,7 @@ def _degree(strongest: FloatArray, weakest: FloatArray, noise: FloatArray) -> in
     return max(min(needed, allowed, _MAX_DEGREE), 1)
 
 
-def _ritz(R: ComplexArray, rows: ComplexArray, sources: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
+def _ritz(R: ComplexArray, rows: ComplexArray, sources: int) -> tuple[ComplexArray, RealArray, RealArray]:
     """Rayleigh-Ritz: orthonormal rows, ascending values, and a bound of the sine of the angle missed."""
     Q = np.ascontiguousarray(np.linalg.qr(rows.transpose(0, 2, 1))[0].transpose(0, 2, 1))
     QR = Q @ R

@@ -12,13 +12,14 @@ after the next `guard_hops` hops have passed, with the least weight of all these
 learned in the moments before anybody believes in it.
 
 What is heard is learned, and what was learned used, as far as it comes from below, where the own vehicle is
-and no street: see `from_below`. A gate that opens by mistake, or because the vehicle stands, changes nothing.
+and no street: see `elevation_split`. A gate that opens by mistake, or because the vehicle stands, changes
+nothing.
 
 Whitened noise that has changed since it was learned, with the speed say, leaves a level c above that of white
 noise. Its mean over all directions is learned by the same gate, and the steered power is divided by it: as in
 any detector of constant false-alarm rate, noise reads 1/M in a slow drive and in a fast one.
 
-Sources: the references of `prewhitening` and `from_below`; unit-length snapshots as in D. E. Tyler,
+Sources: the references of `prewhitening` and `elevation_split`; unit-length snapshots as in D. E. Tyler,
 "Statistical analysis for the angular central Gaussian distribution on the sphere", 1987; guard cells as in
 any detector of constant false-alarm rate.
 """
@@ -28,15 +29,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.steering import Steering, cross_spectra
 from worldstate.frontend.spectra.phat import whiten
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Complex64Array, FloatArray
 
-from .elevation_split import FromBelow, share_of
-from .guard_delay import Guard
+from .elevation_split import ElevationSplit, share_of
+from .guard_delay import GuardDelay
 from .harmonic_cancellation import HarmonicCanceller
 from .noise_memory import NoiseCovariance, NoiseLevel
 from .prewhitening import shrunk_inverse_root, white_share
@@ -127,7 +128,7 @@ class EgoNoise:
         Beams to keep whitened, each with its bins among those of the spectra.
     engine : HarmonicCanceller, optional
         For the bins of the beams, from the first to the last.
-    from_below : FromBelow, optional
+    elevation_split : ElevationSplit, optional
         For these bins; without it all that is learned counts as from below.
 
     Examples
@@ -150,12 +151,12 @@ class EgoNoise:
         n_microphones: int,
         beams: Sequence[tuple[Steering, slice]],
         engine: HarmonicCanceller | None = None,
-        from_below: FromBelow | None = None,
+        elevation_split: ElevationSplit | None = None,
     ) -> None:
         self.weight = 0.0
         self.engine = engine
-        self.from_below = 0.0
-        self._judge = from_below
+        self.elevation_split = 0.0
+        self._judge = elevation_split
         self._beams = [WhitenedBeams(plain) for plain, _ in beams]
         self._bins = spanned(bins for _, bins in beams)
         first, n_bins = self._bins.start, self._bins.stop - self._bins.start
@@ -163,7 +164,7 @@ class EgoNoise:
         self._settings = settings
         self._covariance = NoiseCovariance(n_bins, n_microphones, 0.5 * settings.forgetting_s * frames_per_s)
         self._roots = np.tile(np.eye(n_microphones, dtype=np.complex64), (n_bins, 1, 1))
-        self._guard: Guard[tuple[NDArray[np.complex64] | None, int]] = Guard(settings.guard_hops)
+        self._guard: GuardDelay[tuple[Complex64Array | None, int]] = GuardDelay(settings.guard_hops)
         self._level = NoiseLevel(settings.guard_hops)
         self._recent = np.zeros(2)
         self._is_odd = False
@@ -179,7 +180,7 @@ class EgoNoise:
         """Number of frames that the covariance remembers; those of every second hop are learned."""
         return self._covariance.n_frames
 
-    def process(self, spectra: NDArray[np.complex64]) -> list[tuple[NDArray[np.complex64], Steering]]:
+    def process(self, spectra: Complex64Array) -> list[tuple[Complex64Array, Steering]]:
         r"""Cancel, learn and whiten the frames of a hop (frames, bins, M), phase transform included.
 
         .. math:: y = \hat R^{-1/2}\, (x - \ell), \qquad Z_m = y_m / |y_m|
@@ -209,10 +210,10 @@ class EgoNoise:
         self._refresh()
         whitened = self._whitened(heard)
         both = zip(self._slices, self._beams, strict=True)
-        used = bool(self.from_below)
+        used = bool(self.elevation_split)
         return [(whitened[:, bins], beams.steering if used else beams.plain) for bins, beams in both]
 
-    def levelled(self, power: NDArray[np.float64], n_frames: int) -> NDArray[np.float64]:
+    def levelled(self, power: FloatArray, n_frames: int) -> FloatArray:
         r"""Divide a hop's steered power by the level that whitened noise had while it was learned.
 
         .. math:: P'(\theta) = P(\theta) / c^{\,u}, \qquad
@@ -237,23 +238,23 @@ class EgoNoise:
         H. M. Finn and R. S. Johnson, "Adaptive detection mode with threshold control as a function of
         spatially sampled clutter-level estimates", RCA Review 29, 1968 (constant false-alarm rate).
         """
-        if not self._aim_frames or not self.from_below:
+        if not self._aim_frames or not self.elevation_split:
             return power
         n_bins = self._slices[0].stop - self._slices[0].start
         white = n_frames * n_bins * self._roots.shape[1]
         level = self._level.push(float(power.mean()) / white, self._gated())
-        return np.asarray(power / max(level, 1e-6) ** self.from_below)
+        return np.asarray(power / max(level, 1e-6) ** self.elevation_split)
 
     def _gated(self) -> float:
         return self.weight if self.weight >= self._settings.min_weight else 0.0
 
-    def _whitened(self, heard: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        if not self.from_below:
+    def _whitened(self, heard: Complex64Array) -> Complex64Array:
+        if not self.elevation_split:
             return whiten(heard)
         by_bin = heard.transpose(1, 0, 2) @ self._roots.transpose(0, 2, 1)
         return whiten(by_bin).transpose(1, 0, 2)
 
-    def _learn(self, spectra: NDArray[np.complex64]) -> None:
+    def _learn(self, spectra: Complex64Array) -> None:
         """Put this hop in the queue, take the one that has waited long enough."""
         weight = self._gated()
         # Ego-noise is steady: every second hop says nearly everything.
@@ -285,17 +286,17 @@ class EgoNoise:
 
     def _judge_share(self) -> None:
         """Decide how far what was learned is used; where that has changed, all bins are urgent."""
-        self.from_below = self._share_used()
-        is_another = abs(self.from_below - self._aim) > _ANOTHER_SHARE
+        self.elevation_split = self._share_used()
+        is_another = abs(self.elevation_split - self._aim) > _ANOTHER_SHARE
         if is_another or self.learned_frames > _ANOTHER_LENGTH * self._aim_frames:
-            self._aim, self._aim_frames = self.from_below, self.learned_frames
+            self._aim, self._aim_frames = self.elevation_split, self.learned_frames
             self._urgent = self._stale = len(self._roots)
 
     def _share_used(self) -> float:
         """How far what was learned is used: 0 for a street, 1 for a vehicle's own noise."""
         return 1.0 if self._judge is None else _use_of(*self._judge.powers(self._covariance.total))
 
-    def _recent_share(self, total: NDArray[np.complex64]) -> float:
+    def _recent_share(self, total: Complex64Array) -> float:
         """How far the last second that could be learned, this hop the newest, is the vehicle's own noise."""
         if self._judge is None:
             return 1.0
@@ -305,7 +306,7 @@ class EgoNoise:
 
     def _update(self, index: int) -> None:
         R = self._covariance.mean(index)
-        least = max(self._settings.min_shrinkage, 1.0 - self.from_below)
+        least = max(self._settings.min_shrinkage, 1.0 - self.elevation_split)
         self._roots[index] = shrunk_inverse_root(R, max(least, white_share(R, self.learned_frames)))
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
@@ -340,7 +341,7 @@ def spanned(slices: Iterable[slice]) -> slice:
     return slice(min(part.start for part in parts), max(part.stop for part in parts))
 
 
-def _direction_sum(spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
+def _direction_sum(spectra: Complex64Array) -> Complex64Array:
     """Sum x x^H of snapshots scaled to mean power one, (frames, bins, M) -> (bins, M, M)."""
     power = np.square(spectra.real).sum(axis=2) + np.square(spectra.imag).sum(axis=2)
     scale = np.sqrt(np.float32(spectra.shape[2]) / np.maximum(power, _TINY))

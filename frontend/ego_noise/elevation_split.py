@@ -17,10 +17,11 @@ noise models", J. Acoust. Soc. Am. 34, 1962; weighted least squares.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 _BELOW_DEG, _STREET_DEG = (-60.0, -50.0, -40.0, -30.0, -20.0), (0.0, 10.0, 20.0, 30.0)
 _AZIMUTHS_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
@@ -30,7 +31,7 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FromBelow:
+class ElevationSplit:
     """Tells noise of the own vehicle from that of the street, by elevation.
 
     Parameters
@@ -45,7 +46,7 @@ class FromBelow:
     --------
     >>> from worldstate.frontend.array.microphone_array import roof_array_56
     >>> array = roof_array_56()
-    >>> judge = FromBelow.of(array, [500.0, 1000.0])
+    >>> judge = ElevationSplit.of(array, [500.0, 1000.0])
     >>> def heard(elevation):
     ...     a = array.steering([500.0, 1000.0], 0.3, elevation)
     ...     return (a @ a.conj().transpose(0, 2, 1)).astype(np.complex64)
@@ -53,8 +54,8 @@ class FromBelow:
     [True, False]
     """
 
-    below: NDArray[np.float32]
-    street: NDArray[np.float32]
+    below: Float32Array
+    street: Float32Array
     can_tell: bool
 
     @classmethod
@@ -63,7 +64,7 @@ class FromBelow:
         array: MicrophoneArray,
         frequencies_hz: ArrayLike,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-    ) -> "FromBelow":
+    ) -> "ElevationSplit":
         r"""Make the model fields of an array at the frequencies of its bins.
 
         .. math:: \Gamma = \langle a a^H \rangle \text{ off the diagonal}, \qquad
@@ -83,7 +84,7 @@ class FromBelow:
 
         Returns
         -------
-        FromBelow
+        ElevationSplit
             For covariances of these bins.
 
         References
@@ -99,7 +100,7 @@ class FromBelow:
         below, street = (np.ascontiguousarray(scale * x, np.float32) for x in (below, street))
         return cls(below, street, can_tell=contrast >= _LEAST_CONTRAST)
 
-    def powers(self, covariance: NDArray[np.complex64]) -> NDArray[np.float64]:
+    def powers(self, covariance: Complex64Array) -> FloatArray:
         r"""Return the two sums of q, from below and from the street; an array that cannot tell says below.
 
         .. math:: P_b = \sum_k \Delta_k\, \hat p_{b,k}, \qquad P_s = \sum_k \Delta_k\, \hat p_{s,k}
@@ -124,7 +125,7 @@ class FromBelow:
         parts = covariance.reshape(len(covariance), -1).view(np.float32)
         return np.array([np.vdot(parts, self.below), np.vdot(parts, self.street)], np.float64)
 
-    def share(self, covariance: NDArray[np.complex64]) -> float:
+    def share(self, covariance: Complex64Array) -> float:
         """Return q, near 0 for a street and near 1 for what comes from below.
 
         .. math:: q = P_b / (P_b + P_s)
@@ -141,7 +142,7 @@ class FromBelow:
 
         References
         ----------
-        As for `FromBelow.powers`, after B. F. Cron and C. H. Sherman 1962.
+        As for `ElevationSplit.powers`, after B. F. Cron and C. H. Sherman 1962.
         """
         return share_of(*self.powers(covariance))
 
@@ -154,7 +155,7 @@ def share_of(below: float, street: float) -> float:
     Parameters
     ----------
     below, street : float
-        See `FromBelow.powers`.
+        See `ElevationSplit.powers`.
 
     Returns
     -------
@@ -175,7 +176,7 @@ def share_of(below: float, street: float) -> float:
 
 def _field(
     array: MicrophoneArray, frequencies_hz: ArrayLike, elevations_deg: tuple[float, ...], speed: float
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Covariance between different microphones of waves from all around at some elevations, (bins, 2 M^2)."""
     azimuths, elevations = np.meshgrid(_AZIMUTHS_RAD, np.radians(elevations_deg))
     A = array.steering(frequencies_hz, azimuths.ravel(), elevations.ravel(), speed)

@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 Item = TypeVar("Item")
 
 
-class Guard(Generic[Item]):
+class GuardDelay(Generic[Item]):
     """A queue of hops; each comes out some hops later with the least weight since.
 
     So a source is not learned in the moments before anybody believes in it.
@@ -18,7 +18,7 @@ class Guard(Generic[Item]):
 
     Examples
     --------
-    >>> guard: Guard[str] = Guard(1)
+    >>> guard: GuardDelay[str] = GuardDelay(1)
     >>> [guard.push(item, weight) for item, weight in (("a", 1.0), ("b", 0.4), ("c", 0.9))]
     [None, ('a', 0.4), ('b', 0.4)]
     """

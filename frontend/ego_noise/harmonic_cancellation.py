@@ -23,13 +23,10 @@ import cmath
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-
-ComplexArray = NDArray[np.complexfloating]
-FloatArray = NDArray[np.float64]
+from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 
 # Lines so far outside the bins, in bins, no longer reach them through the window.
 _REACH_BINS = 1.5
@@ -251,7 +248,7 @@ class HarmonicCanceller:
         self._limits_hz = told * (1.0 - share), told * (1.0 + share)
         self._engine = self._engine.within(*self._limits_hz)
 
-    def cancel(self, spectra: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def cancel(self, spectra: Complex64Array) -> Complex64Array:
         r"""Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
 
         .. math:: X'_{t,k,m} = X_{t,k,m} - \sum_h \kappa_h \hat c_{h,m}\, g_{t,k,h}, \qquad
@@ -304,7 +301,7 @@ class HarmonicCanceller:
         rest = lines.reshape(heard.shape)
         return np.asarray(np.subtract(heard, rest, out=rest))
 
-    def _orders(self, frequency_hz: float) -> NDArray[np.int64]:
+    def _orders(self, frequency_hz: float) -> IntArray:
         """Return the orders that reach the bins."""
         place = self._all_orders * frequency_hz / self._bin_hz
         near = (place > self._bins[0] - _REACH_BINS) & (place < self._bins[-1] + _REACH_BINS)
@@ -324,17 +321,17 @@ class _LineShapes:
     turn : (frames, H) complex
     """
 
-    orders: NDArray[np.int64]
-    kernel: NDArray[np.float32]
-    turn: NDArray[np.complex64]
+    orders: IntArray
+    kernel: Float32Array
+    turn: Complex64Array
 
     @classmethod
     def of(
         cls,
         engine: EngineState,
         time_s: FloatArray,
-        orders: NDArray[np.int64],
-        bins: NDArray[np.int64],
+        orders: IntArray,
+        bins: IntArray,
         bin_hz: float,
     ) -> "_LineShapes":
         kernel = _signed_kernel(engine.frequencies(time_s.mean()) * orders / bin_hz, bins)
@@ -342,19 +339,17 @@ class _LineShapes:
         turn = np.exp(1j * angle).astype(np.complex64)
         return cls(orders, kernel, turn)
 
-    def over_bins(
-        self, turn: NDArray[np.complex64], weights: NDArray[np.float32] | None = None
-    ) -> ComplexArray:
+    def over_bins(self, turn: Complex64Array, weights: Float32Array | None = None) -> ComplexArray:
         """Spread turns (frames, H) over the bins, with a weight each (bins,): (frames * bins, H)."""
         kernel = self.kernel if weights is None else weights[:, None] * self.kernel
         return np.asarray((turn[:, None, :] * kernel).reshape(-1, len(self.orders)))
 
-    def weighted_gram(self, weights: NDArray[np.float32]) -> ComplexArray:
+    def weighted_gram(self, weights: Float32Array) -> ComplexArray:
         """Return G^H W G with a weight per bin (bins,), without the product over all frames and bins."""
         over_bins = self.kernel.T @ (weights[:, None] * self.kernel)
         return np.asarray((self.turn.conj().T @ self.turn) * over_bins)
 
-    def weighted_moment(self, weights: NDArray[np.float32], spectra: NDArray[np.complex64]) -> ComplexArray:
+    def weighted_moment(self, weights: Float32Array, spectra: Complex64Array) -> ComplexArray:
         """Return G^H W X, (H, M)."""
         adjoint = self.over_bins(self.turn.conj(), weights).T
         return np.asarray(adjoint @ spectra.reshape(-1, spectra.shape[2]))
@@ -373,14 +368,14 @@ class _Fit:
         Weighted sum of |X|^2 per microphone and number of values behind it.
     """
 
-    orders: NDArray[np.int64]
+    orders: IntArray
     gram: ComplexArray
     moment: ComplexArray
     energy: float
     count: float
 
     @classmethod
-    def of(cls, shapes: _LineShapes, spectra: NDArray[np.complex64]) -> "_Fit":
+    def of(cls, shapes: _LineShapes, spectra: Complex64Array) -> "_Fit":
         n_frames, n_bins, _ = spectra.shape
         weights = _inverse_power(spectra)
         gram, moment = shapes.weighted_gram(weights), shapes.weighted_moment(weights, spectra)
@@ -443,7 +438,7 @@ class _Fit:
         return np.asarray(amplitudes * kept[:, None].astype(np.float32))
 
 
-def _signed_kernel(place: FloatArray, bins: NDArray[np.int64]) -> NDArray[np.float32]:
+def _signed_kernel(place: FloatArray, bins: IntArray) -> Float32Array:
     r"""Spectrum of the Hann window per sample for lines at `place`, bins, times (-1)^k: (bins, H).
 
     sinc(u) / (2 (1 - u^2)) with u = place - k, cut beyond four bins. As sin(pi u) = (-1)^k sin(pi place), the
@@ -462,7 +457,7 @@ def _signed_kernel(place: FloatArray, bins: NDArray[np.int64]) -> NDArray[np.flo
     return kernel.astype(np.float32)
 
 
-def _inverse_power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
+def _inverse_power(spectra: Complex64Array) -> Float32Array:
     """Return the weights that give every bin unit power, (bins,); silent bins get no say."""
     parts = spectra.view(np.float32)
     power = np.einsum("tbm,tbm->b", parts, parts) / np.float32(spectra.shape[0] * spectra.shape[2])

@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .guard_delay import Guard
+from worldstate.ground.typing import Complex64Array
+
+from .guard_delay import GuardDelay
 
 # Memory of the level of whitened noise, hops.
 _LEVEL_HOPS = 10.0
@@ -34,7 +35,7 @@ class NoiseCovariance:
         self._sum = np.zeros((n_bins, n_microphones, n_microphones), np.complex64)
         self._forgetting = forgetting_frames
 
-    def learn(self, total: NDArray[np.complex64], n_frames: int, weight: float) -> None:
+    def learn(self, total: Complex64Array, n_frames: int, weight: float) -> None:
         r"""Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
 
         .. math:: S \leftarrow e^{-w T / F} S + w \sum_t x_t x_t^H, \qquad n \leftarrow e^{-w T / F} n + w T
@@ -59,7 +60,7 @@ class NoiseCovariance:
         self._sum += total
         self.n_frames = kept * self.n_frames + weight * n_frames
 
-    def mean(self, bin_index: int) -> NDArray[np.complex64]:
+    def mean(self, bin_index: int) -> Complex64Array:
         r"""Covariance of one bin; the mean of its diagonal is one.
 
         .. math:: \hat R = S / n
@@ -81,7 +82,7 @@ class NoiseCovariance:
         return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
 
     @property
-    def total(self) -> NDArray[np.complex64]:
+    def total(self) -> Complex64Array:
         """Sum that the mean is made of, (bins, M, M)."""
         return self._sum
 
@@ -102,7 +103,7 @@ class NoiseLevel:
     """
 
     def __init__(self, guard_hops: int) -> None:
-        self._guard: Guard[float] = Guard(guard_hops)
+        self._guard: GuardDelay[float] = GuardDelay(guard_hops)
         self._sum = self._weights = 0.0
 
     def push(self, level: float, weight: float) -> float:

@@ -20,12 +20,13 @@ Signal Processing 58, 2010.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.spectra import ComplexArray, finite_complex
+from worldstate.frontend.spectra.spectra import finite_complex
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import ComplexArray
 
 # A microphone whose noise is this far below the mean (power) is dead: it keeps no say in anything.
 _DEAD = 1e-9
@@ -285,7 +286,7 @@ def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
     return root
 
 
-def _shrunk_root(R: NDArray[np.complexfloating], s: float) -> ComplexArray:
+def _shrunk_root(R: ComplexArray, s: float) -> ComplexArray:
     if s >= 1.0:
         return np.eye(len(R), dtype=R.dtype)
     values, vectors = np.linalg.eigh(R)

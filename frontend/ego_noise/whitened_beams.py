@@ -1,9 +1,9 @@
 """Beams for spectra that are whitened by a root of their own in every bin."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.steering import Steering
+from worldstate.ground.typing import Complex64Array
 
 _TINY = np.float32(1e-30)
 
@@ -35,7 +35,7 @@ class WhitenedBeams:
         basis = None if plain.basis is None else plain.basis.copy()
         self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
 
-    def update(self, bin_index: int, root: NDArray[np.complex64]) -> None:
+    def update(self, bin_index: int, root: Complex64Array) -> None:
         r"""Use another inverse root (M, M) in one bin.
 
         .. math:: w(\theta) = \sqrt M\, \frac{\overline{R^{-1/2}}\, \overline{a(\theta)}}

@@ -1,7 +1,8 @@
 """Who is there: channels that are silent or crackle now, always, or now and then."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import BoolArray
 
 from .channel_health import ChannelFault, Fault, faults_where
 
@@ -10,7 +11,7 @@ _MEMORY_HOPS = 50
 _SILENCE_HOPS = 10
 
 
-class Presence:
+class ChannelActivity:
     """Hops in which a channel was of no use, over the last five seconds.
 
     Bad until now since one moment means dead; bad in several stretches, or once and well again, intermittent.
@@ -23,7 +24,7 @@ class Presence:
 
     Examples
     --------
-    >>> presence = Presence(3)
+    >>> presence = ChannelActivity(3)
     >>> for hop in range(4):
     ...     bad = presence.push(np.array([False, True, hop % 2 == 0]))
     >>> [(fault.channel, fault.fault.value, fault.value) for fault in presence.faults()]
@@ -37,7 +38,7 @@ class Presence:
         self._dead = self._intermittent = np.zeros(n_channels, bool)
         self._share = np.zeros(n_channels)
 
-    def push(self, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def push(self, bad: BoolArray) -> BoolArray:
         """Take one flag per channel (M,); give it back.
 
         Parameters
@@ -53,7 +54,7 @@ class Presence:
         self._n_silent = 0
         return self._remember(bad)
 
-    def all_silent(self) -> NDArray[np.bool_]:
+    def all_silent(self) -> BoolArray:
         """Take a hop in which all are silent, which for a second is held against nobody.
 
         ``bad = (n >= 10)`` for all channels, n being the hops of silence in a row.
@@ -71,14 +72,14 @@ class Presence:
         silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
         return self._remember(silent) if silent.any() else silent
 
-    def _remember(self, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _remember(self, bad: BoolArray) -> BoolArray:
         self._bad[self._n_hops % _MEMORY_HOPS] = bad
         self._n_hops += 1
         if bad.any() or self._share.any():
             self._judge(bad)
         return bad
 
-    def _judge(self, bad: NDArray[np.bool_]) -> None:
+    def _judge(self, bad: BoolArray) -> None:
         n = min(self._n_hops, _MEMORY_HOPS)
         newest = self._n_hops % _MEMORY_HOPS
         ordered = self._bad[:n] if n < _MEMORY_HOPS else np.roll(self._bad, -newest, axis=0)
@@ -90,7 +91,7 @@ class Presence:
         self._share = count / n
 
     @property
-    def suspects(self) -> NDArray[np.bool_]:
+    def suspects(self) -> BoolArray:
         """Dead and intermittent channels, (M,)."""
         return np.asarray(self._dead | self._intermittent)
 

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.channel_mask import ChannelMask
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import NotUsable
 
-from .dropouts import Gap
+from .dropouts import Dropout
 from .sample_clock import RateEstimate
 
 
@@ -83,7 +83,7 @@ class ArrayHealth:
         Microphones that count in this hop.
     faults : tuple of ChannelFault
         What is wrong now, by channel; one channel may have several.
-    gaps : tuple of Gap
+    gaps : tuple of Dropout
         The last few places where samples are missing, silent or repeated.
     n_gaps : int
         Number of such places since the start.
@@ -103,7 +103,7 @@ class ArrayHealth:
 
     mask: ChannelMask
     faults: tuple[ChannelFault, ...]
-    gaps: tuple[Gap, ...]
+    gaps: tuple[Dropout, ...]
     n_gaps: int
     coherence: float | NotUsable
     sample_rate: RateEstimate | NotUsable
@@ -133,7 +133,7 @@ class ArrayHealth:
         rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
         return not (self.faults or self.n_gaps or rate_is_wrong)
 
-    def with_fault(self, *kinds: Fault) -> NDArray[np.intp]:
+    def with_fault(self, *kinds: Fault) -> IndexArray:
         """Channels that have one of these faults, ascending.
 
         Parameters
@@ -154,7 +154,7 @@ class ArrayHealth:
         return np.unique(np.array([f.channel for f in self.faults if f.fault in kinds], np.intp))
 
 
-def faults_where(fault: Fault, found: NDArray[np.bool_], values: NDArray[np.float64]) -> list[ChannelFault]:
+def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:
     """List one fault of several channels, (M,) each.
 
     Parameters

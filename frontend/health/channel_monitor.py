@@ -1,17 +1,17 @@
 """Watching the microphones of a stream, hop by hop, against each other."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, FloatArray
 
-from .channel_activity import Presence
+from .channel_activity import ChannelActivity
 from .channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Fault, faults_where
-from .clipping import RailCounter
-from .dropouts import Gap, GapFinder
-from .geometry_check import PlaceCheck
-from .running_mean import SlowMean
+from .clipping import ClippingCounter
+from .dropouts import Dropout, DropoutFinder
+from .geometry_check import GeometryCheck
+from .running_mean import RunningMean
 from .sample_clock import SampleClock
 
 # Mean square of the band against the median channel's below which a channel counts as silent: -30 dB.
@@ -58,27 +58,27 @@ class ChannelMonitor:
     def __init__(
         self,
         array: MicrophoneArray,
-        frequencies_hz: NDArray[np.float64],
+        frequencies_hz: FloatArray,
         sample_rate_hz: float,
         speed_of_sound_m_s: float = 343.0,
     ) -> None:
         n = array.n_microphones
         self.clock = SampleClock(sample_rate_hz)
-        self._presence = Presence(n)
-        self._usual = SlowMean((3, n))
+        self._presence = ChannelActivity(n)
+        self._usual = RunningMean((3, n))
         self._own: list[ChannelFault] = []
         self._n_hops = 0
-        self._rails = RailCounter(n)
-        self._gap_finder = GapFinder(n)
-        self._gaps: tuple[Gap, ...] = ()
+        self._rails = ClippingCounter(n)
+        self._gap_finder = DropoutFinder(n)
+        self._gaps: tuple[Dropout, ...] = ()
         self._n_gaps = 0
-        self._places = PlaceCheck(array, frequencies_hz, speed_of_sound_m_s)
+        self._places = GeometryCheck(array, frequencies_hz, speed_of_sound_m_s)
 
     def push(
         self,
-        samples: NDArray[np.float32],
-        energies: NDArray[np.float64],
-        matrices: NDArray[np.complex64],
+        samples: Float32Array,
+        energies: FloatArray,
+        matrices: Complex64Array,
     ) -> ArrayHealth:
         r"""Take one hop, say which channels count in it and why.
 
@@ -117,13 +117,11 @@ class ChannelMonitor:
         self._places.push(matrices, len(energies), ~self._presence.suspects)
         return self._report(bad)
 
-    def _remember(self, gaps: list[Gap]) -> None:
+    def _remember(self, gaps: list[Dropout]) -> None:
         self._n_gaps += len(gaps)
         self._gaps = (*self._gaps, *gaps)[-_KEPT_GAPS:]
 
-    def _judge_hop(
-        self, samples: NDArray[np.float32], energies: NDArray[np.float64], span: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
+    def _judge_hop(self, samples: Float32Array, energies: FloatArray, span: Float32Array) -> BoolArray:
         """Which channels are silent or crackle in this hop."""
         alive = span > 0.0
         if not alive.any():
@@ -140,7 +138,7 @@ class ChannelMonitor:
         self._usual.add(np.stack([span, np.log(np.maximum(level, _SILENT)), share @ samples]), ~bad)
         return self._presence.push(bad)
 
-    def _report(self, bad: NDArray[np.bool_]) -> ArrayHealth:
+    def _report(self, bad: BoolArray) -> ArrayHealth:
         if self._n_hops % _EVERY_HOPS == 0:
             self._own = self._own_faults()
         self._n_hops += 1
@@ -169,7 +167,7 @@ class ChannelMonitor:
         ]
 
 
-def _extremes(samples: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _extremes(samples: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Lowest and highest sample of every channel, (M,) each; long rows are faster than short ones."""
     rows, n_channels = len(samples) // _ROWS * _ROWS, samples.shape[1]
     wide, rest = samples[:rows].reshape(-1, _ROWS * n_channels), samples[rows:]

@@ -1,7 +1,8 @@
 """Clipping: samples that pile up at one extreme value of a channel, wherever that value is."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import Float32Array, FloatArray
 
 # Width of the shell below an extreme that an unclipped distribution fills more than the extreme itself.
 _SHELL = np.float32(0.1)
@@ -11,7 +12,7 @@ _COARSE = np.float32(0.02)
 _MIN_COUNT = 16
 
 
-class RailCounter:
+class ClippingCounter:
     """Count samples at and just below the highest and the lowest value of every channel.
 
     An unclipped sound meets its extreme once, and more often the values just below it; a clipped one stays at
@@ -27,7 +28,7 @@ class RailCounter:
     --------
     >>> sound = np.random.default_rng(0).standard_normal((4800, 2)).astype(np.float32)
     >>> sound[:, 1] = sound[:, 1].clip(-1.5, 1.5)
-    >>> rails = RailCounter(2)
+    >>> rails = ClippingCounter(2)
     >>> for _ in range(2):
     ...     rails.push(sound, sound.min(axis=0), sound.max(axis=0))
     >>> rails.clipped_share().round(2)
@@ -40,9 +41,7 @@ class RailCounter:
         self._at = np.zeros((2, n_channels), np.int64)
         self._below = np.zeros((2, n_channels), np.int64)
 
-    def push(
-        self, samples: NDArray[np.float32], lowest: NDArray[np.float32], highest: NDArray[np.float32]
-    ) -> None:
+    def push(self, samples: Float32Array, lowest: Float32Array, highest: Float32Array) -> None:
         r"""Take the samples (n, M) of a hop and their extremes (M,).
 
         .. math:: n_{at} = \#\{x = x_{max}\}, \qquad
@@ -70,9 +69,9 @@ class RailCounter:
         self,
         side: int,
         sign: np.float32,
-        samples: NDArray[np.float32],
-        top: NDArray[np.float32],
-        span: NDArray[np.float32],
+        samples: Float32Array,
+        top: Float32Array,
+        span: Float32Array,
     ) -> None:
         extreme, at, below = self._extreme[side], self._at[side], self._below[side]
         reached = np.flatnonzero((top == extreme) & (span > 0.0))
@@ -89,7 +88,7 @@ class RailCounter:
             at[reached] += n_at * fine
             below[reached] += n_below * fine
 
-    def clipped_share(self) -> NDArray[np.float64]:
+    def clipped_share(self) -> FloatArray:
         r"""Share of all samples that stand at a rail, (M,); 0 for channels without one.
 
         .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]

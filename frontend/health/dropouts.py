@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from worldstate.ground.typing import BoolArray, Float32Array, IndexArray
+
 GapKind = Literal["still", "splice", "repeat"]
 
 # Channels looked at, evenly picked: a few say what all would.
@@ -33,7 +35,7 @@ _TINY = np.finfo(np.float32).tiny
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class Dropout:
     """A place where the stream is broken.
 
     Parameters
@@ -48,7 +50,7 @@ class Gap:
 
     Examples
     --------
-    >>> Gap("still", 48_000, 512).kind
+    >>> Dropout("still", 48_000, 512).kind
     'still'
     """
 
@@ -57,7 +59,7 @@ class Gap:
     n_samples: int | None
 
 
-class GapFinder:
+class DropoutFinder:
     """Find gaps hop by hop.
 
     Parameters
@@ -69,8 +71,8 @@ class GapFinder:
     --------
     >>> sound = np.random.default_rng(0).standard_normal((4800, 8)).astype(np.float32)
     >>> sound[1000:1100] = 0.0
-    >>> GapFinder(8).push(sound, np.ones(8, bool))
-    [Gap(kind='still', sample=1000, n_samples=100)]
+    >>> DropoutFinder(8).push(sound, np.ones(8, bool))
+    [Dropout(kind='still', sample=1000, n_samples=100)]
     """
 
     def __init__(self, n_channels: int) -> None:
@@ -79,7 +81,7 @@ class GapFinder:
         self._still = StillRuns()
         self._repeats = RepeatFinder()
 
-    def push(self, samples: NDArray[np.float32], alive: NDArray[np.bool_]) -> list[Gap]:
+    def push(self, samples: Float32Array, alive: BoolArray) -> list[Dropout]:
         """Take the samples (n, M) of a hop and the channels that are not constant in it.
 
         Parameters
@@ -91,7 +93,7 @@ class GapFinder:
 
         Returns
         -------
-        list of Gap
+        list of Dropout
             Those that end or show within this hop.
         """
         start = self._n_seen - len(self._tail)
@@ -106,7 +108,7 @@ class GapFinder:
         gaps += self._repeats.push(sound[:, -len(samples) :], self._n_seen)
         return sorted(gaps, key=lambda gap: gap.sample)
 
-    def _picked(self, samples: NDArray[np.float32], alive: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def _picked(self, samples: Float32Array, alive: BoolArray) -> Float32Array:
         """Give a few living channels, channel by channel: what follows runs along time."""
         every = max(-(-int(np.count_nonzero(alive)) // _PICKED), 1)
         picks = slice(None, None, every) if alive.all() else np.flatnonzero(alive)[::every]
@@ -125,7 +127,7 @@ class StillRuns:
     >>> runs, still = StillRuns(), np.zeros(300, bool)
     >>> still[100:150] = True
     >>> runs.push(still, end=300)
-    [Gap(kind='still', sample=99, n_samples=51)]
+    [Dropout(kind='still', sample=99, n_samples=51)]
     """
 
     def __init__(self) -> None:
@@ -133,7 +135,7 @@ class StillRuns:
         self._heard = False
         self._n_still, self._n_moving = 0, 0
 
-    def push(self, still: NDArray[np.bool_], end: int) -> list[Gap]:
+    def push(self, still: BoolArray, end: int) -> list[Dropout]:
         r"""Take one flag per sample, the last being sample `end` - 1; give the runs that end here.
 
         A run is a gap from the length L that still samples by chance, a share q of all, hardly make:
@@ -149,7 +151,7 @@ class StillRuns:
 
         Returns
         -------
-        list of Gap
+        list of Dropout
             In order of time.
 
         References
@@ -168,14 +170,14 @@ class StillRuns:
         edges = np.concatenate([[-1 - self._length], moving])
         lengths = np.diff(edges) - 1
         found = np.flatnonzero(lengths >= self._shortest(lengths))
-        gaps = [Gap("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
+        gaps = [Dropout("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
         if not self._heard:
             gaps = [gap for gap in gaps if gap.sample > 0 and gap.sample >= first + moving[0]]
         self._heard = True
         self._length = int(len(still) - 1 - moving[-1])
         return gaps
 
-    def _shortest(self, lengths: NDArray[np.intp]) -> float:
+    def _shortest(self, lengths: IndexArray) -> float:
         """Length that single samples which do not change, as often as they come, hardly make."""
         self._n_still += int(lengths[lengths < _SHORTEST_STILL].sum())
         self._n_moving += len(lengths)
@@ -183,7 +185,7 @@ class StillRuns:
         return max(_SHORTEST_STILL, np.log(_STILL_CHANCE) / np.log(share)) if share else _SHORTEST_STILL
 
 
-def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool_]) -> list[Gap]:
+def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dropout]:
     r"""Find samples at which the sound of all channels at once is not what its last samples foretell.
 
     With d the differences, e their prediction errors and J the jump of two samples,
@@ -205,7 +207,7 @@ def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool
 
     Returns
     -------
-    list of Gap
+    list of Dropout
         In order of time.
 
     References
@@ -218,7 +220,7 @@ def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool
     >>> sound = np.cumsum(np.random.default_rng(0).standard_normal((8, 4000)), axis=1).cumsum(axis=1)
     >>> change = np.diff(np.delete(sound, np.s_[2000:2100], axis=1)).astype(np.float32)
     >>> find_splices(change, 1, np.zeros(3899, bool))
-    [Gap(kind='splice', sample=2000, n_samples=None)]
+    [Dropout(kind='splice', sample=2000, n_samples=None)]
     """
     error = _prediction_error(change)
     np.square(error, out=error)
@@ -232,10 +234,10 @@ def find_splices(change: NDArray[np.float32], start: int, still: NDArray[np.bool
     near_still = np.convolve(still, np.ones(9), "same")[1:-1] > 2
     found = np.flatnonzero((jump > limit) & ~near_still)
     apart = found[np.diff(found, prepend=-100) > 50]
-    return [Gap("splice", int(start + 2 + index), None) for index in apart]
+    return [Dropout("splice", int(start + 2 + index), None) for index in apart]
 
 
-def _prediction_error(change: NDArray[np.float32]) -> NDArray[np.float32]:
+def _prediction_error(change: Float32Array) -> Float32Array:
     """Remainder of the best prediction of every difference from the one before, one rule for all channels."""
     # A product or two reach from one channel into the next: nothing among thousands.
     flat = change.ravel()
@@ -268,7 +270,7 @@ class RepeatFinder:
         self._lag = 0
         self._end = 0
 
-    def push(self, sound: NDArray[np.float32], end: int) -> list[Gap]:
+    def push(self, sound: Float32Array, end: int) -> list[Dropout]:
         r"""Take a hop of a few channels (channels, n); `end` is the number of samples so far.
 
         .. math:: h[n] = \sum_c a_c\, b_c[n] \bmod 2^{64}, \qquad
@@ -285,7 +287,7 @@ class RepeatFinder:
 
         Returns
         -------
-        list of Gap
+        list of Dropout
             At most one.
 
         References
@@ -307,7 +309,7 @@ class RepeatFinder:
         self._now.update(zip(keys, places, strict=True))
         return self._repeat(lags)
 
-    def _anchors(self, sound: NDArray[np.float32], start: int) -> tuple[list[int], list[int]]:
+    def _anchors(self, sound: Float32Array, start: int) -> tuple[list[int], list[int]]:
         bits = np.ascontiguousarray(sound).view(np.uint32)
         hashes: NDArray[np.uint64] = (bits * self._factors[: len(bits), None]).sum(axis=0, dtype=np.uint64)
         # High bits are the well-mixed ones of a product.
@@ -317,7 +319,7 @@ class RepeatFinder:
         where = np.flatnonzero(anchored)
         return hashes[where].tolist(), (where + start).tolist()
 
-    def _repeat(self, lags: list[tuple[int, int]]) -> list[Gap]:
+    def _repeat(self, lags: list[tuple[int, int]]) -> list[Dropout]:
         if len(lags) < _MIN_ANCHORS:
             return []
         lag, count = Counter(lag for lag, _ in lags).most_common(1)[0]
@@ -326,4 +328,4 @@ class RepeatFinder:
         places = [place for found, place in lags if found == lag]
         goes_on = lag == self._lag and places[0] - self._end < 1000
         self._lag, self._end = lag, places[-1]
-        return [] if goes_on else [Gap("repeat", places[0], places[-1] - places[0])]
+        return [] if goes_on else [Dropout("repeat", places[0], places[-1] - places[0])]

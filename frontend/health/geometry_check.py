@@ -1,14 +1,14 @@
 """Noisy, inverted and swapped microphones, by the place that their sound fits: see `place_fit`."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.typing import BoolArray, Complex64Array, FloatArray
 from worldstate.ground.values import NotUsable
 
 from .channel_health import ChannelFault, Fault, faults_where
-from .position_fit import place_scores, place_weights
+from .position_fit import position_scores, position_weights
 
 # Judged once in so many hops, on a mean over the last two seconds.
 _EVERY_HOPS = 10
@@ -26,7 +26,7 @@ _RESTLESS = 0.2
 _OTHER_MARGIN = 0.1
 
 
-class PlaceCheck:
+class GeometryCheck:
     """Judge the places of all channels once a second; a verdict needs two judgements in a row.
 
     Parameters
@@ -46,7 +46,7 @@ class PlaceCheck:
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1 * i, 0] for i in range(5)])
-    >>> check, frequencies = PlaceCheck(array, np.array([100.0])), np.array([100.0])
+    >>> check, frequencies = GeometryCheck(array, np.array([100.0])), np.array([100.0])
     >>> wave = array.steering(frequencies, 0.3)[:, :, 0] * np.array([1, 1, -1, 1, 1])
     >>> matrices = (wave[:, :, None] * wave[:, None].conj()).astype(np.complex64)
     >>> for hop in range(20):
@@ -56,7 +56,7 @@ class PlaceCheck:
     """
 
     def __init__(
-        self, array: MicrophoneArray, frequencies_hz: NDArray[np.float64], speed_of_sound_m_s: float = 343.0
+        self, array: MicrophoneArray, frequencies_hz: FloatArray, speed_of_sound_m_s: float = 343.0
     ) -> None:
         n = array.n_microphones
         self.coherence: float | NotUsable = NotUsable("the first second is not over")
@@ -65,12 +65,12 @@ class PlaceCheck:
         self._n_frames = 0.0
         self._hops = 0
         self._usable = np.ones(n, bool)
-        self._weights = place_weights(array, frequencies_hz, self._usable, speed_of_sound_m_s)
+        self._weights = position_weights(array, frequencies_hz, self._usable, speed_of_sound_m_s)
         self._suspects = np.zeros(n, bool)
         self._once: set[ChannelFault] = set()
         self._faults: list[ChannelFault] = []
 
-    def push(self, matrices: NDArray[np.complex64], n_frames: int, there: NDArray[np.bool_]) -> None:
+    def push(self, matrices: Complex64Array, n_frames: int, there: BoolArray) -> None:
         r"""Take the cross-spectra (K, M, M) of one hop, sums over its frames, and who is there (M,).
 
         .. math:: S_{ij} \leftarrow 0.95\, S_{ij} + \mathrm{Re} \sum_t Z_i \overline{Z_j}, \qquad
@@ -106,9 +106,9 @@ class PlaceCheck:
         """
         return self._faults
 
-    def _judge(self, there: NDArray[np.bool_]) -> None:
+    def _judge(self, there: BoolArray) -> None:
         self._use(there & ~self._suspects)
-        scores = place_scores(self._sum / np.float32(self._n_frames), self._weights)
+        scores = position_scores(self._sum / np.float32(self._n_frames), self._weights)
         own = scores.diagonal()
         typical = float(np.median(own[self._usable])) if self._usable.any() else 0.0
         found: list[ChannelFault] = []
@@ -119,16 +119,14 @@ class PlaceCheck:
             found = self._find(scores, typical, there)
         self._confirm(found)
 
-    def _use(self, usable: NDArray[np.bool_]) -> None:
+    def _use(self, usable: BoolArray) -> None:
         """Guess from these channels only; new weights, where they changed, cost a few milliseconds."""
         if not np.array_equal(usable, self._usable):
             array, frequencies_hz, speed = self._geometry
             self._usable = usable
-            self._weights = place_weights(array, frequencies_hz, usable, speed)
+            self._weights = position_weights(array, frequencies_hz, usable, speed)
 
-    def _find(
-        self, scores: NDArray[np.float64], typical: float, there: NDArray[np.bool_]
-    ) -> list[ChannelFault]:
+    def _find(self, scores: FloatArray, typical: float, there: BoolArray) -> list[ChannelFault]:
         limit = typical * np.where(self._suspects, _WELL, _SUSPECT)
         own = scores.diagonal()
         inverted = there & (own < -limit)
@@ -148,7 +146,7 @@ class PlaceCheck:
         self._once = set(found)
 
 
-def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> list[ChannelFault]:
+def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
     r"""Seat channels where they fit best together, a place for each, and list those that gain by it.
 
     .. math:: \hat\pi = \arg\max_\pi \sum_m S_{m, \pi(m)}, \qquad g_m = S_{m, \hat\pi(m)} - S_{mm}
@@ -159,7 +157,7 @@ def displaced(scores: NDArray[np.float64], candidates: NDArray[np.bool_]) -> lis
     Parameters
     ----------
     scores : ndarray, shape (M, M)
-        From `place_scores`.
+        From `position_scores`.
     candidates : ndarray of bool, shape (M,)
         Channels that fit anywhere at all; they share their places among themselves.
 

@@ -23,10 +23,10 @@ Soc. Am., 1955.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 # Incoherent power of a usable channel against the field's: delay mismatch and self-noise of real arrays.
 _NOISE = 0.2
@@ -34,12 +34,12 @@ _NOISE = 0.2
 _UNUSABLE = 1e3
 
 
-def place_weights(
+def position_weights(
     array: MicrophoneArray,
-    frequencies_hz: NDArray[np.float64],
-    usable: NDArray[np.bool_],
+    frequencies_hz: FloatArray,
+    usable: BoolArray,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     r"""Weights of all other microphones in the guess at every place.
 
     .. math:: w_{pj} = -\frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}, \qquad
@@ -69,7 +69,7 @@ def place_weights(
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0], [0, -0.1, 0]])
-    >>> place_weights(array, np.array([100.0]), np.ones(3, bool))[0, 1].round(2) + 0.0
+    >>> position_weights(array, np.array([100.0]), np.ones(3, bool))[0, 1].round(2) + 0.0
     array([0.46, 0.  , 0.46], dtype=float32)
     """
     positions = array.positions_m
@@ -82,7 +82,7 @@ def place_weights(
     return np.asarray(weights, np.float32)
 
 
-def place_scores(coherence: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float64]:
+def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArray:
     r"""Score every channel at every place, between -1 and 1.
 
     .. math:: S_{mp} = \frac{\sum_k \sum_{j \ne m} w_{k,pj} R_{k,jm}}
@@ -93,7 +93,7 @@ def place_scores(coherence: NDArray[np.float32], weights: NDArray[np.float32]) -
     coherence : ndarray of float32, shape (K, M, M)
         Real part of the mean of Z_i conj(Z_j) over frames, Z being whitened spectra: the weights are real.
     weights : ndarray of float32, shape (K, M, M)
-        From `place_weights`.
+        From `position_weights`.
 
     Returns
     -------
@@ -103,13 +103,13 @@ def place_scores(coherence: NDArray[np.float32], weights: NDArray[np.float32]) -
     References
     ----------
     Derived here: the correlation of a whitened channel with the guess for a place, by C. Rasmussen and C.
-    Williams 2006 (see `place_weights`), its own share left out.
+    Williams 2006 (see `position_weights`), its own share left out.
 
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0], [0, -0.1, 0]])
-    >>> weights = place_weights(array, np.array([100.0]), np.ones(3, bool))
-    >>> place_scores(np.ones((1, 3, 3), np.float32), weights).diagonal().round(2)
+    >>> weights = position_weights(array, np.array([100.0]), np.ones(3, bool))
+    >>> position_scores(np.ones((1, 3, 3), np.float32), weights).diagonal().round(2)
     array([1., 1., 1.])
     """
     guessed = weights @ coherence

@@ -1,13 +1,15 @@
 """A running mean per channel that leaves out the hops in which a channel was of no use."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from worldstate.ground.typing import BoolArray
 
 # Time constant, hops: three seconds.
 _HOPS = 30
 
 
-class SlowMean:
+class RunningMean:
     """Exponential mean over hops, an ordinary mean until its time constant has passed.
 
     Parameters
@@ -24,7 +26,7 @@ class SlowMean:
 
     Examples
     --------
-    >>> slow = SlowMean((1, 2))
+    >>> slow = RunningMean((1, 2))
     >>> slow.add([[1.0, 5.0]], np.array([True, True]))
     >>> slow.add([[3.0, 7.0]], np.array([True, False]))
     >>> slow.mean, slow.count
@@ -35,7 +37,7 @@ class SlowMean:
         self.mean = np.zeros(shape)
         self.count = np.zeros(shape[1], np.int64)
 
-    def add(self, values: ArrayLike, good: NDArray[np.bool_]) -> None:
+    def add(self, values: ArrayLike, good: BoolArray) -> None:
         r"""Take the values of a hop, of this shape, and the channels that are good (M,).
 
         .. math:: \mu \leftarrow \mu + \frac{x - \mu}{\min(n, 30)}

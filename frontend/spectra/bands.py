@@ -1,15 +1,15 @@
 """Band levels: log-energy in a handful of bands."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 
 # Mean square that stands for silence, far below 24-bit quantisation; keeps the logarithm finite.
 SILENCE = 1e-20
 
 
-def band_edges(bins: range, n_bands: int) -> NDArray[np.int64]:
+def band_edges(bins: range, n_bands: int) -> IntArray:
     r"""Edges of bands that grow by an equal ratio, at least one bin wide each.
 
     .. math:: e_{b+1} = \max\big(e_b + 1,\; \mathrm{round}(e_b\, (e_B / e_b)^{1 / (B - b)})\big)
@@ -54,7 +54,7 @@ def band_edges(bins: range, n_bands: int) -> NDArray[np.int64]:
     return np.asarray(edges)
 
 
-def mean_square_per_bin(powers: NDArray[np.float32], nfft: int) -> NDArray[np.float64]:
+def mean_square_per_bin(powers: Float32Array, nfft: int) -> FloatArray:
     r"""Mean square of the sound per bin, averaged over frames and channels.
 
     .. math:: \overline{x^2}[k] = \frac{2 \langle |X[k]|^2 \rangle}{N \sum_n w[n]^2},
@@ -85,9 +85,7 @@ def mean_square_per_bin(powers: NDArray[np.float32], nfft: int) -> NDArray[np.fl
     return np.asarray(mean * (2.0 / (nfft * 0.375 * nfft)))
 
 
-def log_band_energy(
-    mean_square: NDArray[np.float64], edges: NDArray[np.int64], first: int
-) -> NDArray[np.float64]:
+def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> FloatArray:
     r"""Natural logarithm of the mean square in each band; silence is floored at 1e-20.
 
     .. math:: L_b = \ln \max\Big(\sum_{k = e_b}^{e_{b+1} - 1} \overline{x^2}[k],\; 10^{-20}\Big)

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from worldstate.ground.checks import in_range
+from worldstate.ground.typing import FloatArray
 
 # What folds into the band is this far down, and so is the ripple within it.
 _ATTENUATION_DB = 80.0
@@ -59,9 +60,9 @@ class Decimator:
         self.n_taps = len(taps)
         padded = np.concatenate([taps, np.zeros(-len(taps) % self.factor)])
         self._phases = np.ascontiguousarray(padded.reshape(-1, self.factor).T)
-        self._waiting: NDArray[np.float64] = np.empty(0)
+        self._waiting: FloatArray = np.empty(0)
 
-    def push(self, samples: NDArray[np.floating]) -> NDArray[np.float64]:
+    def push(self, samples: NDArray[np.floating]) -> FloatArray:
         r"""Take the next samples (n,), give the outputs that they complete.
 
         .. math:: y[m] = \sum_n h[n]\, x[m D + n]
@@ -85,7 +86,7 @@ class Decimator:
         self._waiting = waiting[n_out * self.factor :]
         return self._filtered(waiting, n_out)
 
-    def _filtered(self, x: NDArray[np.float64], n_out: int) -> NDArray[np.float64]:
+    def _filtered(self, x: FloatArray, n_out: int) -> FloatArray:
         D, Q = self._phases.shape
         rows = np.zeros((n_out + Q - 1, D))
         n_used = min(len(x), rows.size)
@@ -97,7 +98,7 @@ class Decimator:
         return np.asarray(diagonals.sum(axis=1))
 
 
-def _low_pass(rate: float, high: float, low_rate: float) -> NDArray[np.float64]:
+def _low_pass(rate: float, high: float, low_rate: float) -> FloatArray:
     width = (low_rate - 2.0 * high) / (0.5 * rate)
     n_taps, beta = signal.kaiserord(_ATTENUATION_DB, width)
     taps = signal.firwin(n_taps | 1, 0.5 * low_rate, window=("kaiser", beta), fs=rate)

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import Float32Array
 
 
 def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
@@ -56,7 +57,7 @@ class Hop:
 
     index: int
     end: int
-    samples: NDArray[np.float32]
+    samples: Float32Array
 
 
 class HopCutter:
@@ -84,7 +85,7 @@ class HopCutter:
         self._filled = 0
         self._buffer = np.empty((math.ceil(sample_rate_hz / hop_rate_hz) + 1, n_channels), np.float32)
 
-    def cut(self, block: NDArray[np.float32]) -> Iterator[Hop]:
+    def cut(self, block: Float32Array) -> Iterator[Hop]:
         """Take a block (n, M), give the hops that it completes; read the iterator to its end.
 
         Parameters

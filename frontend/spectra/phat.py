@@ -1,14 +1,15 @@
 """The phase transform: keep phases, forget magnitudes."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import Complex64Array, Float32Array
 
 # Smallest power of a bin that still counts as sound; far below 24-bit quantisation, far above float32
 # underflow.
 _POWER_FLOOR = np.float32(1e-30)
 
 
-def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
+def power(spectra: Complex64Array) -> Float32Array:
     """Squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, without a square root, same shape.
 
     Parameters
@@ -35,9 +36,7 @@ def power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
     return squared
 
 
-def whiten(
-    spectra: NDArray[np.complex64], powers: NDArray[np.float32] | None = None
-) -> NDArray[np.complex64]:
+def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Complex64Array:
     r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
 
     Parameters

@@ -1,15 +1,13 @@
 """The one check that complex spectra need at the public boundary."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
-
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
+from worldstate.ground.typing import ComplexArray
 
 
 def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ComplexArray:

@@ -1,9 +1,9 @@
 """Short-time Fourier transform of a stream, only the bins that somebody reads."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Complex64Array, Float32Array, IntArray
 
 
 class StreamingStft:
@@ -51,9 +51,9 @@ class StreamingStft:
         self._signs = ((-1.0) ** wider).astype(np.float32)[:, None]
         self._head = np.empty((nfft // 2, n_channels), np.float32)
         self._n_head = 0
-        self._previous: NDArray[np.float32] | None = None
+        self._previous: Float32Array | None = None
 
-    def push(self, samples: NDArray[np.float32]) -> NDArray[np.complex64]:
+    def push(self, samples: Float32Array) -> Complex64Array:
         r"""Take the next samples, give the frames that they complete.
 
         .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N}
@@ -81,7 +81,7 @@ class StreamingStft:
         self._previous = halves[-1].copy()
         return _frames(halves[first:], self._signs)
 
-    def _halves(self, samples: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    def _halves(self, samples: Float32Array) -> Float32Array | None:
         """Transform the half frames that are full now, (1 + n, 2, bins + 2, M); the first is left open."""
         size, n_channels = self._head.shape
         missing = size - self._n_head
@@ -102,13 +102,13 @@ class StreamingStft:
         return halves
 
 
-def _half_dft(bins: NDArray[np.int64], nfft: int) -> NDArray[np.float32]:
+def _half_dft(bins: IntArray, nfft: int) -> Float32Array:
     """Real rows, then imaginary rows of the DFT over half a frame, (2 bins, nfft / 2)."""
     phase = -2.0 * np.pi / nfft * np.outer(bins, np.arange(nfft // 2))
     return np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
 
 
-def _frames(halves: NDArray[np.float32], signs: NDArray[np.float32]) -> NDArray[np.complex64]:
+def _frames(halves: Float32Array, signs: Float32Array) -> Complex64Array:
     """Join neighbouring halves and apply the window, (n, 2, bins + 2, M) -> (n - 1, bins, M)."""
     joined = halves[1:] * signs
     joined += halves[:-1]

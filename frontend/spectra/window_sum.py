@@ -1,7 +1,8 @@
 """Sums of matrices over a sliding window that remember nothing of what has left it."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import Complex64Array
 
 # Rounding that may build up, relative to what is in the window, before it is summed again from its parts.
 _DEBT = 1e-5
@@ -45,7 +46,7 @@ class WindowSum:
         self._debt = np.zeros(n_bins)
         self._slot = 0
 
-    def open_slot(self) -> NDArray[np.complex64]:
+    def open_slot(self) -> Complex64Array:
         r"""Take the oldest set out and give its place, for the newest to be written to.
 
         .. math:: S \leftarrow S - A_{n - L}

@@ -21,9 +21,9 @@ from worldstate.abduction.grounding.class_descriptors import (
 )
 from worldstate.abduction.grounding.grounded_likelihood import (
     BACKGROUNDS,
+    AzimuthPrior,
     Background,
     GroundedSettings,
-    Sector,
     ground,
 )
 from worldstate.abduction.grounding.observation import GroundedObservation, Observable
@@ -124,7 +124,7 @@ def test_a_bearing_from_anywhere_says_nothing_of_hidden_but_something_of_visible
 @given(st.floats(-1.2, 1.2), st.floats(0.05, 0.3))
 def test_mirrored_measurements_mirror_the_answer(azimuth, std):
     swapped = SignatureEvidence(("left", "right"), SCORES.hidden[::-1], SCORES.visible, SCORES.none)
-    settings = (GroundedSettings(hidden=Sector(sign * 0.7, 0.4)) for sign in (1.0, -1.0))
+    settings = (GroundedSettings(hidden=AzimuthPrior(sign * 0.7, 0.4)) for sign in (1.0, -1.0))
     there, back = (
         ground(scores, GroundedObservation(bearing_rad=Observable(sign * azimuth, std)), [car()], one)
         for scores, sign, one in zip((SCORES, swapped), (1.0, -1.0), settings, strict=True)

@@ -21,7 +21,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.training.feature_evaluation import out_of_fold
 from worldstate.operations.training.methods import site_ensemble
 from worldstate.operations.training.site_references import with_site_references
-from worldstate.operations.training.splits import recording_folds
+from worldstate.operations.training.splits import folds_by_recording
 
 SETTINGS = SiteEstimateSettings()
 
@@ -124,7 +124,7 @@ def rates(table, prepared, train, here, rng):
     """Decisions on a stream, site learned and not, at a threshold from windows out of fold; and labels."""
     model = SiteEnsembleClassifier().fit(prepared.features[train], prepared.labels[train]).model_
     known = prepared.select(train)
-    inner = out_of_fold(known, recording_folds(known, rng), site_ensemble, rng)
+    inner = out_of_fold(known, folds_by_recording(known, rng), site_ensemble, rng)
     gamma = neyman_pearson_threshold(list(hazard_statistic(inner, 0.0)[known.hazard_free][:, None]), 0.02)
     estimate, decisions = SiteEstimate.start(60), []
     rows = stream_of(table, here, rng)

@@ -29,7 +29,11 @@ from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
-from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, Scene, measure_absence
+from worldstate.operations.detectors.miss_rate_measurement import (
+    AbsenceSettings,
+    LabelledVideo,
+    measure_absence,
+)
 
 GREY = next(street(1))
 
@@ -249,7 +253,7 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("video")
     video = open_video(write_video(folder / "street.mp4", street(26, speed_px=16.0)))
     camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
-    return Scene(video, reference(26, 16.0), camera)
+    return LabelledVideo(video, reference(26, 16.0), camera)
 
 
 def test_beta_rises_from_a_tenth_to_nine_tenths(scene):

@@ -15,7 +15,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import statistic
-from worldstate.belief.acoustic_update import hear
+from worldstate.belief.acoustic_update import acoustic_update
 from worldstate.belief.existence import after_empty_look, after_sighting
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
 from worldstate.ground.values import NotUsable
@@ -155,7 +155,7 @@ def test_an_assumed_approach_is_not_published():
 
 
 def test_an_old_approach_rate_fades():
-    """Heard to close at 0.8 1/s, then seen for three seconds and not heard to approach."""
+    """SourceEvidence to close at 0.8 1/s, then seen for three seconds and not heard to approach."""
     script = [measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in hops(1.0, 4.0)]
     script += [measured(t, FRONT, car(0.4)) for t in hops(4.0, 7.0)]
     _, states = run(start(), script)
@@ -582,9 +582,9 @@ def test_overlapping_bearings_are_not_counted_twice():
     m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
     (track,) = world.memory.tracks
     once, often = (track,), (track,)
-    once = hear(once, m, world.explanation, 1.0, FilterSettings())
+    once = acoustic_update(once, m, world.explanation, 1.0, FilterSettings())
     for _ in range(10):
-        often = hear(often, m, world.explanation, 0.1, FilterSettings())
+        often = acoustic_update(often, m, world.explanation, 0.1, FilterSettings())
     for row, most in ((0, 0.35), (2, 0.2)):
         one, ten, none = (t.motion.covariance[row, row] for t in (once[0], often[0], track))
         assert ten == pytest.approx(one, rel=most)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worldstate.frontend.array.front_back_ambiguity import twin_azimuth_rad, twin_reflection
+from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.direction.music import covariance, covariance_subspace, music_spectrum
 from worldstate.frontend.direction.music_stage import MusicReading
@@ -122,7 +122,7 @@ def test_the_twin_sounds_the_same(tilt_deg: float, azimuth_deg: float) -> None:
     c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
     array = MicrophoneArray(ARRAY.positions_m @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
     bearing = np.radians(azimuth_deg)
-    twin = twin_azimuth_rad(twin_reflection(array), bearing)
+    twin = mirror_azimuth_rad(mirror_reflection(array), bearing)
     assert isinstance(twin, float)
     assert np.degrees(
         np.angle(np.exp(1j * (twin - np.pi - 2 * np.radians(tilt_deg) + bearing)))
@@ -133,25 +133,25 @@ def test_the_twin_sounds_the_same(tilt_deg: float, azimuth_deg: float) -> None:
 
 def test_twins_of_lines_and_solids() -> None:
     line = MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)])
-    assert twin_azimuth_rad(twin_reflection(line), 0.3) == pytest.approx(np.pi - 0.3)
+    assert mirror_azimuth_rad(mirror_reflection(line), 0.3) == pytest.approx(np.pi - 0.3)
     lying = MicrophoneArray(ARRAY.positions_m[:, [2, 1, 0]])
     pole = MicrophoneArray([[0, 0, 0.1 * i] for i in range(4)])
     for array in (lying, pole, BLOCK):
-        assert isinstance(twin_azimuth_rad(twin_reflection(array), 0.3), NotUsable)
+        assert isinstance(mirror_azimuth_rad(mirror_reflection(array), 0.3), NotUsable)
 
 
 def test_the_frame_tells_the_twin_and_the_grid_shows_it() -> None:
     chosen = FrontEndSettings(azimuth_span_deg=(-180.0, 180.0))
     frame = FrontEnd(ARRAY, RATE, chosen).process(waves(ARRAY, [(30.0, 0.0)]))[-1]
     assert frame.ambiguity == "front-back"
-    assert isinstance(frame.twin_bearing_rad, float)
-    both = sorted(np.degrees([frame.bearing_rad, frame.twin_bearing_rad]))
+    assert isinstance(frame.mirror_bearing_rad, float)
+    both = sorted(np.degrees([frame.bearing_rad, frame.mirror_bearing_rad]))
     np.testing.assert_allclose(both, [30.0, 150.0], atol=1.0)
     heights = np.interp(np.radians(both), frame.azimuths_rad, frame.srp)
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     solid = FrontEnd(BLOCK, RATE, chosen).process(waves(BLOCK, [(30.0, 0.0)]))[-1]
     assert solid.ambiguity == "none"
-    assert isinstance(solid.twin_bearing_rad, NotUsable)
+    assert isinstance(solid.mirror_bearing_rad, NotUsable)
     assert np.degrees(solid.bearing_rad) == pytest.approx(30.0, abs=1.0)
 
 

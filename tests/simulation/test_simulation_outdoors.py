@@ -12,7 +12,7 @@ from worldstate.adapters.simulation import SimulationSettings, draw_settings, si
 from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.ego_motion import BRAKING_MPS2, EgoMotion
 from worldstate.adapters.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
-from worldstate.adapters.simulation.scene.occluders import Occluder, box, detours, hidden_by
+from worldstate.adapters.simulation.scene.occluders import OccludingBody, box, detours, hidden_by
 from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
 from worldstate.adapters.simulation.scene.vehicle import (
@@ -189,7 +189,7 @@ def _outline(x: float, y: float, width: float, depth: float, turn: float) -> np.
 def test_a_body_hides_what_lies_behind_it(x, y, width, depth, turn, source_x, source_y):
     """Brute force: a point of the line inside the body; and no way round is shorter than a taut string."""
     corners = _outline(x, y, width, depth, turn)
-    body = Occluder(tuple(map(tuple, corners)))
+    body = OccludingBody(tuple(map(tuple, corners)))
     line = np.linspace(0.0, 1.0, 4001)[1:-1, None] * [source_x, source_y]
     edges = np.roll(corners, -1, axis=0) - corners
     to = line[:, None] - corners
@@ -220,7 +220,7 @@ def _shorter_way(outline: np.ndarray, first: int, last: int) -> float:
 
 def test_a_long_barrier_hides_who_drives_beside_us():
     """Both of its ends may lie beyond both ends of the line."""
-    barrier = Occluder(((-60.0, 2.6), (7.0, 2.6)))
+    barrier = OccludingBody(((-60.0, 2.6), (7.0, 2.6)))
     x = np.array([-20.0, 0.0, 10.0, 14.9, 15.3, 30.0])
     expected = [True, True, True, True, False, False]
     assert hidden_by([barrier], x, np.full(6, 5.6), (0.0, 0.0)).tolist() == expected
@@ -250,7 +250,7 @@ def test_occluded_vehicles_come_into_sight_when_told_and_their_detour_has_no_jum
 )
 def test_outlines_that_are_none_are_refused(corners):
     with pytest.raises(InvalidArgumentError, match="corners_m"):
-        Occluder(corners)
+        OccludingBody(corners)
 
 
 def test_unknown_names_are_named():
@@ -271,5 +271,7 @@ def test_a_moving_site_is_the_same_place_and_only_there_the_ego_moves():
 
 def test_thin_bodies_are_bodies_too():
     assert box(1.0, 2.0, -1.0, 1.0).corners_m[2] == (2.0, 1.0)
-    assert hidden_by([Occluder(((5.0, -1.0), (5.0, 1.0)))], np.array([9.0]), np.zeros(1), (0.0, 0.0)).all()
+    assert hidden_by(
+        [OccludingBody(((5.0, -1.0), (5.0, 1.0)))], np.array([9.0]), np.zeros(1), (0.0, 0.0)
+    ).all()
     assert LIGHT.label == "car"

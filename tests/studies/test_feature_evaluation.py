@@ -17,7 +17,7 @@ from worldstate.cli.studies import evaluate_features
 from worldstate.cli.users import train
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.operations.training.feature_evaluation import cross_validate
-from worldstate.operations.training.splits import junction_folds, recording_folds, recording_labels
+from worldstate.operations.training.splits import folds_by_recording, junction_folds, recording_labels
 
 JUNCTIONS = ("SA1", "SB1", "SB2")
 KEYS = {
@@ -68,7 +68,7 @@ def command(*words):
 @given(st.integers(0, 1000), st.integers(12, 60), st.integers(2, 5))
 def test_folds_never_part_a_recording_and_share_out_every_stratum(seed, recordings, n_folds):
     table = made_up_table(recordings=recordings)
-    folds = recording_folds(table, np.random.default_rng(seed), n_folds)
+    folds = folds_by_recording(table, np.random.default_rng(seed), n_folds)
     keys, labels = table.recording_keys, recording_labels(table)
     fold_of = dict(zip(keys.tolist(), folds.tolist(), strict=True))
     assert all(fold_of[key] == fold for key, fold in zip(keys.tolist(), folds.tolist(), strict=True))
@@ -94,7 +94,7 @@ class Spy(PublishedClassifier):
         return super().predict_proba(X)
 
 
-@pytest.mark.parametrize("split", [recording_folds, junction_folds])
+@pytest.mark.parametrize("split", [folds_by_recording, junction_folds])
 def test_nothing_is_predicted_by_what_it_was_trained_on(split):
     table = made_up_table(recordings=60)
     passes = cross_validate(table, split, Spy, np.random.default_rng(0), alpha=0.1)

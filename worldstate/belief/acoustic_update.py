@@ -15,7 +15,7 @@ from .track import Track, merged
 _LOG_CLUTTER_DENSITY = -math.log(math.pi)
 
 
-def hear(
+def acoustic_update(
     tracks: tuple[Track, ...],
     measurement: Measurement,
     explanation: ExplanationBelief,

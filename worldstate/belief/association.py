@@ -9,7 +9,7 @@ from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
 
 from .settings import FilterSettings
-from .site_geometry import Scene
+from .site_geometry import SiteGeometry
 from .track import Track
 
 _NEVER = 1e6
@@ -37,7 +37,7 @@ def match_visible(
 
 
 def match_hidden(
-    tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], scene: Scene
+    tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], scene: SiteGeometry
 ) -> dict[int, int]:
     """Return {track index: sighting index}: hidden entities that came into view.
 
@@ -68,7 +68,7 @@ def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> flo
     return residual**2 / variance + (0.0 if sighting.moving == track.moving else _CHANGED_MIND)
 
 
-def _emergence(track: Track, sighting: Sighting, scene: Scene) -> float:
+def _emergence(track: Track, sighting: Sighting, scene: SiteGeometry) -> float:
     """Return the log odds of "this entity" against "nobody heard it"; -inf out of reach of any edge."""
     settings = scene.settings
     distances = [side.distance_rad(sighting.azimuth_rad) for side in scene.sides]

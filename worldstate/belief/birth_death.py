@@ -7,14 +7,14 @@ from worldstate.ground.values import NANOSECONDS_PER_SECOND
 from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
-from .site_geometry import Scene
+from .site_geometry import SiteGeometry
 from .track import Track, entity_id
 
 HIDDEN_LABEL = "vehicle"
 
 
 @dataclass(frozen=True, slots=True)
-class Hidden:
+class BirthDeath:
     """Outcome: tracks, explanations, entities that each side has brought forth, sides that began one."""
 
     tracks: tuple[Track, ...]
@@ -23,15 +23,15 @@ class Hidden:
     begun: tuple[int, ...]
 
 
-def renew_hidden(
+def birth_death(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
     births: tuple[int, ...],
     alarmed: Sequence[bool],
     rearmed: Sequence[bool],
     measurement: Measurement,
-    scene: Scene,
-) -> Hidden:
+    scene: SiteGeometry,
+) -> BirthDeath:
     """Return the world with hidden entities born, refreshed and dropped, one at most per side.
 
     Parameters
@@ -64,10 +64,10 @@ def renew_hidden(
             existence = explanation.hidden[k] + explanation.emerged[k]
             if existence >= settings.death_probability or alarmed[k]:
                 kept.append(replace(current, existence=existence))
-    return Hidden(tuple(kept), explanation, tuple(counts), tuple(begun))
+    return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))
 
 
-def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: Scene) -> Track | None:
+def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: SiteGeometry) -> Track | None:
     """Return the entity that left view near this side a moment ago, if there is one."""
     side, settings = scene.sides[k], scene.settings
     earliest_ns = stamp_ns - settings.reocclusion_s * NANOSECONDS_PER_SECOND
@@ -82,7 +82,9 @@ def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: Scene) -> Trac
     return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)
 
 
-def _hidden_again(track: Track, k: int, existence: float, measurement: Measurement, scene: Scene) -> Track:
+def _hidden_again(
+    track: Track, k: int, existence: float, measurement: Measurement, scene: SiteGeometry
+) -> Track:
     return replace(
         track,
         side=k,
@@ -94,7 +96,7 @@ def _hidden_again(track: Track, k: int, existence: float, measurement: Measureme
     )
 
 
-def _born(k: int, number: int, existence: float, measurement: Measurement, scene: Scene) -> Track:
+def _born(k: int, number: int, existence: float, measurement: Measurement, scene: SiteGeometry) -> Track:
     return Track(
         id=entity_id(scene.settings.stream, scene.sides[k].label, number),
         side=k,

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, abduce
+from worldstate.ground.typing import FloatArray
 
 from .markov_chain import RatesHz, equilibrium, transition
 
@@ -54,7 +54,7 @@ class ExplanationBelief:
         return cls(directions, _logs(np.array([*[hidden / k] * k, *[0.0] * k, visible, none])))
 
     @property
-    def probabilities(self) -> NDArray[np.float64]:
+    def probabilities(self) -> FloatArray:
         """Shape (2K + 2,), in the order of `chain`."""
         return np.exp(self.log_probabilities)
 
@@ -92,7 +92,7 @@ class ExplanationBelief:
     def update(
         self,
         evidence: SignatureEvidence,
-        log_co_evidence: NDArray[np.float64],
+        log_co_evidence: FloatArray,
     ) -> "ExplanationBelief":
         """Return the belief after one look.
 
@@ -138,6 +138,6 @@ class ExplanationBelief:
         return belief
 
 
-def _logs(probabilities: NDArray[np.float64]) -> tuple[float, ...]:
+def _logs(probabilities: FloatArray) -> tuple[float, ...]:
     with np.errstate(divide="ignore"):
         return tuple(np.maximum(np.log(probabilities), LOG_FLOOR).tolist())

@@ -9,9 +9,9 @@ chain adds is the answer to "was that the one we heard before?".
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
 RatesHz = tuple[float, float, float, float, float, float]
@@ -22,7 +22,7 @@ LONGEST_STEP_S = 1000.0
 
 
 @lru_cache(maxsize=64)
-def generator(rates_hz: RatesHz, directions: int) -> NDArray[np.float64]:
+def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
     r"""Return Q, shape (2K + 2, 2K + 2), 1/s: row i holds the rates out of state i and sums to zero.
 
     Parameters
@@ -61,7 +61,7 @@ def generator(rates_hz: RatesHz, directions: int) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=256)
-def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> NDArray[np.float64]:
+def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
     r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only.
 
     Parameters
@@ -84,14 +84,14 @@ def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> NDArray[np.f
     array([1., 1., 1., 1., 1., 1.])
     """
     step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
-    matrix: NDArray[np.float64] = np.maximum(expm(generator(rates_hz, directions) * step_s), 0.0)
+    matrix: FloatArray = np.maximum(expm(generator(rates_hz, directions) * step_s), 0.0)
     matrix /= matrix.sum(axis=1, keepdims=True)
     matrix.flags.writeable = False
     return matrix
 
 
 @lru_cache(maxsize=64)
-def equilibrium(rates_hz: RatesHz, directions: int) -> NDArray[np.float64]:
+def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
     """Return where the chain settles from "none", shape (2K + 2,).
 
     Parameters
@@ -111,5 +111,5 @@ def equilibrium(rates_hz: RatesHz, directions: int) -> NDArray[np.float64]:
     >>> equilibrium((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2).round(3)
     array([0.088, 0.088, 0.076, 0.076, 0.084, 0.588])
     """
-    settled: NDArray[np.float64] = transition(rates_hz, directions, 10**12)[-1]
+    settled: FloatArray = transition(rates_hz, directions, 10**12)[-1]
     return settled

@@ -5,13 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from numpy.typing import NDArray
 
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
 from .polar import AZIMUTH, LOG_RANGE, RADIAL_RATE, jacobian, process_noise, propagate
-
-Floats = NDArray[np.float64]
 
 # No range is ever measured from a standing ego; the belief about it only scales accelerations.
 _NEAREST_M, _FARTHEST_M = 3.0, 200.0
@@ -38,8 +36,8 @@ class MotionBelief:
     (0.674, 0.174)
     """
 
-    mean: Floats
-    covariance: Floats
+    mean: FloatArray
+    covariance: FloatArray
 
     @classmethod
     def around(
@@ -155,10 +153,10 @@ def _update(belief: MotionBelief, row: int, value: float, std: float, weight: fl
     return _belief(belief.mean + weight * step, covariance + weight * (1.0 - weight) * np.outer(step, step))
 
 
-def _wrapped(z: Floats, expected: Floats) -> Floats:
+def _wrapped(z: FloatArray, expected: FloatArray) -> FloatArray:
     return wrap_angle(z - expected)
 
 
-def _belief(mean: Floats, covariance: Floats) -> MotionBelief:
+def _belief(mean: FloatArray, covariance: FloatArray) -> MotionBelief:
     mean[AZIMUTH] = wrap_angle(float(mean[AZIMUTH]))
     return MotionBelief(mean, 0.5 * (covariance + covariance.T))

@@ -21,7 +21,8 @@ Aidala and Hammel, "Utilization of modified polar coordinates for bearings-only 
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import FloatArray
 
 AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
 
@@ -29,7 +30,7 @@ AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
 _LEAST_Q = 1e-3
 
 
-def propagate(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
+def propagate(state: FloatArray, step_s: float) -> FloatArray:
     """Return the state (theta, theta_dot, rho, log r) after `step_s`, shape (4,); theta is not wrapped.
 
     Parameters
@@ -57,7 +58,7 @@ def propagate(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
     )
 
 
-def jacobian(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
+def jacobian(state: FloatArray, step_s: float) -> FloatArray:
     """Return d propagate / d state, shape (4, 4).
 
     Parameters
@@ -96,7 +97,7 @@ def jacobian(state: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
     )
 
 
-def process_noise(acceleration_psd: float, range_m: float, step_s: float) -> NDArray[np.float64]:
+def process_noise(acceleration_psd: float, range_m: float, step_s: float) -> FloatArray:
     r"""Return Q, shape (4, 4), of a white acceleration: at range r it turns and closes by a/r.
 
     Parameters

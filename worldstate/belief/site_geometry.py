@@ -10,7 +10,7 @@ from .settings import FilterSettings
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class SideGeometry:
     """One approach side.
 
     Parameters
@@ -24,7 +24,7 @@ class Side:
 
     Examples
     --------
-    >>> round(Side("left", 0.56, 0.96, 0.35).distance_rad(-0.2), 2)
+    >>> round(SideGeometry("left", 0.56, 0.96, 0.35).distance_rad(-0.2), 2)
     0.76
     """
 
@@ -47,12 +47,12 @@ class Side:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SiteGeometry:
     """What stays the same from step to step.
 
     Parameters
     ----------
-    sides : tuple of Side
+    sides : tuple of SideGeometry
         Approach sides, in the order of the signature's directions.
     view_half_angle_rad : float
         Half the field of view of the co-evidence channel, centred on the x axis.
@@ -60,7 +60,7 @@ class Scene:
         Noise levels, gates, births and deaths.
     """
 
-    sides: tuple[Side, ...]
+    sides: tuple[SideGeometry, ...]
     view_half_angle_rad: float
     settings: FilterSettings
 

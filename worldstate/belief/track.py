@@ -8,7 +8,7 @@ from worldstate.measurement.measurement import Sighting
 
 from .existence import after_time
 from .motion import MotionBelief, predict, relax
-from .site_geometry import Scene
+from .site_geometry import SiteGeometry
 
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
 _LABEL_GAIN = 0.3
@@ -95,7 +95,7 @@ def entity_id(stream: str, kind: str, number: int) -> str:
     return str(uuid5(_NAMESPACE, f"{stream}/{kind}/{number}"))
 
 
-def predict_track(track: Track, hidden_share: float, step_s: float, scene: Scene) -> Track:
+def predict_track(track: Track, hidden_share: float, step_s: float, scene: SiteGeometry) -> Track:
     """Return the track after a time step.
 
     `hidden_share` is P(hidden | exists): as far as it is hidden, its azimuth stays where hidden vehicles are.

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
+from worldstate.ground.typing import FloatArray
 from worldstate.measurement.measurement import Measurement, Sighting
 
 from .association import match_hidden, match_visible
@@ -14,7 +14,7 @@ from .explanation import ExplanationBelief
 from .motion import MotionBelief, update_azimuth
 from .polar import LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
-from .site_geometry import Scene
+from .site_geometry import SiteGeometry
 from .track import Track, entity_id, merged, relabelled
 
 _NEW_RATE_STD = (0.5, 0.5)
@@ -24,7 +24,7 @@ _MOST_MISSES = 0.99
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class VisionUpdate:
     """Outcome of a look: the tracks, the explanations, and on which sides a hand-over took place."""
 
     tracks: tuple[Track, ...]
@@ -33,7 +33,7 @@ class Seen:
     born: int
 
 
-def log_co_evidence(answer: CoEvidence, directions: int) -> NDArray[np.float64]:
+def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
     """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats.
 
     Examples
@@ -51,8 +51,8 @@ def look(
     measurement: Measurement,
     weight: float,
     born: int,
-    scene: Scene,
-) -> Seen:
+    scene: SiteGeometry,
+) -> VisionUpdate:
     """Return the world after one look; `born` counts the entities that vision brought in so far."""
     sightings = tuple(sorted(measurement.sightings, key=lambda s: (s.azimuth_rad, s.label, s.score)))
     known = match_visible(tracks, sightings, scene.settings)
@@ -71,7 +71,7 @@ def look(
         explanation = explanation.emerge(side, scene.settings.handover_residual)
     fresh = [s for j, s in new if j not in emerging.values()]
     after += [_born(s, measurement, born + n, scene) for n, s in enumerate(fresh)]
-    return Seen(tuple(after), explanation, handed_over, born + len(fresh))
+    return VisionUpdate(tuple(after), explanation, handed_over, born + len(fresh))
 
 
 def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
@@ -118,7 +118,7 @@ def _sighted(track: Track, sighting: Sighting, measurement: Measurement, setting
     return _found(changed, measurement, settings)
 
 
-def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, scene: Scene) -> Track:
+def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, scene: SiteGeometry) -> Track:
     """Return the hidden entity as vision now has it: same id, azimuth and side from the sighting."""
     seen = replace(
         track,
@@ -131,7 +131,7 @@ def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, sce
     return _found(seen, measurement, scene.settings)
 
 
-def _not_sighted(track: Track, answer: CoEvidence, weight: float, scene: Scene) -> Track:
+def _not_sighted(track: Track, answer: CoEvidence, weight: float, scene: SiteGeometry) -> Track:
     if not track.seen:
         searched = isinstance(answer, Absent)
         miss = answer.miss_rate if isinstance(answer, Absent) else None
@@ -142,7 +142,7 @@ def _not_sighted(track: Track, answer: CoEvidence, weight: float, scene: Scene) 
     return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
 
 
-def _born(sighting: Sighting, measurement: Measurement, number: int, scene: Scene) -> Track:
+def _born(sighting: Sighting, measurement: Measurement, number: int, scene: SiteGeometry) -> Track:
     unseen = Track(
         id=entity_id(scene.settings.stream, "visible", number),
         side=scene.nearest_side(sighting.azimuth_rad),

@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
-from worldstate.belief.belief_lag import Heard, Trail
+from worldstate.belief.belief_lag import BeliefLag, SourceEvidence
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.motion import MotionBelief
 from worldstate.belief.settings import FilterSettings
@@ -158,7 +158,7 @@ def policy_from_record(record: Record) -> CueingPolicy:
         raise InvalidArgumentError(f"{record.where}: expected a cueing policy ({error!r})") from error
 
 
-def _trail_to_dict(trail: Trail) -> dict[str, Any]:
+def _trail_to_dict(trail: BeliefLag) -> dict[str, Any]:
     return {
         "beliefs": [
             {"stamp_ns": stamp_ns, "log_explanations": list(belief.log_probabilities)}
@@ -171,7 +171,7 @@ def _trail_to_dict(trail: Trail) -> dict[str, Any]:
     }
 
 
-def _trail_from_record(record: Record, directions: tuple[str, ...]) -> Trail:
+def _trail_from_record(record: Record, directions: tuple[str, ...]) -> BeliefLag:
     k = len(directions)
     beliefs = tuple(
         (item.integer("stamp_ns"), ExplanationBelief(directions, _sized(item, "log_explanations", 2 * k + 2)))
@@ -179,10 +179,12 @@ def _trail_from_record(record: Record, directions: tuple[str, ...]) -> Trail:
     )
     if not beliefs:
         raise InvalidArgumentError(f"{record.where}.beliefs: expected at least one")
-    return Trail(
+    return BeliefLag(
         beliefs,
         tuple(
-            Heard(item.text("source"), item.integer("stamp_ns"), _sized(item, "log_likelihoods", k + 2))
+            SourceEvidence(
+                item.text("source"), item.integer("stamp_ns"), _sized(item, "log_likelihoods", k + 2)
+            )
             for item in record.records("heard")
         ),
     )

@@ -26,7 +26,17 @@ from .checkpoint import (
 )
 from .memory import Memory, first_memory, priors_of
 from .snapshot_builder import cues_of, entity_of, relations_of
-from .step import Ground, advance, alarmed, alert, listen, renew, scene_of, watch, weights_of
+from .step import (
+    FilterModel,
+    advance,
+    alarmed,
+    site_geometry_of,
+    update_advisories,
+    update_entities,
+    update_evidence,
+    update_sightings,
+    weights_of,
+)
 
 # A step and the stamp that it aims at may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
@@ -152,7 +162,7 @@ class WorldFilter:
                 for edge in relations_of(track, memory.explanation, context, memory.stamp_ns)
             ),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
-            cues=cues_of(memory, self._ground, self.risk, alarmed(memory)),
+            cues=cues_of(memory, self._model, self.risk, alarmed(memory)),
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":
@@ -179,7 +189,7 @@ class WorldFilter:
             )
         if stamp_ns <= self.stamp_ns:
             return self
-        return replace(self, memory=advance(self._memory, stamp_ns, self._ground))
+        return replace(self, memory=advance(self._memory, stamp_ns, self._model))
 
     def update(self, measurement: Measurement) -> "WorldFilter":
         """Return the filter after a measurement, predicted to its time first where that was not done.
@@ -192,12 +202,12 @@ class WorldFilter:
         """
         _check(measurement, self.context, dict(self._memory.last_ns))
         world = self.predict_to(measurement.stamp_ns)
-        memory, ground = world._memory, world._ground
+        memory, model = world._memory, world._model
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
-        memory = listen(memory, measurement, weights, ground)
-        memory = watch(memory, measurement, weights, ground)
-        memory = alert(memory, measurement, ground)
-        return replace(world, memory=renew(memory, measurement, ground))
+        memory = update_evidence(memory, measurement, weights, model)
+        memory = update_sightings(memory, measurement, weights, model)
+        memory = update_advisories(memory, measurement, model)
+        return replace(world, memory=update_entities(memory, measurement, model))
 
     def to_dict(self) -> dict[str, Any]:
         """Return a checkpoint as JSON-able values: what is read back continues bit for bit.
@@ -245,8 +255,8 @@ class WorldFilter:
         return self.memory or first_memory(self.context, self.policy, self.start_ns)
 
     @cached_property
-    def _ground(self) -> Ground:
-        return Ground(self.context, self.policy, scene_of(self.context, self.settings))
+    def _model(self) -> FilterModel:
+        return FilterModel(self.context, self.policy, site_geometry_of(self.context, self.settings))
 
 
 def _check(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
-from worldstate.belief.belief_lag import Trail
+from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.track import Track
 from worldstate.state import Context, Priors
@@ -21,7 +21,7 @@ class Memory:
         Time of the belief.
     explanation : ExplanationBelief
         Which explanation holds.
-    trail : Trail
+    trail : BeliefLag
         Its past of one window.
     rule : SustainedRule
         Run of the statistic above its threshold.
@@ -47,7 +47,7 @@ class Memory:
 
     stamp_ns: int
     explanation: ExplanationBelief
-    trail: Trail
+    trail: BeliefLag
     rule: SustainedRule
     births: tuple[int, ...]
     handover_ns: tuple[int | None, ...]
@@ -66,7 +66,7 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
     return Memory(
         stamp_ns=start_ns,
         explanation=explanation,
-        trail=Trail(((start_ns, explanation),)),
+        trail=BeliefLag(((start_ns, explanation),)),
         rule=policy.rule(),
         births=(0,) * len(directions),
         handover_ns=(None,) * len(directions),

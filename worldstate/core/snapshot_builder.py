@@ -12,7 +12,7 @@ from worldstate.belief.track import Track
 from worldstate.state import EGO, Classification, Context, Entity, Relation, RiskCue, Visibility
 
 from .memory import Memory, priors_of
-from .step import Ground
+from .step import FilterModel
 
 # A range whose logarithm is less certain than this was never measured, only assumed.
 _KNOWN_LOG_RANGE_STD = 0.25
@@ -87,7 +87,7 @@ def relations_of(
 
 
 def cues_of(
-    memory: Memory, ground: Ground, hazard_risk: float, alarmed: Sequence[bool]
+    memory: Memory, ground: FilterModel, hazard_risk: float, alarmed: Sequence[bool]
 ) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
     if memory.instant is None:
@@ -95,7 +95,7 @@ def cues_of(
     return tuple(_cue(k, memory, ground, hazard_risk, named) for k, named in enumerate(alarmed))
 
 
-def _cue(k: int, memory: Memory, ground: Ground, hazard_risk: float, named: bool) -> RiskCue:
+def _cue(k: int, memory: Memory, ground: FilterModel, hazard_risk: float, named: bool) -> RiskCue:
     explanation, side, instant = memory.explanation, ground.scene.sides[k], memory.instant
     assert instant is not None
     track = next((t for t in memory.tracks if not t.seen and t.side == k), None)

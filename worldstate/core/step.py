@@ -1,4 +1,4 @@
-"""One step of the filter as pure functions: listen, watch, alert, renew."""
+"""One step of the filter as pure functions: evidence, sightings, advisories, entities."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -9,12 +9,12 @@ from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import abduce
-from worldstate.belief.acoustic_update import hear, hidden_share
-from worldstate.belief.belief_lag import Heard
-from worldstate.belief.birth_death import renew_hidden
+from worldstate.belief.acoustic_update import acoustic_update, hidden_share
+from worldstate.belief.belief_lag import SourceEvidence
+from worldstate.belief.birth_death import birth_death
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.site_geometry import Scene, Side
+from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import predict_track
 from worldstate.belief.vision_update import log_co_evidence, look, surviving
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, seconds
@@ -28,12 +28,12 @@ _TIE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class FilterModel:
     """What does not change while the filter runs."""
 
     context: Context
     policy: CueingPolicy
-    scene: Scene
+    scene: SiteGeometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +44,13 @@ class Weights:
     look: float
 
 
-def scene_of(context: Context, settings: FilterSettings) -> Scene:
+def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry:
     """Return a context as the beliefs need it."""
     sides = (
-        Side(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
+        SideGeometry(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
         for o in context.occluders
     )
-    return Scene(tuple(sides), context.view_half_angle_rad, settings)
+    return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings)
 
 
 def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
@@ -60,37 +60,37 @@ def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings
     return Weights(min(elapsed_s / settings.window_s, 1.0), min(elapsed_s / settings.look_interval_s, 1.0))
 
 
-def advance(memory: Memory, stamp_ns: int, ground: Ground) -> Memory:
+def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     """Return the memory at a later time, nothing having been measured."""
     step_ns, explanation = stamp_ns - memory.stamp_ns, memory.explanation
     tracks = tuple(
-        predict_track(track, hidden_share(track, explanation), seconds(step_ns), ground.scene)
+        predict_track(track, hidden_share(track, explanation), seconds(step_ns), model.scene)
         for track in memory.tracks
     )
     return replace(
         memory,
         stamp_ns=stamp_ns,
-        explanation=explanation.predict(ground.context.rates.values_hz, step_ns),
-        tracks=surviving(tracks, ground.scene.settings),
+        explanation=explanation.predict(model.context.rates.values_hz, step_ns),
+        tracks=surviving(tracks, model.scene.settings),
     )
 
 
-def listen(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:
+def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel) -> Memory:
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
-    settings, source, stamp_ns = ground.scene.settings, measurement.source, measurement.stamp_ns
+    settings, source, stamp_ns = model.scene.settings, measurement.source, measurement.stamp_ns
     window_ns = nanoseconds(settings.window_s)
     base = memory.trail.base(source, stamp_ns, window_ns)
-    prior = base.belief.predict(ground.context.rates.values_hz, stamp_ns - base.stamp_ns)
-    answer = log_co_evidence(measurement.co_evidence, len(ground.scene.sides))
+    prior = base.belief.predict(model.context.rates.values_hz, stamp_ns - base.stamp_ns)
+    answer = log_co_evidence(measurement.co_evidence, len(model.scene.sides))
     signature = _with_hand_overs(measurement.signature, memory.handover_ns, stamp_ns - window_ns)
     explanation = prior.update(signature, answer + base.log_likelihoods)
     said = np.maximum(signature.log_likelihoods + answer, LOG_FLOOR)
-    heard = Heard(source, stamp_ns, tuple(said.tolist()))
+    heard = SourceEvidence(source, stamp_ns, tuple(said.tolist()))
     return replace(
         memory,
         explanation=explanation,
         trail=memory.trail.add(heard, explanation, window_ns),
-        tracks=hear(memory.tracks, measurement, explanation, weights.sound, settings),
+        tracks=acoustic_update(memory.tracks, measurement, explanation, weights.sound, settings),
         predicted=priors_of(prior),
     )
 
@@ -107,7 +107,9 @@ def _with_hand_overs(
     return replace(signature, visible=max([signature.visible, *before]))
 
 
-def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Ground) -> Memory:
+def update_sightings(
+    memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel
+) -> Memory:
     """Return the memory after the sightings, the empty looks and the hand-overs they bring."""
     seen = look(
         memory.tracks,
@@ -115,18 +117,18 @@ def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Gr
         measurement,
         weights.look,
         memory.sighted,
-        ground.scene,
+        model.scene,
     )
     handover_ns = tuple(
         measurement.stamp_ns if k in seen.handed_over else before_ns
         for k, before_ns in enumerate(memory.handover_ns)
     )
-    residual, trail = ground.scene.settings.handover_residual, memory.trail
+    residual, trail = model.scene.settings.handover_residual, memory.trail
     for side in seen.handed_over:
         trail = trail.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
     return replace(
         memory,
-        tracks=surviving(seen.tracks, ground.scene.settings),
+        tracks=surviving(seen.tracks, model.scene.settings),
         explanation=seen.explanation,
         trail=trail,
         handover_ns=handover_ns,
@@ -134,13 +136,13 @@ def watch(memory: Memory, measurement: Measurement, weights: Weights, ground: Gr
     )
 
 
-def alert(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
+def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
     """Return the memory after the sustained rule has taken in this window's statistic."""
-    log_prior = np.log(ground.policy.reference_prior)
+    log_prior = np.log(model.policy.reference_prior)
     instant = abduce(log_prior, measurement.signature, measurement.co_evidence)
-    held = instant.hidden_total >= ground.policy.gamma_at(memory.threshold.shift_nats)
+    held = instant.hidden_total >= model.policy.gamma_at(memory.threshold.shift_nats)
     alerted = replace(memory, instant=instant, rule=memory.rule.advance(held))
-    return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, ground.policy))
+    return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, model.policy))
 
 
 def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThreshold:
@@ -164,17 +166,17 @@ def alarmed(memory: Memory) -> tuple[bool, ...]:
     return tuple(memory.rule.alarm and p >= least for p in hidden)
 
 
-def renew(memory: Memory, measurement: Measurement, ground: Ground) -> Memory:
+def update_entities(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
     """Return the memory after births and deaths of hidden entities, the measurement counted."""
-    rearm_ns = ground.scene.settings.rearm_s * NANOSECONDS_PER_SECOND
-    hidden = renew_hidden(
+    rearm_ns = model.scene.settings.rearm_s * NANOSECONDS_PER_SECOND
+    hidden = birth_death(
         memory.tracks,
         memory.explanation,
         memory.births,
         alarmed(memory),
         [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
         measurement,
-        ground.scene,
+        model.scene,
     )
     trail = memory.trail
     for side in hidden.begun:

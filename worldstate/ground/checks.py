@@ -6,12 +6,14 @@ Every check names the argument, what came and what was expected.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from worldstate.ground.typing import FloatArray
 
 from .errors import InvalidArgumentError
 
 
-def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> NDArray[np.float64]:
+def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:
     """Return `value` as finite float64 of the given shape; `None` leaves an axis free.
 
     Parameters

@@ -1,10 +1,14 @@
 """Small values that every storey of the house speaks of."""
 
 from dataclasses import dataclass
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import FloatArray
+
+# A float stays a float, an array an array.
+AngleT = TypeVar("AngleT", float, FloatArray)
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
 
@@ -24,11 +28,7 @@ class NotUsable:
     reason: str
 
 
-@overload
-def wrap_angle(angle_rad: float) -> float: ...
-@overload
-def wrap_angle(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]: ...
-def wrap_angle(angle_rad: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
+def wrap_angle(angle_rad: AngleT) -> AngleT:
     """Wrap an angle in radians into (-pi, pi].
 
     Parameters
@@ -47,7 +47,7 @@ def wrap_angle(angle_rad: float | NDArray[np.float64]) -> float | NDArray[np.flo
     (-1.571, True)
     """
     wrapped = np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2 * np.pi)
-    return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped
+    return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped  # type: ignore[return-value]
 
 
 def seconds(stamp_ns: int) -> float:

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
 from .protocols import Side
@@ -42,7 +42,7 @@ class Sector:
             return None
         return Sector(wrap_angle(other.centre_rad + (low + high) / 2), (high - low) / 2)
 
-    def midpoints(self, n: int) -> NDArray[np.float64]:
+    def midpoints(self, n: int) -> FloatArray:
         """Return the centres of n equal parts, radians, shape (n,), not wrapped."""
         return self.centre_rad + self.half_width_rad * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
 

@@ -5,14 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
 
-Floats = NDArray[np.float32]
-Image = NDArray[np.float32]
 # From two coordinates on a surface to red, green, blue in 0..255, shape (..., 3).
-Paint = Callable[[Floats, Floats], Image]
+Paint = Callable[[Float32Array, Float32Array], Float32Array]
 
 OVERSAMPLING = 2  # rays across a pixel and down
 NEAREST_M = 0.05
@@ -72,7 +70,7 @@ class View:
         """Focal length in rays."""
         return 0.5 * self.shape[1] / math.tan(self.camera.half_angle_rad)
 
-    def rays(self, patch: Patch) -> Floats:
+    def rays(self, patch: Patch) -> Float32Array:
         """Directions in `base_link`, one unit long along the optical axis, shape (rows, columns, 3)."""
         rows, columns = self.shape
         left = (0.5 * columns - 0.5 - np.arange(patch.left, patch.right)) / self.focal
@@ -81,7 +79,7 @@ class View:
         rays = axes[0] + left[None, :, None] * axes[1] + up[:, None, None] * axes[2]
         return np.asarray(rays, np.float32)
 
-    def around(self, points_m: NDArray[np.float64]) -> Patch | None:
+    def around(self, points_m: FloatArray) -> Patch | None:
         """Return whole pixels around the projection of points ahead, (n, 3); None where it is outside."""
         ahead, left, up = (self._axes @ (points_m - self.camera.position_m).T).astype(np.float64)
         ahead = np.maximum(ahead, NEAREST_M)
@@ -93,7 +91,7 @@ class View:
         return Patch(top, bottom, low, high) if low < high and top < bottom else None
 
     @property
-    def _axes(self) -> NDArray[np.float64]:
+    def _axes(self) -> FloatArray:
         """Forward, left and up, shape (3, 3)."""
         yaw, pitch = self.camera.yaw_rad, self.camera.pitch_rad
         sin_yaw, cos_yaw, sin_pitch, cos_pitch = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
@@ -102,7 +100,7 @@ class View:
         return np.array([forward, [-sin_yaw, cos_yaw, 0.0], up])
 
 
-def _whole(values: NDArray[np.float64], limit: int) -> tuple[int, int]:
+def _whole(values: FloatArray, limit: int) -> tuple[int, int]:
     """First and last ray of the pixels that hold all values, within the image."""
     n = OVERSAMPLING
     low, high = np.clip([values.min(), values.max()], -n, limit + n)
@@ -131,7 +129,9 @@ class Panel:
     paint: Paint
 
 
-def cast_panels(view: View, patch: Patch, panels: list[Panel], sky: Paint) -> tuple[Image, Floats]:
+def cast_panels(
+    view: View, patch: Patch, panels: list[Panel], sky: Paint
+) -> tuple[Float32Array, Float32Array]:
     """Paint a patch of rays with the nearest panel that each meets, or the sky.
 
     Returns
@@ -157,8 +157,8 @@ def cast_panels(view: View, patch: Patch, panels: list[Panel], sky: Paint) -> tu
 
 
 def cast_solid(
-    rays: Floats, eye_m: NDArray[np.float64], normals: NDArray[np.float64], offsets: NDArray[np.float64]
-) -> tuple[Floats, NDArray[np.intp]]:
+    rays: Float32Array, eye_m: FloatArray, normals: FloatArray, offsets: FloatArray
+) -> tuple[Float32Array, IndexArray]:
     r"""Meet a convex solid :math:`\{p : n_k \cdot p \le o_k\}`.
 
     Parameters
@@ -200,7 +200,7 @@ def cast_solid(
     return enter, face
 
 
-def reduced(image: Image) -> Image:
+def reduced(image: Float32Array) -> Float32Array:
     """Average the rays of each pixel, (rows, columns, 3) to (height, width, 3).
 
     Examples

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import LIGHT, VehicleKind
 from worldstate.adapters.simulation.scene.occluders import hidden_by
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
-
-Array = NDArray[np.float64]
+from worldstate.ground.typing import BoolArray, FloatArray
 
 ARRAY_HEIGHT_M = 1.7  # origin of `base_link` above the road: the array's centre on the roof
 LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs
@@ -25,7 +23,7 @@ PARKED_NOISE_PX = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Detection:
+class SimulatedDetection:
     """One box: left, top, right, bottom in pixels, a score in [0, 1] and a class name."""
 
     box_px: tuple[float, float, float, float]
@@ -33,12 +31,12 @@ class Detection:
     label: str = "car"
 
 
-Frame = tuple[Detection, ...]
+Frame = tuple[SimulatedDetection, ...]
 
 
 def visible_part(
-    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | Array = 0.0
-) -> tuple[Array, Array]:
+    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Lateral limits (right, left) of what the camera sees of the vehicle, (T,); empty if right > left."""
     ahead, _ = trajectory.behind(0.0)
     right_limit, left_limit = site.sights_m(ahead, (ego_x_m + camera.position_m[0], camera.position_m[1]))
@@ -47,8 +45,8 @@ def visible_part(
 
 
 def line_of_sight(
-    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | Array = 0.0
-) -> NDArray[np.bool_]:
+    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
+) -> BoolArray:
     """Tell when the camera sees the middle of the vehicle's front, shape (T,)."""
     ahead, across = trajectory.behind(0.0)
     eye = (ego_x_m + camera.position_m[0], camera.position_m[1])
@@ -74,7 +72,7 @@ def detect(
             frames.append(())
         else:
             score = float(np.clip(luck * (0.75 + 0.25 * min(share, 1.0)), 0.3, 0.999))
-            frames.append((Detection(_inside(box + jitter, camera), round(score, 4), kind.label),))
+            frames.append((SimulatedDetection(_inside(box + jitter, camera), round(score, 4), kind.label),))
     return frames
 
 
@@ -89,7 +87,9 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
         return [()] * frames
     noise = rng.normal(0.0, PARKED_NOISE_PX, (frames, 4))
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
-    return [(Detection(_inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)]
+    return [
+        (SimulatedDetection(_inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)
+    ]
 
 
 def to_json(frames: list[Frame]) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def _miss_rate(ahead_m: float, lateral_m: float) -> float:
 
 def _project(
     camera: PinholeCamera, middle_x: float, right_y: float, left_y: float, kind: VehicleKind = LIGHT
-) -> Array | None:
+) -> FloatArray | None:
     """Box (left, top, right, bottom) around the visible cuboid; None where it is outside the image."""
     x = middle_x + kind.width_m * np.array([-0.5, 0.5])
     z = np.array([0.0, kind.height_m]) - ARRAY_HEIGHT_M
@@ -134,7 +134,7 @@ def _project(
     return None if outside else box
 
 
-def _inside(box: Array, camera: PinholeCamera) -> tuple[float, float, float, float]:
+def _inside(box: FloatArray, camera: PinholeCamera) -> tuple[float, float, float, float]:
     """Clip to the image, keep at least one pixel, round to tenths."""
     x = np.clip(box[[0, 2]], 0.0, camera.width_px - 1.0)
     y = np.clip(box[[1, 3]], 0.0, camera.height_px - 1.0)

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
+from worldstate.ground.typing import BoolArray, Float32Array, ImageArray
 
 from .rays import OVERSAMPLING, Panel, Patch, View, cast_panels, reduced
 from .simulated_detector import ARRAY_HEIGHT_M
-from .textures import Facade, Floats, Image, asphalt, flags, grass, leaves, paving, smooth_noise, tinted
+from .textures import Facade, asphalt, flags, grass, leaves, paving, smooth_noise, tinted
 
 ROAD_Z_M = -ARRAY_HEIGHT_M
 FAR_M = 150.0
@@ -38,10 +38,10 @@ class StreetView:
     """
 
     view: View
-    image: NDArray[np.uint8]
-    depth: Floats
+    image: ImageArray
+    depth: Float32Array
 
-    def pixels(self) -> Image:
+    def pixels(self) -> Float32Array:
         """Return the image itself, shape (height, width, 3)."""
         rows = range(0, self.image.shape[0], STRIP_ROWS * OVERSAMPLING)
         step = STRIP_ROWS * OVERSAMPLING
@@ -119,7 +119,7 @@ class _Ground:
     site: Site
     seed: int
 
-    def paint(self, ahead: Floats, left: Floats) -> Image:
+    def paint(self, ahead: Float32Array, left: Float32Array) -> Float32Array:
         near, far = self.site.corner_ahead_m, self.site.corner_ahead_m + self.site.street_width_m
         image = paving(left, ahead, self.seed)
         _put(image, asphalt(ahead, left, self.seed), (ahead > near) & (ahead < far))
@@ -134,7 +134,7 @@ class _Ground:
         image *= self._light(ahead, left)[..., None]
         return image
 
-    def _marked(self, ahead: Floats, left: Floats) -> NDArray[np.bool_]:
+    def _marked(self, ahead: Float32Array, left: Float32Array) -> BoolArray:
         middle = self.site.corner_ahead_m + 0.5 * self.site.street_width_m
         line = (np.abs(ahead - middle) < 0.05) & (np.mod(left, 3.0) < 1.2)
         depth = ahead - (self.site.corner_ahead_m - 0.75)
@@ -143,18 +143,18 @@ class _Ground:
         between = (centre < self.site.corner_left_m - 0.6) & (centre > -self.site.corner_right_m + 0.6)
         return np.asarray(line | (tooth & (depth > 0.0) & (depth < 0.6) & between))
 
-    def _light(self, ahead: Floats, left: Floats) -> Floats:
+    def _light(self, ahead: Float32Array, left: Float32Array) -> Float32Array:
         """Less light at the foot of the walls of the ego's street."""
         gap = np.minimum(self.site.side_wall_left_m - left, left + self.site.side_wall_right_m)
         inside = 0.65 + 0.35 * np.clip(gap / 1.2, 0.0, 1.0)
         return np.where(ahead < self.site.corner_ahead_m, inside, 1.0).astype(np.float32)
 
 
-def _put(image: Image, other: Image, where: NDArray[np.bool_]) -> None:
+def _put(image: Float32Array, other: Float32Array, where: BoolArray) -> None:
     image[where] = other[where]
 
 
-def _sky(left: Floats, up: Floats) -> Image:
+def _sky(left: Float32Array, up: Float32Array) -> Float32Array:
     """Overcast, brighter towards the horizon."""
     clouds = 0.97 + 0.06 * smooth_noise(left, up * 2.0, 0.3, 1)
     return tinted((206.0, 211.0, 217.0), clouds * (1.04 - 0.12 * np.clip(up, 0.0, 1.0)))

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float32]
-Image = NDArray[np.float32]
+from worldstate.ground.typing import BoolArray, Float32Array
+
 Colour = tuple[float, float, float]
 
 BRICK_M, COURSE_M, JOINT_M = 0.21, 0.065, 0.01
@@ -17,7 +17,7 @@ SILL: Colour = (168.0, 164.0, 156.0)
 GLASS: Colour = (58.0, 66.0, 74.0)
 
 
-def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Floats:
+def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Float32Array:
     """Draw a number in [0, 1) for every whole pair of coordinates, always the same for the same seed.
 
     Examples
@@ -33,7 +33,7 @@ def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Floats:
     return np.asarray((mixed ^ (mixed >> np.uint32(15))) / np.float32(2**32), np.float32)
 
 
-def smooth_noise(a: Floats, b: Floats, cell_m: float, seed: int) -> Floats:
+def smooth_noise(a: Float32Array, b: Float32Array, cell_m: float, seed: int) -> Float32Array:
     """Noise in [0, 1) without edges, features of about `cell_m`."""
     x, y = a / np.float32(cell_m), b / np.float32(cell_m)
     left, low = np.floor(x), np.floor(y)
@@ -43,16 +43,16 @@ def smooth_noise(a: Floats, b: Floats, cell_m: float, seed: int) -> Floats:
     return np.asarray((1.0 - fy) * below + fy * above, np.float32)
 
 
-def _ease(t: Floats) -> Floats:
+def _ease(t: Float32Array) -> Float32Array:
     return t * t * (3.0 - 2.0 * t)
 
 
-def tinted(colour: Colour, shade: ArrayLike) -> Image:
+def tinted(colour: Colour, shade: ArrayLike) -> Float32Array:
     """Return a colour times a shade of any shape, with a last axis of three."""
     return np.asarray(np.asarray(shade, np.float32)[..., None] * np.array(colour, np.float32), np.float32)
 
 
-def asphalt(a: Floats, b: Floats, seed: int) -> Image:
+def asphalt(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
     """Paint asphalt: dark, mottled, with patches."""
     patches = np.where(smooth_noise(a, b, 2.7, seed) > 0.62, -0.07, 0.0)
     shade = (
@@ -61,35 +61,35 @@ def asphalt(a: Floats, b: Floats, seed: int) -> Image:
     return tinted((96.0, 97.0, 99.0), shade + patches)
 
 
-def paving(a: Floats, b: Floats, seed: int) -> Image:
+def paving(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
     """Paint paving bricks in courses, brown grey."""
     return tinted((124.0, 108.0, 98.0), _courses(a, b, 0.2, 0.1, seed))
 
 
-def flags(a: Floats, b: Floats, seed: int) -> Image:
+def flags(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
     """Paint concrete flags of 30 cm."""
     return tinted((150.0, 148.0, 143.0), _courses(a, b, 0.3, 0.3, seed))
 
 
-def grass(a: Floats, b: Floats, seed: int) -> Image:
+def grass(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
     """Paint a verge."""
     shade = 0.75 + 0.3 * smooth_noise(a, b, 1.3, seed) + 0.3 * (cell_noise(a / 0.03, b / 0.03, seed) - 0.5)
     return tinted((92.0, 108.0, 70.0), shade)
 
 
-def leaves(a: Floats, b: Floats, seed: int) -> Image:
+def leaves(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
     """Paint a hedge."""
     shade = 0.6 + 0.5 * smooth_noise(a, b, 0.25, seed) + 0.3 * (cell_noise(a / 0.06, b / 0.06, seed) - 0.5)
     return tinted((70.0, 84.0, 56.0), shade)
 
 
-def brick(a: Floats, b: Floats, colour: Colour, seed: int) -> Image:
+def brick(a: Float32Array, b: Float32Array, colour: Colour, seed: int) -> Float32Array:
     """Paint a wall in stretcher bond, a along it, b up."""
     weather = 0.9 + 0.2 * smooth_noise(a, b, 1.8, seed + 7)
     return tinted(colour, weather * _courses(a, b, BRICK_M, COURSE_M, seed))
 
 
-def _courses(a: Floats, b: Floats, length_m: float, height_m: float, seed: int) -> Floats:
+def _courses(a: Float32Array, b: Float32Array, length_m: float, height_m: float, seed: int) -> Float32Array:
     """Shade of stones in courses, every other one half a stone along, joints darker."""
     course = np.floor(b / np.float32(height_m))
     along = a / np.float32(length_m) + 0.5 * np.mod(course, 2.0)
@@ -122,7 +122,7 @@ class Facade:
     brightness: float
     seed: int
 
-    def paint(self, a: Floats, b: Floats) -> Image:
+    def paint(self, a: Float32Array, b: Float32Array) -> Float32Array:
         """Colours at places along the wall and up."""
         up = b - np.float32(self.foot_m)
         image = brick(a, up, self.colour, self.seed)
@@ -137,7 +137,13 @@ class Facade:
         return np.asarray(image * light[..., None], np.float32)
 
     def _fill(
-        self, image: Image, opening: "_Opening", here: NDArray[np.bool_], bay: Floats, x: Floats, y: Floats
+        self,
+        image: Float32Array,
+        opening: "_Opening",
+        here: BoolArray,
+        bay: Float32Array,
+        x: Float32Array,
+        y: Float32Array,
     ) -> None:
         """Put frame, panes and sill where an opening is."""
         half, low = opening.half_m, opening.low_m

@@ -7,16 +7,13 @@ the road.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.vehicle import AXLES_BEHIND_FRONT_M, HEIGHT_M, LENGTH_M, WIDTH_M
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, TextArray
 
 from .rays import Patch, cast_solid, reduced
 from .street_view import ROAD_Z_M, StreetView
-from .textures import GLASS, Colour, Floats, Image, tinted
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from .textures import GLASS, Colour, tinted
 
 PAINTS: tuple[Colour, ...] = (
     (206.0, 208.0, 208.0), (148.0, 152.0, 156.0), (46.0, 48.0, 52.0), (78.0, 84.0, 92.0),
@@ -81,7 +78,7 @@ class Car:
     heading: int
     colour: Colour
 
-    def corners_m(self) -> Array:
+    def corners_m(self) -> FloatArray:
         """Corners of the cuboid that holds the car and its shadow, in `base_link`, shape (8, 3)."""
         x = self.lane_x_m + (HALF_M + SHADOW_REACH_M) * np.array([-1.0, 1.0])
         rear = self.front_y_m - self.heading * LENGTH_M
@@ -89,17 +86,17 @@ class Car:
         z = ROAD_Z_M + np.array([0.0, HEIGHT_M])
         return np.array(np.meshgrid(x, y, z)).reshape(3, -1).T
 
-    def own_eye(self, eye_m: tuple[float, float, float]) -> Array:
+    def own_eye(self, eye_m: tuple[float, float, float]) -> FloatArray:
         """From `base_link` to the car's own coordinates, shape (3,)."""
         x, y, z = eye_m
         return np.array([x - self.lane_x_m, (self.front_y_m - y) * self.heading, z - ROAD_Z_M])
 
-    def own_rays(self, rays: Floats) -> Floats:
+    def own_rays(self, rays: Float32Array) -> Float32Array:
         """Turn directions in `base_link` into the car's own, shape (..., 3)."""
         return rays * np.array([1.0, -self.heading, 1.0], np.float32)
 
 
-def add_car(street: StreetView, car: Car, image: Image) -> None:
+def add_car(street: StreetView, car: Car, image: Float32Array) -> None:
     """Draw a car into an image (height, width, 3) wherever nothing of the street stands before it."""
     patch = street.view.around(car.corners_m())
     if patch is not None:
@@ -119,7 +116,7 @@ def with_parked_car(street: StreetView, car: Car) -> StreetView:
     return replace(street, image=image)
 
 
-def _painted(street: StreetView, car: Car, patch: Patch) -> Image:
+def _painted(street: StreetView, car: Car, patch: Patch) -> Float32Array:
     """Colours of the rays of a patch, shape (rows, columns, 3)."""
     colours = street.image[patch.slices].astype(np.float32)
     depth = street.depth[patch.slices].copy()
@@ -137,7 +134,7 @@ def _painted(street: StreetView, car: Car, patch: Patch) -> Image:
     return colours
 
 
-def _cast_shadow(colours: Image, depth: Floats, rays: Floats, eye: Array) -> None:
+def _cast_shadow(colours: Float32Array, depth: Float32Array, rays: Float32Array, eye: FloatArray) -> None:
     """Darken the road under and beside the car."""
     with np.errstate(divide="ignore"):
         road = np.float32(-eye[2]) / rays[..., 2]
@@ -151,7 +148,7 @@ def _cast_shadow(colours: Image, depth: Floats, rays: Floats, eye: Array) -> Non
     colours[on_road] *= (1.0 - strength[on_road])[:, None].astype(np.float32)
 
 
-def _paint_body(car: Car, places: Floats, face: NDArray[np.str_]) -> Image:
+def _paint_body(car: Car, places: Float32Array, face: TextArray) -> Float32Array:
     across, behind, up = places.T
     light = np.select(
         [face == "top", face == "hood", np.isin(face, ("front", "rear"))], [1.12, 1.12, 0.9], 0.0
@@ -172,7 +169,7 @@ def _paint_body(car: Car, places: Floats, face: NDArray[np.str_]) -> Image:
     return colours
 
 
-def _detail_side(colours: Image, side: Flags, behind: Floats, up: Floats) -> None:
+def _detail_side(colours: Float32Array, side: BoolArray, behind: Float32Array, up: Float32Array) -> None:
     seam = np.min([np.abs(behind - place) for place in SEAMS_M], axis=0) < 0.012
     colours[side & seam & (up > SILL_M)] *= 0.55
     handle = np.min([np.abs(behind - place + 0.2) for place in SEAMS_M[1:]], axis=0) < 0.09
@@ -183,7 +180,9 @@ def _detail_side(colours: Image, side: Flags, behind: Floats, up: Floats) -> Non
     colours[side & (up < CLEARANCE_M)] = UNDER
 
 
-def _put_wheels(colours: Image, side: Flags, behind: Floats, up: Floats, roll_rad: float) -> None:
+def _put_wheels(
+    colours: Float32Array, side: BoolArray, behind: Float32Array, up: Float32Array, roll_rad: float
+) -> None:
     for axle in AXLES_BEHIND_FRONT_M:
         radius = np.hypot(behind - axle, up - WHEEL_M)
         spoke = np.cos(5.0 * (np.arctan2(up - WHEEL_M, behind - axle) + roll_rad)) > 0.1
@@ -192,7 +191,7 @@ def _put_wheels(colours: Image, side: Flags, behind: Floats, up: Floats, roll_ra
         colours[side & (radius < RIM_M) & (spoke | (radius < 0.06))] = RIM
 
 
-def _paint_cabin(car: Car, places: Floats, face: NDArray[np.str_]) -> Image:
+def _paint_cabin(car: Car, places: Float32Array, face: TextArray) -> Float32Array:
     across, behind, up = places.T
     height = up - np.float32(WAIST_M)
     colours = tinted(car.colour, np.where(face == "roof", 1.12, 1.0))

@@ -24,10 +24,11 @@ from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_setti
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
+from worldstate.ground.typing import ImageArray
 
 from .plan import DatasetSettings, Plan
 from .recording import SimulatedRecording, simulate_recording
-from .rendered_video import Picture, camera_frames, write_video
+from .rendered_video import camera_frames, write_video
 
 TRUTH_NAME = "truth.json"
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
@@ -122,7 +123,7 @@ def write_recording(
     root: str | Path,
     recording: SimulatedRecording,
     number: int = 0,
-    frames: Iterable[Picture] | None = None,
+    frames: Iterable[ImageArray] | None = None,
 ) -> LogRow:
     """Write one recording below `root`, whole or not at all.
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -32,11 +31,9 @@ from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.ground.checks import in_range
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .truth import describe
-
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
 
 FULL_SCALE_PA = 20.0  # 120 dB, where measurement microphones of this kind end
 HEAD_START_S = 2.0  # emission begins this long before the recording: travel time and late field
@@ -56,14 +53,14 @@ class SimulatedRecording:
         Rate of `audio`.
     t0_frame : int
         First camera frame with line of sight, 10 frames a second from the start; 70 % of all if no vehicle.
-    detections : tuple of tuple of Detection
+    detections : tuple of tuple of SimulatedDetection
         One tuple per camera frame; no frame at all for a moving ego, of which OVAD has no detections: vision
         is unqueried there.
     truth : dict
         Settings, trajectory, line of sight and azimuth per frame; see `truth.describe`.
     """
 
-    audio: Signal
+    audio: Float32Array
     sample_rate_hz: float
     t0_frame: int
     detections: tuple[Frame, ...]
@@ -119,7 +116,7 @@ def stream_recording(
     rng: np.random.Generator,
     block_samples: int,
     array: MicrophoneArray | None = None,
-) -> Iterator[Signal]:
+) -> Iterator[Float32Array]:
     """Simulate one recording and hand it out in blocks, as a sound card would, without a file.
 
     The whole recording is rendered before the first block, for late sound needs what was emitted early.
@@ -154,7 +151,7 @@ def stream_recording(
         yield audio[start : start + size]
 
 
-def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Signal:
+def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Float32Array:
     """Return what the array records, shape (n, M)."""
     to_emission, to_street, to_channels = rng.spawn(3)
     receiver = _receiver(settings, array, to_channels)
@@ -184,11 +181,11 @@ def _samples(settings: SimulationSettings) -> int:
     return round(settings.duration_s * settings.sample_rate_hz)
 
 
-def _frame_times(settings: SimulationSettings) -> Array:
+def _frame_times(settings: SimulationSettings) -> FloatArray:
     return np.arange(max(round(settings.duration_s * FRAME_RATE_HZ), 1)) / FRAME_RATE_HZ
 
 
-def _knots(settings: SimulationSettings) -> Array:
+def _knots(settings: SimulationSettings) -> FloatArray:
     """Emission knots, from a head start before the recording to its end."""
     knot_s = KNOT_SAMPLES / settings.sample_rate_hz
     before, after = -(-HEAD_START_S // knot_s), -(-settings.duration_s // knot_s)
@@ -196,7 +193,7 @@ def _knots(settings: SimulationSettings) -> Array:
 
 
 def _add_vehicle_sound(
-    sound: Signal,
+    sound: Float32Array,
     static: StaticSources,
     settings: SimulationSettings,
     path: Trajectory,
@@ -221,11 +218,13 @@ def _add_vehicle_sound(
     add_late_field(static, heard, samples, preset.late_decay_s, positions, rate, rng, field)
 
 
-def _moving(path: Trajectory, signal: Signal, behind_m: float, height_m: float, rate: float) -> MovingSource:
+def _moving(
+    path: Trajectory, signal: Float32Array, behind_m: float, height_m: float, rate: float
+) -> MovingSource:
     return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
 
 
-def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> Signal:
+def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> Float32Array:
     """How strongly the source feeds the late field: less the farther it, or the ego, is from the mouth."""
     x, y = path.behind(0.0)
     away = np.hypot(x - settings.site.corner_ahead_m, y) - settings.ego.x_m(path.time_s)
@@ -236,7 +235,7 @@ def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> 
     return np.asarray(np.interp(np.arange(samples), knots, gain), np.float32)
 
 
-def _to_samples(sound: Signal, settings: SimulationSettings, rng: np.random.Generator) -> Signal:
+def _to_samples(sound: Float32Array, settings: SimulationSettings, rng: np.random.Generator) -> Float32Array:
     """From Pa (M, n) to full scale (n, M), with the channels' gains."""
     gain = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(sound)) / 20.0) / FULL_SCALE_PA
     samples = (sound[:, : _samples(settings)] * gain[:, None].astype(np.float32)).T
@@ -244,7 +243,7 @@ def _to_samples(sound: Signal, settings: SimulationSettings, rng: np.random.Gene
 
 
 def _t0_frame(
-    settings: SimulationSettings, frames_s: Array, seen: list[Trajectory], camera: PinholeCamera
+    settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], camera: PinholeCamera
 ) -> int:
     """First frame in which any vehicle is in line of sight; the last one where none ever is."""
     if not seen:
@@ -257,7 +256,7 @@ def _t0_frame(
 def _detections(
     settings: SimulationSettings,
     seen: list[Trajectory],
-    frames_s: Array,
+    frames_s: FloatArray,
     camera: PinholeCamera,
     rng: np.random.Generator,
 ) -> tuple[Frame, ...]:

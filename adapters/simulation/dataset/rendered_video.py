@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.camera.opencv import opencv
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -18,10 +17,9 @@ from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 
 from .recording import SimulatedRecording
-
-Picture = NDArray[np.uint8]
 
 CODEC = "mp4v"
 SENSOR_NOISE = 1.5  # grey levels
@@ -34,7 +32,7 @@ def camera_frames(
     recording: SimulatedRecording,
     rng: np.random.Generator,
     camera: PinholeCamera | None = None,
-) -> Iterator[Picture]:
+) -> Iterator[ImageArray]:
     """Yield what the camera sees, ten frames a second.
 
     The street is the site's own; buildings hide the vehicle until its front passes the line of sight past
@@ -86,7 +84,7 @@ def camera_frames(
         yield _taken(image, rng)
 
 
-def write_video(path: str | Path, frames: Iterable[Picture], frame_rate_hz: float = FRAME_RATE_HZ) -> None:
+def write_video(path: str | Path, frames: Iterable[ImageArray], frame_rate_hz: float = FRAME_RATE_HZ) -> None:
     """Write frames of one size as MPEG-4, whole or not at all.
 
     Parameters
@@ -135,7 +133,7 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
 
     Parameters
     ----------
-    detections : iterable of tuple of Detection
+    detections : iterable of tuple of SimulatedDetection
         Per frame; the parked car comes first in each.
     site : Site
         The junction.
@@ -153,7 +151,7 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
     return float(middles[missed.argmin()])
 
 
-def _columns_px(camera: PinholeCamera, lane_m: float, ends_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _columns_px(camera: PinholeCamera, lane_m: float, ends_m: FloatArray) -> FloatArray:
     """First and last column of cuboids between lateral ends (n, 2) (right, left), shape (n, 2)."""
     ahead = lane_m + WIDTH_M * np.array([-0.5, 0.5]) - camera.position_m[0]
     # At the camera's own height, where the pitch shortens the depth and nothing else.
@@ -163,7 +161,7 @@ def _columns_px(camera: PinholeCamera, lane_m: float, ends_m: NDArray[np.float64
     return np.stack([columns.min(axis=1), columns.max(axis=1)], axis=1)
 
 
-def _taken(image: NDArray[np.float32], rng: np.random.Generator) -> Picture:
+def _taken(image: Float32Array, rng: np.random.Generator) -> ImageArray:
     """Add the sensor's noise, alike in all colours, and round; red, green, blue become blue, green, red."""
     noise = rng.standard_normal(image.shape[:2], dtype=np.float32)
     noise *= SENSOR_NOISE

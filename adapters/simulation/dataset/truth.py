@@ -4,13 +4,13 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.vehicle import Trajectory
+from worldstate.ground.typing import FloatArray
 
 SCHEMA = "worldstate.simulation.truth"
 SCHEMA_VERSION = "1.1.0"
@@ -18,7 +18,7 @@ SCHEMA_VERSION = "1.1.0"
 
 def describe(
     settings: SimulationSettings,
-    frames_s: NDArray[np.float64],
+    frames_s: FloatArray,
     seen: list[Trajectory],
     camera: PinholeCamera,
 ) -> dict[str, Any]:
@@ -52,8 +52,8 @@ def describe(
 
 def _frames(
     settings: SimulationSettings,
-    frames_s: NDArray[np.float64],
-    ego_x_m: NDArray[np.float64],
+    frames_s: FloatArray,
+    ego_x_m: FloatArray,
     seen: Trajectory,
     entry_s: float,
     camera: PinholeCamera,

@@ -1,9 +1,9 @@
 """From settings to motion: when and where every vehicle and the ego are."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.ground.typing import FloatArray
 
 from .junction import Site
 from .kinds import vehicle_kind
@@ -12,21 +12,19 @@ from .route import Route, along, turn_in
 from .settings import SimulationSettings, VehicleSettings
 from .vehicle import Trajectory, drive, follow
 
-Array = NDArray[np.float64]
-
 SEARCH_STEP_M = 0.1
 TURN_WITHIN_S = 5.0  # braking for a turn begins and line of sight is reached within this long
 
 
-def trajectories(settings: SimulationSettings, time_s: Array) -> list[Trajectory]:
+def trajectories(settings: SimulationSettings, time_s: FloatArray) -> list[Trajectory]:
     """Motion of every vehicle at evenly spaced times, the first that of the approach; empty without any."""
     return [_trajectory(settings, vehicle, time_s) for vehicle in settings.traffic]
 
 
-def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: Array) -> Trajectory:
+def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: FloatArray) -> Trajectory:
     lane, entry_y = _entry(settings, vehicle)
 
-    def passing(times: Array, entry_s: float) -> Trajectory:
+    def passing(times: FloatArray, entry_s: float) -> Trajectory:
         return drive(
             times,
             entry_s=entry_s,

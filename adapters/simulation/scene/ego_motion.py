@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
-
-Array = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray
 
 BRAKING_MPS2 = 2.5
 
@@ -47,11 +45,11 @@ class EgoMotion:
         """Whether it never moves."""
         return self.speed_mps == 0.0
 
-    def at_mps(self, time_s: Array) -> Array:
+    def at_mps(self, time_s: FloatArray) -> FloatArray:
         """Speed at any time, same shape as `time_s`."""
         return np.clip(BRAKING_MPS2 * (self.stop_s - time_s), 0.0, self.speed_mps)
 
-    def x_m(self, time_s: Array) -> Array:
+    def x_m(self, time_s: FloatArray) -> FloatArray:
         """Position along the street, 0 where it stops, same shape as `time_s`."""
         left = np.maximum(self.stop_s - time_s, 0.0)
         braking = np.minimum(left, self.speed_mps / BRAKING_MPS2)

@@ -8,14 +8,12 @@ import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
-from .occluders import Occluder
-
-Array = NDArray[np.float64]
+from .occluders import OccludingBody
 
 SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, in this order
 MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
@@ -44,7 +42,7 @@ class Site:
         Pressure reflection factors of the side walls and of the crossing street's facades, 0..1.
     side_order, facade_order : int
         Highest number of reflections followed in the ego's street and in the crossing street.
-    occluders : tuple of Occluder
+    occluders : tuple of OccludingBody
         Bodies in the open that hide a vehicle, at most 4. Where there are any there are no corners and no
         walls to be heard; the corners only limit what the camera sees.
 
@@ -71,7 +69,7 @@ class Site:
     facade_reflection: float = 0.8
     side_order: int = 3
     facade_order: int = 4
-    occluders: tuple[Occluder, ...] = ()
+    occluders: tuple[OccludingBody, ...] = ()
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -108,7 +106,9 @@ class Site:
         right, left = self.sights_m(np.array([ahead_m]), eye_m)
         return float(right[0]), float(left[0])
 
-    def sights_m(self, ahead_m: Array, eye_m: tuple[float | Array, float]) -> tuple[Array, Array]:
+    def sights_m(
+        self, ahead_m: FloatArray, eye_m: tuple[float | FloatArray, float]
+    ) -> tuple[FloatArray, FloatArray]:
         """Return those limits for distances, and an eye, that change: shape (T,) each."""
         x, y = eye_m
         reach = (ahead_m - x) / (self.corner_ahead_m - x)

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-
-Array = NDArray[np.float64]
+from worldstate.ground.typing import BoolArray, FloatArray
 
 MAX_CORNERS = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Occluder:
+class OccludingBody:
     """A convex outline on the ground.
 
     Parameters
@@ -46,14 +45,17 @@ class Occluder:
             raise InvalidArgumentError(f"corners_m: expected 2 to {MAX_CORNERS} corners, got {len(corners)}")
 
 
-def box(near_m: float, far_m: float, right_m: float, left_m: float) -> Occluder:
+def box(near_m: float, far_m: float, right_m: float, left_m: float) -> OccludingBody:
     """Return an upright rectangular outline."""
-    return Occluder(((near_m, right_m), (far_m, right_m), (far_m, left_m), (near_m, left_m)))
+    return OccludingBody(((near_m, right_m), (far_m, right_m), (far_m, left_m), (near_m, left_m)))
 
 
 def hidden_by(
-    occluders: Sequence[Occluder], x_m: Array, y_m: Array, eye_m: tuple[float | Array, float]
-) -> NDArray[np.bool_]:
+    occluders: Sequence[OccludingBody],
+    x_m: FloatArray,
+    y_m: FloatArray,
+    eye_m: tuple[float | FloatArray, float],
+) -> BoolArray:
     """Tell when a body stands between an eye and a point that moves, shape (T,).
 
     Examples
@@ -69,8 +71,8 @@ def hidden_by(
 
 
 def detours(
-    occluder: Occluder, x_m: Array, y_m: Array, end_m: tuple[float | Array, float]
-) -> tuple[Array, NDArray[np.int_]]:
+    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
+) -> tuple[FloatArray, NDArray[np.int_]]:
     """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each.
 
     The detour is negative where the line is clear; it passes through 0 where the line touches the body.
@@ -97,13 +99,15 @@ def detours(
     )
 
 
-def _via(x: float, y: float, x_m: Array, y_m: Array, end_m: tuple[float | Array, float]) -> Array:
+def _via(
+    x: float, y: float, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
+) -> FloatArray:
     return np.asarray(np.hypot(x_m - x, y_m - y) + np.hypot(end_m[0] - x, end_m[1] - y))
 
 
 def _offsets(
-    occluder: Occluder, x_m: Array, y_m: Array, end_m: tuple[float | Array, float]
-) -> tuple[Array, Array]:
+    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
+) -> tuple[FloatArray, FloatArray]:
     """Lateral offset of every corner from the line, and how far along it is, 0..1, shape (corners, T)."""
     corners = np.array(occluder.corners_m)[:, :, None]
     dx, dy = x_m - end_m[0], y_m - end_m[1]
@@ -114,7 +118,7 @@ def _offsets(
     return (to_y * dx - to_x * dy) * per_length, (to_x * dx + to_y * dy) * per_length**2
 
 
-def _crosses(offset: Array, along: Array) -> NDArray[np.bool_]:
+def _crosses(offset: FloatArray, along: FloatArray) -> BoolArray:
     """Tell when a side of the outline crosses the line between its ends, shape (T,)."""
     onward, further = np.roll(offset, -1, axis=0), np.roll(along, -1, axis=0)
     apart = offset * onward < 0.0

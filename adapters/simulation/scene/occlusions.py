@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from worldstate.ground.errors import InvalidArgumentError
 
 from .junction import Site
-from .occluders import Occluder, box
+from .occluders import OccludingBody, box
 
 OPEN_M = 30.0
 
@@ -51,7 +51,7 @@ def bridge_pier() -> OccludedScene:
 
 def merge() -> OccludedScene:
     """Return a barrier between our lane and the one that we merge into; a faster vehicle is behind us."""
-    barrier = Occluder(((-60.0, 2.6), (7.0, 2.6)))
+    barrier = OccludingBody(((-60.0, 2.6), (7.0, 2.6)))
     return OccludedScene(_open("SM1", barrier), ((-60.0, 5.6), (60.0, 5.6)), "left")
 
 
@@ -90,7 +90,7 @@ def scene_of(site_name: str) -> OccludedScene | None:
     return next((scene for scene in map(occluded_scene, OCCLUSIONS) if scene.site.name == site_name), None)
 
 
-def _open(name: str, occluder: Occluder) -> Site:
+def _open(name: str, occluder: OccludingBody) -> Site:
     return Site(
         name=name,
         corner_left_m=OPEN_M,

@@ -1,15 +1,16 @@
 """Eight octave bands that add up to the whole signal again."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, rfft, rfftfreq
+
+from worldstate.ground.typing import Float32Array, FloatArray
 
 OCTAVES_HZ = 62.5 * 2.0 ** np.arange(8)  # 62.5 Hz .. 8 kHz
 TRANSITION_OCTAVES = 0.5
 REFERENCE_PA = 20e-6
 
 
-def octave_masks(frequencies_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+def octave_masks(frequencies_hz: FloatArray) -> FloatArray:
     """Amplitude weights of the octave bands, a partition of unity over frequency.
 
     Parameters
@@ -34,7 +35,7 @@ def octave_masks(frequencies_hz: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.diff(np.concatenate([ends, lowpass, ends + 1.0]), axis=0)
 
 
-def smooth_step(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def smooth_step(x: FloatArray) -> FloatArray:
     """Return a raised cosine from 0 at x <= 0 to 1 at x >= 1.
 
     Examples
@@ -45,9 +46,7 @@ def smooth_step(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return 0.5 - 0.5 * np.cos(np.pi * np.clip(x, 0.0, 1.0))
 
 
-def split_octaves(
-    signal: NDArray[np.float32], sample_rate_hz: float, oversampling: int = 1
-) -> NDArray[np.float32]:
+def split_octaves(signal: Float32Array, sample_rate_hz: float, oversampling: int = 1) -> Float32Array:
     """Split a signal into octave bands without phase shift; the bands sum to the signal.
 
     Parameters
@@ -78,7 +77,7 @@ def split_octaves(
     return bands
 
 
-def resample_whole(signal: NDArray[np.float32], oversampling: int) -> NDArray[np.float32]:
+def resample_whole(signal: Float32Array, oversampling: int) -> Float32Array:
     """Interpolate a signal, band-limited, by a whole factor; the ends are joined.
 
     Examples
@@ -91,9 +90,7 @@ def resample_whole(signal: NDArray[np.float32], oversampling: int) -> NDArray[np
     return np.asarray(irfft(rfft(signal) * np.float32(oversampling), n * oversampling), np.float32)
 
 
-def level_curve(
-    octave_levels_db: NDArray[np.float64], frequencies_hz: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def level_curve(octave_levels_db: FloatArray, frequencies_hz: FloatArray) -> FloatArray:
     """Power spectral density in Pa^2/Hz of octave-band levels (dB re 20 uPa), log-interpolated.
 
     Parameters

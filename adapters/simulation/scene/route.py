@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray
 
 FAR_M = 600.0  # a route goes on straight this far at both ends
 TURN_RADIUS_M = 3.5
@@ -26,10 +26,10 @@ class Route:
         Positions there, x ahead and y left.
     """
 
-    driven_m: Array
-    points_m: Array
+    driven_m: FloatArray
+    points_m: FloatArray
 
-    def at(self, driven_m: float | Array) -> tuple[Array, Array]:
+    def at(self, driven_m: float | FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x and y after some distance, shape of `driven_m`."""
         along = np.asarray(driven_m)
         x, y = (np.interp(along, self.driven_m, column) for column in self.points_m.T)

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from worldstate.ground.typing import Float32Array, FloatArray
+
 from .kinds import LIGHT, TYRE_M, VehicleKind
 from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 from .route import Route
@@ -53,27 +55,27 @@ class Trajectory:
         Distance of the front along the route.
     """
 
-    time_s: NDArray[np.float64]
-    front_y_m: NDArray[np.float64]
-    speed_mps: NDArray[np.float64]
+    time_s: FloatArray
+    front_y_m: FloatArray
+    speed_mps: FloatArray
     lane_x_m: float
     heading: int
     kind: VehicleKind = LIGHT
     route: Route | None = None
-    driven_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    driven_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def axle_y_m(self, axle: int = 0) -> NDArray[np.float64]:
+    def axle_y_m(self, axle: int = 0) -> FloatArray:
         """Lateral position of an axle, 0 the foremost, shape (T,)."""
         return self.behind(self.kind.axles_m[axle])[1]
 
-    def behind(self, distance_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def behind(self, distance_m: float) -> tuple[FloatArray, FloatArray]:
         """Position x, y of what is so far behind the front, shape (T,) each."""
         if self.route is None:
             y = self.front_y_m - self.heading * distance_m
             return np.full_like(y, self.lane_x_m), y
         return self.route.at(self.driven_m - distance_m)
 
-    def footprint_y_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def footprint_y_m(self) -> tuple[FloatArray, FloatArray]:
         """Lateral limits (right, left) of the whole vehicle, shape (T,) each."""
         ends = np.stack([self.front_y_m, self.behind(self.kind.length_m)[1]])
         if self.route is None:
@@ -82,7 +84,7 @@ class Trajectory:
         middle = ends.mean(axis=0)
         return middle - 0.5 * wide, middle + 0.5 * wide
 
-    def at(self, time_s: NDArray[np.float64]) -> "Trajectory":
+    def at(self, time_s: FloatArray) -> "Trajectory":
         """Return the same motion at other times."""
         front = np.interp(time_s, self.time_s, self.front_y_m)
         speed = np.interp(time_s, self.time_s, self.speed_mps)
@@ -91,7 +93,7 @@ class Trajectory:
 
 
 def drive(
-    time_s: NDArray[np.float64],
+    time_s: FloatArray,
     *,
     entry_s: float,
     entry_y_m: float,
@@ -176,7 +178,7 @@ def _turn_speed(driven_m: float, end_m: float) -> float:
     return float(min(turning, np.sqrt(2.0 * TURN_BRAKING_MPS2 * to_end)))
 
 
-def rolling_level_db(speed_mps: NDArray[np.float64], kind: VehicleKind = LIGHT) -> NDArray[np.float64]:
+def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
     """Sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T).
 
     Examples
@@ -188,7 +190,7 @@ def rolling_level_db(speed_mps: NDArray[np.float64], kind: VehicleKind = LIGHT) 
     return _octaves(kind.rolling_a_db) + _octaves(kind.rolling_b_db) * np.log10(speed_kmh / REFERENCE_KMH)
 
 
-def propulsion_level_db(speed_mps: NDArray[np.float64], kind: VehicleKind = LIGHT) -> NDArray[np.float64]:
+def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
     """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T).
 
     Examples
@@ -200,12 +202,12 @@ def propulsion_level_db(speed_mps: NDArray[np.float64], kind: VehicleKind = LIGH
     return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative
 
 
-def _octaves(levels_db: ArrayLike) -> NDArray[np.float64]:
+def _octaves(levels_db: ArrayLike) -> FloatArray:
     return np.asarray(levels_db, dtype=np.float64)[:, None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class SourceSignal:
     """One of the places of a vehicle that sound.
 
     Parameters
@@ -218,7 +220,7 @@ class Source:
         Above the road.
     """
 
-    signal: NDArray[np.float32]
+    signal: Float32Array
     behind_m: float
     height_m: float
 
@@ -229,7 +231,7 @@ def emit(
     sample_rate_hz: float,
     level_offset_db: float,
     rng: np.random.Generator,
-) -> list[Source]:
+) -> list[SourceSignal]:
     """Draw what every axle's tyres and the engine emit.
 
     The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
@@ -250,7 +252,7 @@ def emit(
 
     Returns
     -------
-    list of Source
+    list of SourceSignal
         Tyres per axle, and the engine where the kind has one.
     """
     kind = trajectory.kind
@@ -258,23 +260,23 @@ def emit(
     rolling = _pressure(rolling_level_db(trajectory.speed_mps, kind) + level_offset_db)
     tyres = rolling / np.sqrt(len(kind.axles_m))
     sources = [
-        Source(_noise(trajectory, time, tyres, sample_rate_hz, rng), behind, TYRE_M)
+        SourceSignal(_noise(trajectory, time, tyres, sample_rate_hz, rng), behind, TYRE_M)
         for behind in kind.axles_m
     ]
     if max(kind.propulsion_a_db) > SILENCE_DB:
         engine = _pressure(propulsion_level_db(trajectory.speed_mps, kind) + level_offset_db)
         signal = _engine(trajectory, time, engine, sample_rate_hz, rng)
-        sources.append(Source(signal, kind.axles_m[0], kind.engine_m))
+        sources.append(SourceSignal(signal, kind.axles_m[0], kind.engine_m))
     return sources
 
 
 def _noise(
     trajectory: Trajectory,
-    time: NDArray[np.float64],
-    octave_pressure: NDArray[np.float64],
+    time: FloatArray,
+    octave_pressure: FloatArray,
     sample_rate_hz: float,
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Gaussian noise whose octave pressures (8, T) follow the drive."""
     bands = split_octaves(rng.standard_normal(len(time), dtype=np.float32), sample_rate_hz)
     gains = octave_pressure / np.sqrt(_band_shares(sample_rate_hz))[:, None]
@@ -284,12 +286,12 @@ def _noise(
     return signal
 
 
-def _pressure(power_level_db: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pressure(power_level_db: FloatArray) -> FloatArray:
     """RMS pressure at 1 m in Pa."""
     return np.asarray(REFERENCE_PA * 10.0 ** ((power_level_db + POWER_TO_1M_DB) / 20.0))
 
 
-def _band_shares(sample_rate_hz: float) -> NDArray[np.float64]:
+def _band_shares(sample_rate_hz: float) -> FloatArray:
     """Power of white noise of unit variance in every octave band; bands beyond Nyquist stay empty."""
     masks = octave_masks(np.linspace(0.0, sample_rate_hz / 2.0, 4096))
     return np.asarray(np.maximum((masks**2).mean(axis=1), 1e-6))
@@ -297,11 +299,11 @@ def _band_shares(sample_rate_hz: float) -> NDArray[np.float64]:
 
 def _engine(
     trajectory: Trajectory,
-    time: NDArray[np.float64],
-    octave_pressure: NDArray[np.float64],
+    time: FloatArray,
+    octave_pressure: FloatArray,
     sample_rate_hz: float,
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Noise and lines; an octave that no line falls into is noise alone."""
     share = trajectory.kind.harmonic_share
     firing = firing_frequency_hz(trajectory, time, rng)
@@ -318,12 +320,12 @@ def _engine(
 
 def _harmonics(
     trajectory: Trajectory,
-    time: NDArray[np.float64],
-    octave_amplitude: NDArray[np.float64],
-    firing_hz: NDArray[np.float64],
+    time: FloatArray,
+    octave_amplitude: FloatArray,
+    firing_hz: FloatArray,
     octave: NDArray[np.int_],
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Multiples 1, 2, ... of the firing frequency, each with the amplitude of the octave it falls into."""
     cycles = np.cumsum(firing_hz) / (len(time) / (time[-1] - time[0]))
     levels = [np.interp(time, trajectory.time_s, row).astype(np.float32) for row in octave_amplitude]
@@ -334,9 +336,7 @@ def _harmonics(
     return signal
 
 
-def firing_frequency_hz(
-    trajectory: Trajectory, time: NDArray[np.float64], rng: np.random.Generator
-) -> NDArray[np.float64]:
+def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Draw the firing frequency in Hz: follows the speed through the gears, never idles, wanders by 5 %."""
     shift_up = SHIFT_UP_HZ * rng.uniform(0.8, 1.2)
     speed = np.interp(time, trajectory.time_s, trajectory.speed_mps)
@@ -348,7 +348,7 @@ def firing_frequency_hz(
     return np.asarray(np.maximum(ratio * speed, IDLE_HZ) * np.interp(time, knots, wander))
 
 
-def _smooth(values: NDArray[np.float64], time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(values: FloatArray, time_s: FloatArray) -> FloatArray:
     """Return the running mean over the time that a change of gear takes."""
     length = max(int(SHIFT_S / (time_s[1] - time_s[0])), 1)
     padded = np.pad(values, (length, length), mode="edge")

@@ -1,13 +1,12 @@
 """What air and ground take from and give to a path, per octave band."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
+from worldstate.ground.typing import FloatArray
 
 from .diffraction import SPEED_OF_SOUND_MPS
-
-Array = NDArray[np.float64]
 
 REFERENCE_KELVIN, TRIPLE_POINT_KELVIN = 293.15, 273.16
 STREET_KELVIN, STREET_HUMIDITY = 283.15, 70.0
@@ -17,7 +16,7 @@ SMALLEST_LENGTH_M = 0.1
 
 def absorption_db_per_m(
     frequency_hz: ArrayLike, kelvin: float = STREET_KELVIN, humidity_percent: float = STREET_HUMIDITY
-) -> Array:
+) -> FloatArray:
     r"""Atmospheric absorption of pure tones at sea level.
 
     .. math:: \alpha = 8.686 f^2 \Big[1.84 \cdot 10^{-11} \tau^{1/2} + \tau^{-5/2} \Big(
@@ -59,7 +58,7 @@ def absorption_db_per_m(
 OCTAVE_DB_PER_M = absorption_db_per_m(OCTAVES_HZ)
 
 
-def air_gain(length_m: Array) -> Array:
+def air_gain(length_m: FloatArray) -> FloatArray:
     """Amplitude that is left after `length_m` (T,) through air, shape (T, 8).
 
     Examples
@@ -70,7 +69,7 @@ def air_gain(length_m: Array) -> Array:
     return np.asarray(10.0 ** (-length_m[:, None] * OCTAVE_DB_PER_M / 20.0))
 
 
-def ground_gain(length_m: Array, source_m: float, receiver_m: float) -> Array:
+def ground_gain(length_m: FloatArray, source_m: float, receiver_m: float) -> FloatArray:
     r"""Amplitude by the road's reflection per octave, against the energetic sum of both ways, shape (T, 8).
 
     .. math:: g^2 = 1 + \frac{2 \rho}{1 + \rho^2} \overline{\cos k \Delta}, \qquad

@@ -1,17 +1,14 @@
 """What an empty street sounds like: coherent anisotropic ambience, distant traffic, wind and noise."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfftfreq
 
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
 from worldstate.adapters.simulation.scene.octave_bands import REFERENCE_PA, level_curve
 from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .static_field import StaticSources, plane_wave_delays
-
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
 
 FLUCTUATION_STEP_S = 1.0
 LOBES = 3
@@ -23,11 +20,11 @@ WIND_FLOOR_HZ = 20.0  # below, wind stays as it is there
 
 
 def add_background(
-    out: Signal,
+    out: Float32Array,
     static: StaticSources,
     site: Site,
     preset: Preset,
-    positions_m: Array,
+    positions_m: FloatArray,
     sample_rate_hz: float,
     rng: np.random.Generator,
 ) -> None:
@@ -61,7 +58,7 @@ def add_background(
     _add_channel_noise(out, preset, sample_rate_hz, rng)
 
 
-def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> tuple[Array, Array]:
+def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Azimuths of the ambient waves and their shares of the power, shape (Q,) each.
 
     A site has loud directions of its own; a recording shifts them a little.
@@ -75,14 +72,14 @@ def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> 
     return azimuth, preset.lobe_share * shaped + (1.0 - preset.lobe_share) / preset.ambient_waves
 
 
-def unit_vectors(azimuth_rad: Array, rng: np.random.Generator) -> Array:
+def unit_vectors(azimuth_rad: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Directions with a small random elevation, as traffic between buildings has, shape (Q, 3)."""
     elevation = np.abs(rng.normal(0.0, 0.2, len(azimuth_rad)))
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation)], axis=1)
 
 
-def shaped_noise(density: Array, samples: int, rng: np.random.Generator, channels: int) -> Signal:
+def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator, channels: int) -> Float32Array:
     """Gaussian noise with a given power spectral density.
 
     Parameters
@@ -108,14 +105,19 @@ def shaped_noise(density: Array, samples: int, rng: np.random.Generator, channel
     return noise
 
 
-def noise_frequencies(samples: int, sample_rate_hz: float) -> Array:
+def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:
     """Bins at which `shaped_noise` wants its density."""
     return np.asarray(rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz))
 
 
 def _ambient_waves(
-    power: Array, level_db: Array, preset: Preset, samples: int, rate: float, rng: np.random.Generator
-) -> Signal:
+    power: FloatArray,
+    level_db: FloatArray,
+    preset: Preset,
+    samples: int,
+    rate: float,
+    rng: np.random.Generator,
+) -> Float32Array:
     density = level_curve(level_db, noise_frequencies(samples, rate)) * rate
     waves = shaped_noise(density, samples, rng, len(power))
     knots = np.arange(0.0, samples / rate + 2.0 * FLUCTUATION_STEP_S, FLUCTUATION_STEP_S)
@@ -126,7 +128,7 @@ def _ambient_waves(
     return waves
 
 
-def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> Array:
+def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
     """Draw when distant vehicles are loudest: a Poisson process that knows nothing of the recording's ends.
 
     Parameters
@@ -156,8 +158,13 @@ def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) 
 
 
 def _far_vehicle(
-    loudest_s: float, samples: int, level_db: Array, offsets_m: Array, rate: float, rng: np.random.Generator
-) -> tuple[Signal, Array]:
+    loudest_s: float,
+    samples: int,
+    level_db: FloatArray,
+    offsets_m: FloatArray,
+    rate: float,
+    rng: np.random.Generator,
+) -> tuple[Float32Array, FloatArray]:
     """Draw a vehicle some streets away: one direction, one facade reflection, gone in seconds."""
     noise = shaped_noise(level_curve(level_db, noise_frequencies(samples, rate)) * rate, samples, rng, 1)
     time = np.arange(samples) / rate
@@ -167,7 +174,7 @@ def _far_vehicle(
     return np.concatenate([noise, echo]), plane_wave_delays(directions, offsets_m)
 
 
-def _add_channel_noise(out: Signal, preset: Preset, rate: float, rng: np.random.Generator) -> None:
+def _add_channel_noise(out: Float32Array, preset: Preset, rate: float, rng: np.random.Generator) -> None:
     """Add wind and electronic noise: every microphone by itself."""
     frequencies = noise_frequencies(out.shape[1], rate)
     wind_density = REFERENCE_PA**2 * 10.0 ** (preset.wind_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))

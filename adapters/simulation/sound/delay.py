@@ -8,7 +8,8 @@ which is smooth enough for anything on wheels and makes Doppler a consequence, n
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
 
 KNOT_SAMPLES = 128
 OVERSAMPLING = 4
@@ -30,17 +31,17 @@ class Table:
         Rate of the table, `OVERSAMPLING` times the sample rate.
     """
 
-    values: NDArray[np.float32]
+    values: Float32Array
     start_s: float
     rate_hz: float
 
 
 def emission_times(
-    receive_s: NDArray[np.float64],
-    emit_s: NDArray[np.float64],
-    travel_m: NDArray[np.float64],
+    receive_s: FloatArray,
+    emit_s: FloatArray,
+    travel_m: FloatArray,
     speed_mps: float,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Solve t = t_e + r(t_e) / c for the emission times t_e of given receive times.
 
     Parameters
@@ -65,9 +66,7 @@ def emission_times(
     return np.interp(receive_s, emit_s + travel_m / speed_mps, emit_s, left=np.nan, right=np.nan)
 
 
-def add_delayed(
-    out: NDArray[np.float32], table: Table, emit_s: NDArray[np.float64], gain: NDArray[np.float64]
-) -> None:
+def add_delayed(out: Float32Array, table: Table, emit_s: FloatArray, gain: FloatArray) -> None:
     """Add a delayed signal to `out`, block by block between knots.
 
     Parameters
@@ -96,18 +95,18 @@ def add_delayed(
 class _Lines:
     """Straight lines over knot intervals, each from `low` (K,) to `high` (K,)."""
 
-    def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def __init__(self, low: FloatArray, high: FloatArray) -> None:
         self._start = low.astype(np.float32)[:, None]
         self._rise = (high - low).astype(np.float32)[:, None]
 
-    def into(self, out: NDArray[np.float32], rows: slice) -> None:
+    def into(self, out: Float32Array, rows: slice) -> None:
         """Write the samples of some intervals, shape (rows, KNOT_SAMPLES)."""
         np.multiply(self._rise[rows], RAMP, out=out)
         out += self._start[rows]
 
 
 def _add_between_knots(
-    rows: NDArray[np.float32], table: Table, base: NDArray[np.intp], places: _Lines, gains: _Lines
+    rows: Float32Array, table: Table, base: IndexArray, places: _Lines, gains: _Lines
 ) -> None:
     """Interpolate the table; a few intervals at a time, so that everything stays in the cache."""
     left, right, fraction = np.empty((3, ROWS_AT_ONCE, KNOT_SAMPLES), np.float32)

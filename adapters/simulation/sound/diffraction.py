@@ -1,14 +1,14 @@
 """Screen attenuation behind a corner: Maekawa's chart as Kurze and Anderson put it into a formula."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from worldstate.ground.typing import FloatArray
 
 SPEED_OF_SOUND_MPS = 343.0
 
 
-def screen_attenuation_db(
-    detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: float = 40.0
-) -> NDArray[np.float64]:
+def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: float = 40.0) -> FloatArray:
     r"""Attenuation by a thin screen beyond spherical spreading.
 
     .. math:: A = 5 + 20\log_{10}\frac{\sqrt{2\pi N}}{\tanh\sqrt{2\pi N}}, \qquad N = 2\delta f / c

@@ -10,7 +10,7 @@ in the body's upper side nor in the street are rendered.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.adapters.simulation.scene.octave_bands import (
     OCTAVES_HZ,
@@ -27,13 +27,11 @@ from worldstate.adapters.simulation.scene.vehicle import (
 )
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .background import noise_frequencies, shaped_noise
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from .static_field import StaticSources
-
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
 
 # Places in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
 TYRES_M = np.array([[1.1, 0.75, 0.1], [1.1, -0.75, 0.1], [-1.5, 0.75, 0.1], [-1.5, -0.75, 0.1]])
@@ -74,13 +72,13 @@ class EgoSound:
         Firing frequency of the engine, whose multiples are its lines.
     """
 
-    pressure_pa: Signal
-    firing_hz: Array
+    pressure_pa: Float32Array
+    firing_hz: FloatArray
 
 
 def ego_noise(
     positions_m: ArrayLike, speed_mps: ArrayLike, sample_rate_hz: float, rng: np.random.Generator
-) -> Signal:
+) -> Float32Array:
     """Render the noise of the ego vehicle at its own microphones: `ego_sound` without the engine's speed.
 
     Parameters
@@ -162,7 +160,7 @@ def ego_sound(
     return EgoSound(np.ascontiguousarray(out[:, lead:].T), firing[lead:])
 
 
-def _checked(positions_m: ArrayLike, speed_mps: ArrayLike) -> tuple[Array, Array]:
+def _checked(positions_m: ArrayLike, speed_mps: ArrayLike) -> tuple[FloatArray, FloatArray]:
     positions = finite_array("positions_m", positions_m, (None, 3))
     speed = finite_array("speed_mps", speed_mps, (None,))
     if not len(positions) or not len(speed):
@@ -175,7 +173,12 @@ def _checked(positions_m: ArrayLike, speed_mps: ArrayLike) -> tuple[Array, Array
 
 
 def _add_sources(
-    out: Signal, positions: Array, speed: Array, firing: Array, rate: float, rng: np.random.Generator
+    out: Float32Array,
+    positions: FloatArray,
+    speed: FloatArray,
+    firing: FloatArray,
+    rate: float,
+    rng: np.random.Generator,
 ) -> None:
     roof = _roof_edge(float(positions[:, 2].min()) - ROOF_BELOW_ARRAY_M)
     levels, static = _levels_db(speed[::KNOT]), StaticSources(out, rate)
@@ -190,7 +193,7 @@ def _add_sources(
     static.render()
 
 
-def _places() -> Array:
+def _places() -> FloatArray:
     return np.concatenate([TYRES_M, ENGINE_M[None], EXHAUST_M[None], PILLARS_M])
 
 
@@ -199,7 +202,7 @@ def _line_shares() -> tuple[float, ...]:
     return (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
 
 
-def _levels_db(speed: Array) -> list[Array]:
+def _levels_db(speed: FloatArray) -> list[FloatArray]:
     """Pressure level at 1 m of every source per octave, (8, knots), dB re 20 uPa."""
     slowest = SLOWEST_KMH / 3.6
     # The law ends above a standstill; below, rolling noise fades with the speed itself.
@@ -213,28 +216,28 @@ def _levels_db(speed: Array) -> list[Array]:
     return [tyre] * len(TYRES_M) + [bay, exhaust] + [flow] * len(PILLARS_M)
 
 
-def _pressure_pa(level_db: Array) -> Array:
+def _pressure_pa(level_db: FloatArray) -> FloatArray:
     return np.asarray(REFERENCE_PA * 10.0 ** (level_db / 20.0))
 
 
-def _at_samples(knots: Array, samples: int) -> Signal:
+def _at_samples(knots: FloatArray, samples: int) -> Float32Array:
     """Straight lines between the knots, (8, knots) -> (8, n)."""
     time = np.arange(samples)
     return np.stack([np.interp(time, np.arange(len(row)) * KNOT, row) for row in knots]).astype(np.float32)
 
 
-def _emission(firing: Array, line_share: float, rate: float, rng: np.random.Generator) -> Signal:
+def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random.Generator) -> Float32Array:
     """Noise and engine lines that together have unit mean square in every octave, shape (n,)."""
     samples = len(firing)
     masks = octave_masks(noise_frequencies(samples, rate))
     # White noise divided by its own share of power per octave: unit pressure in each of them.
     shares = np.maximum((masks**2).mean(axis=1), 1e-6)
     shape = (masks / np.sqrt(shares)[:, None]).sum(axis=0)
-    noise: Signal = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng, 1)[0]
+    noise: Float32Array = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng, 1)[0]
     return noise + _lines(firing, line_share, rate, rng) if line_share > 0.0 else noise
 
 
-def _lines(firing: Array, share: float, rate: float, rng: np.random.Generator) -> Signal:
+def _lines(firing: FloatArray, share: float, rate: float, rng: np.random.Generator) -> Float32Array:
     """Multiples of the firing frequency that share each octave's pressure, shape (n,)."""
     cycles = np.cumsum(firing) / rate
     orders = np.arange(1, HARMONICS + 1)
@@ -247,7 +250,7 @@ def _lines(firing: Array, share: float, rate: float, rng: np.random.Generator) -
     return lines
 
 
-def _firing_hz(speed: Array, rate: float, rng: np.random.Generator) -> Array:
+def _firing_hz(speed: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:
     """Follow the speed in the highest gear that its mean allows, never below idling; wander a little."""
     mean = float(speed.mean())
     gear = next((g for g in reversed(GEARS_HZ_PER_MPS) if g * mean >= SHIFT_UP_HZ), GEARS_HZ_PER_MPS[0])
@@ -256,7 +259,7 @@ def _firing_hz(speed: Array, rate: float, rng: np.random.Generator) -> Array:
     return np.asarray(np.maximum(gear * speed, IDLE_HZ) * (1.0 + ENGINE_WANDER * np.clip(wander, -2.0, 2.0)))
 
 
-def _roof_edge(height_m: float) -> Array:
+def _roof_edge(height_m: float) -> FloatArray:
     """Points round the roof, five centimetres apart, shape (E, 3)."""
     x, y = (np.linspace(*ends, round((ends[1] - ends[0]) / 0.05) + 1) for ends in (ROOF_X_M, ROOF_Y_M))
     sides = [np.stack([x, np.full_like(x, edge)], axis=1) for edge in ROOF_Y_M]
@@ -265,7 +268,7 @@ def _roof_edge(height_m: float) -> Array:
     return np.column_stack([flat, np.full(len(flat), height_m)])
 
 
-def _paths_m(source: Array, positions: Array, roof: Array) -> tuple[Array, float]:
+def _paths_m(source: FloatArray, positions: FloatArray, roof: FloatArray) -> tuple[FloatArray, float]:
     """Length of the shortest way over the roof's edge to every microphone, and how much longer it is."""
     to_edge = np.linalg.norm(roof - source, axis=1)
     onward = np.linalg.norm(roof[:, None] - positions, axis=2)
@@ -274,7 +277,7 @@ def _paths_m(source: Array, positions: Array, roof: Array) -> tuple[Array, float
     return length, float(detour)
 
 
-def _add_wind(out: Signal, speed: Array, rate: float, rng: np.random.Generator) -> None:
+def _add_wind(out: Float32Array, speed: FloatArray, rate: float, rng: np.random.Generator) -> None:
     """Add turbulence at every microphone by itself, its level following the speed."""
     frequencies = noise_frequencies(len(speed), rate)
     density = REFERENCE_PA**2 * 10.0 ** (WIND_AT_10_DB / 10.0) / (100.0 / np.sqrt(2.0))

@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.octave_bands import split_octaves
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import KNOT_SAMPLES, OVERSAMPLING, Table
-
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,23 +25,23 @@ class Emission:
         Rate before oversampling.
     """
 
-    bands: Signal
+    bands: Float32Array
     start_s: float
     sample_rate_hz: float
 
     @classmethod
-    def of(cls, signal: Signal, start_s: float, sample_rate_hz: float) -> "Emission":
+    def of(cls, signal: Float32Array, start_s: float, sample_rate_hz: float) -> "Emission":
         """Split `signal`, whose length is a multiple of KNOT_SAMPLES."""
         bands = split_octaves(signal, sample_rate_hz, OVERSAMPLING)
         blocks = bands.reshape(8, -1, KNOT_SAMPLES * OVERSAMPLING).transpose(1, 0, 2)
         return cls(np.ascontiguousarray(blocks), start_s, sample_rate_hz)
 
     @property
-    def knots_s(self) -> Array:
+    def knots_s(self) -> FloatArray:
         """Emission times of the knots, shape (K + 1,)."""
         return self.start_s + np.arange(len(self.bands) + 1) * KNOT_SAMPLES / self.sample_rate_hz
 
-    def table(self, gain: Array) -> tuple[Table, slice] | None:
+    def table(self, gain: FloatArray) -> tuple[Table, slice] | None:
         """Add up the bands, weighted by gains (K + 1, 8) at the knots, over the span where any is not 0.
 
         Returns
@@ -81,11 +78,11 @@ class MovingSource:
     """
 
     emission: Emission
-    x_m: float | Array
-    y_m: Array
+    x_m: float | FloatArray
+    y_m: FloatArray
     height_m: float = SOURCE_HEIGHT_M
 
     @property
-    def ahead_m(self) -> Array:
+    def ahead_m(self) -> FloatArray:
         """How far ahead it is, shape (T,)."""
         return np.asarray(self.x_m + np.zeros_like(self.y_m))

@@ -4,15 +4,12 @@ Every direction gets a tail of its own. One common tail on all microphones would
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .static_field import StaticSources, plane_wave_delays
-
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
 
 DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
@@ -20,7 +17,7 @@ ELEVATION_RAD = 0.3
 TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
 
 
-def sphere(count: int) -> Array:
+def sphere(count: int) -> FloatArray:
     """Evenly spread unit vectors on a Fibonacci spiral, shape (count, 3).
 
     Examples
@@ -35,7 +32,7 @@ def sphere(count: int) -> Array:
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
-def street_field(site: Site, lobe_share: float) -> tuple[Array, Array]:
+def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]:
     """Directions from which late sound reaches the array in a street, and their shares of the energy.
 
     Between walls and under an open sky late sound is near the horizon; it comes in by the mouth and from
@@ -72,13 +69,13 @@ def street_field(site: Site, lobe_share: float) -> tuple[Array, Array]:
 
 def add_late_field(
     static: StaticSources,
-    dry: Signal,
+    dry: Float32Array,
     samples: int,
     decay_s: float,
-    positions_m: Array,
+    positions_m: FloatArray,
     sample_rate_hz: float,
     rng: np.random.Generator,
-    field: tuple[Array, Array] | None = None,
+    field: tuple[FloatArray, FloatArray] | None = None,
 ) -> None:
     r"""Add a diffuse tail of a dry signal.
 

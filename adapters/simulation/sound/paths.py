@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
+from worldstate.ground.typing import FloatArray
 
 from .diffraction import screen_attenuation_db
-
-Array = NDArray[np.float64]
 
 LIT_DEPTH_M = 0.25  # a line this far inside the mouth no longer touches the corner
 FACADE_END_M = 0.5  # a reflection fades over this length at the end of a facade
@@ -41,7 +40,7 @@ class SourceImage:
         Number of reflections.
     """
 
-    x_m: float | Array
+    x_m: float | FloatArray
     gain: float
     near_planes_m: tuple[float, ...] = ()
     order: int = 0
@@ -62,7 +61,7 @@ class ReceiverImage:
     gain: float
     order: int = 0
 
-    def mirror(self, y_m: Array) -> Array:
+    def mirror(self, y_m: FloatArray) -> FloatArray:
         """Lateral positions in the unfolded street."""
         return self.sign * y_m + self.offset_m
 
@@ -93,15 +92,15 @@ class Path:
 
     source: SourceImage
     receiver: ReceiverImage
-    lit: Array
+    lit: FloatArray
     edge: NDArray[np.int8]
-    bent_m: Array
-    gain: Array
-    before_m: Array
-    edge_y_m: Array
+    bent_m: FloatArray
+    gain: FloatArray
+    before_m: FloatArray
+    edge_y_m: FloatArray
 
 
-def source_images(site: Site, lane_x_m: float | Array) -> list[SourceImage]:
+def source_images(site: Site, lane_x_m: float | FloatArray) -> list[SourceImage]:
     """Images of a lane in the facades of the crossing street; only the lane itself where there is no wall.
 
     Examples
@@ -149,13 +148,13 @@ def receiver_images(site: Site) -> list[ReceiverImage]:
 
 def trace_paths(
     site: Site,
-    lane_x_m: float | Array,
-    source_y_m: Array,
+    lane_x_m: float | FloatArray,
+    source_y_m: FloatArray,
     height_m: float,
     cap_db: float,
     *,
-    receiver_x_m: float | Array = 0.0,
-    specular: Array | None = None,
+    receiver_x_m: float | FloatArray = 0.0,
+    specular: FloatArray | None = None,
 ) -> list[Path]:
     """All paths from a source that moves in the crossing street to the array's centre at (receiver_x_m, 0).
 
@@ -205,18 +204,18 @@ class Passage:
         Where the line, or the way round the corner, passes the mouth.
     """
 
-    clearance_m: Array
+    clearance_m: FloatArray
     edge: NDArray[np.int8]
-    straight_m: Array
-    bent_m: Array
-    aim_y_m: Array
+    straight_m: FloatArray
+    bent_m: FloatArray
+    aim_y_m: FloatArray
 
     @property
-    def lit(self) -> Array:
+    def lit(self) -> FloatArray:
         """1 where the line is straight, 0 where it bends round the corner, smooth in between."""
         return smooth_step(self.clearance_m / LIT_DEPTH_M)
 
-    def screen_gain(self, cap_db: float) -> Array:
+    def screen_gain(self, cap_db: float) -> FloatArray:
         """Amplitude that the corner leaves, shape (T, 8)."""
         detour = np.copysign(self.bent_m - self.straight_m, -self.clearance_m)
         return np.asarray(10.0 ** (-screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db) / 20.0))
@@ -224,9 +223,9 @@ class Passage:
 
 def through_mouth(
     site: Site,
-    source_x_m: float | Array,
-    source_y_m: Array,
-    end_x_m: float | Array,
+    source_x_m: float | FloatArray,
+    source_y_m: FloatArray,
+    end_x_m: float | FloatArray,
     end_y_m: float,
     height_m: float,
 ) -> Passage:
@@ -258,11 +257,11 @@ def _trace(
     site: Site,
     source: SourceImage,
     receiver: ReceiverImage,
-    source_y: Array,
+    source_y: FloatArray,
     height: float,
     cap_db: float,
-    receiver_x: float | Array,
-    specular: Array,
+    receiver_x: float | FloatArray,
+    specular: FloatArray,
 ) -> Path:
     end_y = float(receiver.mirror(np.zeros(1))[0])
     passage = through_mouth(site, source.x_m, source_y, receiver_x, end_y, height)
@@ -273,18 +272,22 @@ def _trace(
     return Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain, before, edge_y)
 
 
-def _length(dx: float | Array, dy: Array, dz: float) -> Array:
+def _length(dx: float | FloatArray, dy: FloatArray, dz: float) -> FloatArray:
     return np.asarray(np.sqrt(dx * dx + dy * dy + dz * dz))
 
 
 def _bent_length(
-    before_x: float | Array, before_y: Array, after_x: float | Array, after_y: float, height: float
-) -> Array:
+    before_x: float | FloatArray,
+    before_y: FloatArray,
+    after_x: float | FloatArray,
+    after_y: float,
+    height: float,
+) -> FloatArray:
     """Shortest way over a vertical edge: the two legs lie in one unfolded plane."""
     return np.asarray(np.hypot(np.hypot(before_x, before_y) + np.hypot(after_x, after_y), height))
 
 
-def near_facade(site: Site, source: SourceImage, source_y: Array, aim_y: Array) -> Array:
+def near_facade(site: Site, source: SourceImage, source_y: FloatArray, aim_y: FloatArray) -> FloatArray:
     """1 where every reflection in the near facade meets wall, 0 where it meets the mouth, shape (T,)."""
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     weight = np.ones_like(source_y)

@@ -5,10 +5,10 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .air import air_gain, ground_gain
 from .delay import Table, add_delayed, emission_times
@@ -19,21 +19,18 @@ from .receiver import NEAREST_M, Receiver, add_turning
 from .screened import screened_legs
 from .static_field import StaticSources
 
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
-
 TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
 FAINTEST = 1e-3  # a path below this share of the whole is left out
 
 
 def add_sources(
-    out: Signal,
+    out: Float32Array,
     static: StaticSources,
     sources: Sequence[MovingSource],
     site: Site,
     receiver: Receiver,
     cap_db: float,
-    specular: Array | None = None,
+    specular: FloatArray | None = None,
     *,
     outdoors: bool = False,
 ) -> None:
@@ -77,7 +74,7 @@ def _paths(
     site: Site,
     receiver: Receiver,
     cap_db: float,
-    specular: Array | None,
+    specular: FloatArray | None,
     outdoors: bool,
 ) -> list[Path]:
     above = receiver.above(source.height_m)
@@ -89,7 +86,7 @@ def _paths(
     return [replace(path, gain=path.gain * _media(path.bent_m, source, receiver)) for path in paths]
 
 
-def _media(length_m: Array, source: MovingSource, receiver: Receiver) -> Array:
+def _media(length_m: FloatArray, source: MovingSource, receiver: Receiver) -> FloatArray:
     """Amplitude that air and road leave per octave, shape (T, 8)."""
     ground = ground_gain(length_m, source.height_m, float(receiver.centre_m[2]))
     return air_gain(length_m) * ground
@@ -103,7 +100,7 @@ def _audible(paths: list[Path]) -> list[Path]:
 
 
 def _add_bent(
-    out: Signal, source: MovingSource, path: Path, edge: int, site: Site, receiver: Receiver
+    out: Float32Array, source: MovingSource, path: Path, edge: int, site: Site, receiver: Receiver
 ) -> None:
     """Add what reaches the array's centre round one corner."""
     made = source.emission.table(path.gain * ((1.0 - path.lit) * (path.edge == edge))[:, None])
@@ -119,7 +116,7 @@ def _add_bent(
     _add_along(out, table, knots, travel, receiver.knots_s)
 
 
-def _add_lit(out: Signal, source: MovingSource, path: Path, receiver: Receiver) -> None:
+def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Receiver) -> None:
     """Add what reaches every microphone along the straight line."""
     made = source.emission.table(path.gain * path.lit[:, None])
     if made is None:
@@ -135,12 +132,12 @@ def _add_lit(out: Signal, source: MovingSource, path: Path, receiver: Receiver) 
         _add_along(microphone, table, knots, travel, receiver.knots_s - skew)
 
 
-def _slant(along: float | Array, flat_squared: Array, x_m: Array) -> Array:
+def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((along - x_m) ** 2 + flat_squared))
 
 
 def _add_screened(
-    out: Signal, source: MovingSource, site: Site, receiver: Receiver, cap_db: float, outdoors: bool
+    out: Float32Array, source: MovingSource, site: Site, receiver: Receiver, cap_db: float, outdoors: bool
 ) -> None:
     """Add what reaches every microphone past the bodies of an open scene, on the straight line or round."""
     knots, ahead = source.emission.knots_s, source.ahead_m
@@ -160,21 +157,25 @@ def _add_screened(
             _add_along(microphone, table, knots[span], travel, receiver.knots_s - skew)
 
 
-def _add_along(out: Signal, table: Table, emit_s: Array, travel_m: Array, receive_s: Array) -> None:
+def _add_along(
+    out: Float32Array, table: Table, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
+) -> None:
     """Add what was emitted at the knots `emit_s` and has gone `travel_m`, weaker the longer the way."""
     emit = emission_times(receive_s, emit_s, travel_m, SPEED_OF_SOUND_MPS)
     length = np.interp(np.nan_to_num(emit), emit_s, travel_m)
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 
 
-def _round(before: Array, along: Array, across: Array, rise: float, x_m: Array) -> Array:
+def _round(
+    before: FloatArray, along: FloatArray, across: FloatArray, rise: float, x_m: FloatArray
+) -> FloatArray:
     return np.asarray(np.hypot(before + np.hypot(along - x_m, across), rise))
 
 
 def _add_corners(
-    out: Signal,
+    out: Float32Array,
     static: StaticSources,
-    bent: Signal,
+    bent: Float32Array,
     images: list[ReceiverImage],
     site: Site,
     receiver: Receiver,
@@ -193,7 +194,7 @@ def _add_corners(
             add_turning(out, signals[i], place, np.ones(len(receiver.knots_s)), receiver)
 
 
-def _corner_delays(image: ReceiverImage, corner_y: float, mouth: float, receiver: Receiver) -> Array:
+def _corner_delays(image: ReceiverImage, corner_y: float, mouth: float, receiver: Receiver) -> FloatArray:
     """Delay of every microphone against the array's centre for sound from a corner, shape (M,)."""
     x, y, z = receiver.positions_m.T
     last_leg = np.hypot(mouth - x, image.mirror(y) - corner_y)

@@ -4,16 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.octave_bands import resample_whole
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import KNOT_SAMPLES, OVERSAMPLING, Table, add_delayed
 from .diffraction import SPEED_OF_SOUND_MPS
-
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
 
 NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
 ARRIVAL_ROUNDS = 4
@@ -35,9 +32,9 @@ class Receiver:
         How `base_link` moves along x.
     """
 
-    positions_m: Array
-    skew_s: Array
-    knots_s: Array
+    positions_m: FloatArray
+    skew_s: FloatArray
+    knots_s: FloatArray
     ego: EgoMotion = field(default_factory=EgoMotion)
 
     @property
@@ -51,7 +48,7 @@ class Receiver:
         return float(KNOT_SAMPLES / (self.knots_s[1] - self.knots_s[0]))
 
     @property
-    def centre_m(self) -> Array:
+    def centre_m(self) -> FloatArray:
         """Array's centre in `base_link`, shape (3,)."""
         return np.asarray(self.positions_m.mean(axis=0))
 
@@ -59,7 +56,9 @@ class Receiver:
         """Height of the array's centre above a source."""
         return float(self.centre_m[2]) - height_m
 
-    def arrivals(self, emit_s: Array, length_m: Callable[[Array], Array]) -> tuple[Array, Array]:
+    def arrivals(
+        self, emit_s: FloatArray, length_m: Callable[[FloatArray], FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
         r"""Solve a = t + r(x(a)) / c for what is emitted at t and heard at a by an ego at x.
 
         Parameters
@@ -83,13 +82,15 @@ class Receiver:
         return length, x
 
 
-def distance_m(place_m: Array, x_m: Array, offset_m: Array) -> Array:
+def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> FloatArray:
     """Distance from a place to a point fixed at `offset_m` on an ego at `x_m` (T,)."""
     across = np.hypot(place_m[1] - offset_m[1], place_m[2] - offset_m[2])
     return np.asarray(np.hypot(place_m[0] - offset_m[0] - x_m, across))
 
 
-def add_turning(out: Signal, signal: Signal, place_m: Array, gain: Array, receiver: Receiver) -> None:
+def add_turning(
+    out: Float32Array, signal: Float32Array, place_m: FloatArray, gain: FloatArray, receiver: Receiver
+) -> None:
     """Spread over the microphones of a moving ego what its centre hears from a place that stands still."""
     if not np.abs(signal).any():
         return

@@ -15,16 +15,14 @@ mean one that is drawn once for a site: its face.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.ground.typing import FloatArray
 
 from .paths import SourceImage, near_facade, source_images, through_mouth
 from .receiver import NEAREST_M
-
-Array = NDArray[np.float64]
 
 PATCH_M = 0.9  # along the wall
 WALL_HEIGHT_M = 3.0  # what of a wall is near enough to matter
@@ -51,13 +49,13 @@ class Patches:
         Whether they stand in the crossing street.
     """
 
-    positions_m: Array
-    normals: Array
-    strengths_m: Array
+    positions_m: FloatArray
+    normals: FloatArray
+    strengths_m: FloatArray
     beyond_mouth: bool
 
 
-def scattering(preset: Preset) -> Array:
+def scattering(preset: Preset) -> FloatArray:
     """Scattering coefficient sigma per octave, shape (8,).
 
     Examples
@@ -105,13 +103,13 @@ def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patch
     return Patches(positions, normals, _strengths(len(y), site.facade_reflection, rng), True)
 
 
-def _spread(low: float, high: float, rng: np.random.Generator) -> Array:
+def _spread(low: float, high: float, rng: np.random.Generator) -> FloatArray:
     """Places along a wall, one in every patch, not quite in its middle."""
     count = max(int((high - low) / PATCH_M), 1)
     return np.asarray(low + (high - low) * (np.arange(count) + rng.uniform(0.2, 0.8, count)) / count)
 
 
-def _strengths(count: int, reflection: float, rng: np.random.Generator) -> Array:
+def _strengths(count: int, reflection: float, rng: np.random.Generator) -> FloatArray:
     weights = rng.exponential(1.0, count)
     return np.asarray(reflection * np.sqrt(weights * PATCH_M * WALL_HEIGHT_M / np.pi))
 
@@ -128,16 +126,16 @@ class FirstLeg:
         Amplitude factor per octave without spherical spreading; the last leg's angle is not in it.
     """
 
-    length_m: Array
-    gain: Array
+    length_m: FloatArray
+    gain: FloatArray
 
 
 def first_legs(
     site: Site,
     group: Patches,
     index: int,
-    source_x_m: float | Array,
-    source_y_m: Array,
+    source_x_m: float | FloatArray,
+    source_y_m: FloatArray,
     height_m: float,
     cap_db: float,
 ) -> list[FirstLeg]:
@@ -149,7 +147,9 @@ def first_legs(
     return [_mouth_leg(site, group, index, image, source_y_m, height_m, cap_db) for image in near]
 
 
-def _open_leg(group: Patches, index: int, image: SourceImage, source_y: Array, height: float) -> FirstLeg:
+def _open_leg(
+    group: Patches, index: int, image: SourceImage, source_y: FloatArray, height: float
+) -> FirstLeg:
     x, y, z = group.positions_m[index]
     away = np.stack([image.x_m - x + np.zeros_like(source_y), source_y - y], axis=1)
     length = np.sqrt((away**2).sum(axis=1) + (z - height) ** 2)
@@ -162,7 +162,7 @@ def _mouth_leg(
     group: Patches,
     index: int,
     image: SourceImage,
-    source_y: Array,
+    source_y: FloatArray,
     height: float,
     cap_db: float,
 ) -> FirstLeg:
@@ -176,7 +176,7 @@ def _mouth_leg(
     return FirstLeg(length, gain[:, None] * passage.screen_gain(cap_db))
 
 
-def last_leg(group: Patches, positions_m: Array) -> tuple[Array, Array]:
+def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distance of every patch to every microphone and the amplitude factor there, shape (P, M) each."""
     away = positions_m[None] - group.positions_m[:, None]
     distance = np.maximum(np.linalg.norm(away, axis=2), NEAREST_M)
@@ -184,7 +184,7 @@ def last_leg(group: Patches, positions_m: Array) -> tuple[Array, Array]:
     return distance, np.sqrt(cosine) / distance
 
 
-def seen_through_mouth(site: Site, place_m: Array, x_m: Array) -> Array:
+def seen_through_mouth(site: Site, place_m: FloatArray, x_m: FloatArray) -> FloatArray:
     """1 where an ego at `x_m` (T,) sees a place in the crossing street, 0 where a corner is in the way."""
     passage = through_mouth(site, float(place_m[0]), np.full_like(x_m, place_m[1]), x_m, 0.0, 0.0)
     return passage.lit

@@ -1,10 +1,10 @@
 """What rough walls send on of a moving source, rendered at every microphone."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
@@ -13,12 +13,9 @@ from .receiver import NEAREST_M, Receiver, add_turning, distance_m
 from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, scattering, seen_through_mouth
 from .static_field import StaticSources
 
-Array = NDArray[np.float64]
-Signal = NDArray[np.float32]
-
 
 def add_scattered(
-    out: Signal,
+    out: Float32Array,
     static: StaticSources,
     source: MovingSource,
     site: Site,
@@ -50,7 +47,12 @@ def add_scattered(
 
 
 def _add_leg(
-    out: Signal, emission: Emission, leg: FirstLeg, amplitude: Array, receiver: Receiver, patch_m: Array
+    out: Float32Array,
+    emission: Emission,
+    leg: FirstLeg,
+    amplitude: FloatArray,
+    receiver: Receiver,
+    patch_m: FloatArray,
 ) -> None:
     """Add what one patch sends on, as late as the array's centre hears it."""
     made = emission.table(leg.gain * amplitude)
@@ -65,7 +67,12 @@ def _add_leg(
 
 
 def _add_patches(
-    out: Signal, static: StaticSources, arrived: Signal, group: Patches, site: Site, receiver: Receiver
+    out: Float32Array,
+    static: StaticSources,
+    arrived: Float32Array,
+    group: Patches,
+    site: Site,
+    receiver: Receiver,
 ) -> None:
     """Let every patch sound to all microphones."""
     if receiver.ego.stands:

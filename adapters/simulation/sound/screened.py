@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from worldstate.adapters.simulation.scene.occluders import Occluder, detours
+from worldstate.adapters.simulation.scene.occluders import OccludingBody, detours
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
+from worldstate.ground.typing import FloatArray
 
 from .diffraction import screen_attenuation_db
-
-Array = NDArray[np.float64]
 
 BLEND_M = 0.02  # detour over which a line that touches a body turns into the way round it
 
@@ -30,14 +28,14 @@ class ScreenedLeg:
         Amplitude per octave; 0 where this is not the way.
     """
 
-    before_m: Array
-    via_x_m: Array
-    via_y_m: Array
-    gain: Array
+    before_m: FloatArray
+    via_x_m: FloatArray
+    via_y_m: FloatArray
+    gain: FloatArray
 
 
 def screened_legs(
-    occluders: Sequence[Occluder], x_m: Array, y_m: Array, ego_x_m: Array, cap_db: float
+    occluders: Sequence[OccludingBody], x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArray, cap_db: float
 ) -> list[ScreenedLeg]:
     """Return the straight way and the way round every corner of the body that is most in the way.
 

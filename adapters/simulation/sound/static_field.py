@@ -8,8 +8,9 @@ from the spectra, once per microphone however many sources there are: sources ar
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
+
+from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 from .diffraction import SPEED_OF_SOUND_MPS
 
@@ -19,7 +20,7 @@ BLOCKS_AT_ONCE = 16
 PENDING = 160  # as many sources wait, with their signals, to be rendered together
 
 
-def plane_wave_delays(directions: NDArray[np.float64], offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArray:
     """Delay of plane waves at every microphone against the array's centre, shape (Q, M), s.
 
     Parameters
@@ -58,15 +59,15 @@ class StaticSources:
     array([5000, 5040])
     """
 
-    def __init__(self, out: NDArray[np.float32], sample_rate_hz: float) -> None:
+    def __init__(self, out: Float32Array, sample_rate_hz: float) -> None:
         self._out, self._rate = out, sample_rate_hz
-        self._waiting: list[tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]] = []
+        self._waiting: list[tuple[Float32Array, FloatArray, FloatArray]] = []
 
     def add(
         self,
-        signals: NDArray[np.float32],
-        delays_s: NDArray[np.float64],
-        gains: NDArray[np.float64] | None = None,
+        signals: Float32Array,
+        delays_s: FloatArray,
+        gains: FloatArray | None = None,
     ) -> None:
         """Add sources; see `add_static`."""
         factors = np.ones_like(delays_s) if gains is None else gains
@@ -83,11 +84,11 @@ class StaticSources:
 
 
 def add_static(
-    out: NDArray[np.float32],
-    signals: NDArray[np.float32],
-    delays_s: NDArray[np.float64],
+    out: Float32Array,
+    signals: Float32Array,
+    delays_s: FloatArray,
     sample_rate_hz: float,
-    gains: NDArray[np.float64] | None = None,
+    gains: FloatArray | None = None,
 ) -> None:
     """Add delayed copies of `signals` to every microphone.
 
@@ -122,7 +123,7 @@ def _blocks(samples: int) -> int:
     return -(-samples // HOP) + 1
 
 
-def _analyse(signals: NDArray[np.float32]) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+def _analyse(signals: Float32Array) -> Iterator[tuple[int, Complex64Array]]:
     """Spectra (F, blocks, Q) of Hann-windowed blocks, which sum to the signal, a few blocks at a time."""
     window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(BLOCK) / BLOCK)).astype(np.float32)
     blocks = _blocks(signals.shape[1])

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.frontend.array.angular_interpolation import Nodes
+from worldstate.frontend.array.angular_interpolation import AngularInterpolation
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
@@ -41,7 +41,7 @@ def test_any_quadratic_form_is_said_by_its_nodes(seed: int, planar: bool, span: 
     rng = np.random.default_rng(seed)
     places = rng.uniform(-0.3, 0.3, (8, 3)) * [0.0 if planar else 1.0, 1.0, 1.0]
     vectors = MicrophoneArray(places).steering([400.0, 900.0], np.linspace(-span, span, 151))
-    nodes = Nodes.of(vectors)
+    nodes = AngularInterpolation.of(vectors)
     assert nodes is not None
     assert len(nodes.index) < 60
     Q = circular(rng, 2, 8, 8)
@@ -51,7 +51,7 @@ def test_any_quadratic_form_is_said_by_its_nodes(seed: int, planar: bool, span: 
 
 
 def test_too_coarse_a_grid_has_no_nodes() -> None:
-    assert Nodes.of(ROOF.steering([1500.0], np.radians(np.linspace(-90, 90, 15)))) is None
+    assert AngularInterpolation.of(ROOF.steering([1500.0], np.radians(np.linspace(-90, 90, 15)))) is None
 
 
 def test_the_roof_needs_few_and_its_power_is_that_of_every_beam() -> None:

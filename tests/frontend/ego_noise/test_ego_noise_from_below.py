@@ -11,8 +11,8 @@ from sklearn.metrics import roc_auc_score
 from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.ego_noise.elevation_split import FromBelow
-from worldstate.frontend.ego_noise.guard_delay import Guard
+from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
+from worldstate.frontend.ego_noise.guard_delay import GuardDelay
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 
@@ -20,7 +20,7 @@ RATE = 16_000
 WHOLE = roof_array_56()
 THIN = MicrophoneArray(WHOLE.positions_m[::4])
 BINS_HZ = np.arange(312.5, 1800.0, 125.0)
-JUDGES = {array.n_microphones: FromBelow.of(array, BINS_HZ) for array in (WHOLE, THIN)}
+JUDGES = {array.n_microphones: ElevationSplit.of(array, BINS_HZ) for array in (WHOLE, THIN)}
 PLAIN = FrontEndSettings(nfft=256)
 LEARNING = replace(PLAIN, ego_noise=EgoNoiseSettings())
 
@@ -102,7 +102,7 @@ def test_the_share_grows_with_what_comes_from_below(mixed: float, azimuth: float
 
 def test_a_level_line_cannot_tell_and_trusts_its_caller() -> None:
     line = MicrophoneArray(np.linspace(-0.4, 0.4, 9)[:, None] * [0.0, 1.0, 0.0])
-    judge = FromBelow.of(line, BINS_HZ)
+    judge = ElevationSplit.of(line, BINS_HZ)
     assert JUDGES[56].can_tell
     assert JUDGES[14].can_tell
     assert not judge.can_tell
@@ -180,7 +180,7 @@ def test_a_source_where_the_noise_was_loudest_is_still_found() -> None:
 def test_a_guard_gives_everything_back_in_order_with_the_least_weight_since(
     weights: list[float], hops: int
 ) -> None:
-    guard: Guard[int] = Guard(hops)
+    guard: GuardDelay[int] = GuardDelay(hops)
     out = [guard.push(k, weight) for k, weight in enumerate(weights)]
     assert out[:hops] == [None] * min(hops, len(weights))
     assert out[hops:] == [(k, min(weights[k : k + hops + 1])) for k in range(len(weights) - hops)]

@@ -103,5 +103,5 @@ def test_a_belief_out_of_range_is_refused_and_without_ego_noise_ignored() -> Non
     settings = FrontEndSettings(nfft=256, ego_noise=EgoNoiseSettings())
     learning = AcousticAdapter(ARRAY, RATE, Flat(), front_end_settings=settings)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgumentError, match="none_probability"):
-        learning.believe(1.5)
-    AcousticAdapter(ARRAY, RATE, Flat()).believe(0.5)  # type: ignore[arg-type]
+        learning.set_no_source_probability(1.5)
+    AcousticAdapter(ARRAY, RATE, Flat()).set_no_source_probability(0.5)  # type: ignore[arg-type]

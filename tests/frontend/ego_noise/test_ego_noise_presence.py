@@ -130,7 +130,7 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
     signature = SiteSignature(model, SiteEstimateSettings())
     adapter = AcousticAdapter(array, scene.rate_hz, signature, front_end_settings=settings)
     world = WorldFilter(context=Context(), policy=policies.for_alpha(0.02))
-    adapter.believe(float(gate == "open"))
+    adapter.set_no_source_probability(float(gate == "open"))
     rows = []
     heard, blocks = np.asarray(sound / FULL_SCALE_PA, np.float32), round(20 * len(sound) / scene.rate_hz)
     for block in np.array_split(heard, blocks):
@@ -138,7 +138,7 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
             if gate == "belief":
                 measurement = adapter.interpret(frame)
                 world = world.predict_to(measurement.stamp_ns).update(measurement)
-                adapter.believe(world.explanation.none)
+                adapter.set_no_source_probability(world.explanation.none)
             if scene.in_sight_s - 1.05 < frame.sample_index / scene.rate_hz < scene.in_sight_s + 0.05:
                 peak = frame.srp.max()
                 rows.append(np.log([peak, peak / np.median(frame.srp)]))

@@ -15,9 +15,9 @@ from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.health.channel_health import ArrayHealth, Fault
-from worldstate.frontend.health.clipping import RailCounter
-from worldstate.frontend.health.dropouts import GapFinder
-from worldstate.frontend.health.position_fit import place_scores, place_weights
+from worldstate.frontend.health.clipping import ClippingCounter
+from worldstate.frontend.health.dropouts import DropoutFinder
+from worldstate.frontend.health.position_fit import position_scores, position_weights
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.values import NotUsable
@@ -387,9 +387,9 @@ def test_four_cuts_in_five_are_found_in_simulated_streets() -> None:
         for _ in range(25):
             start, gap = rng.integers(0, 30_000), rng.integers(64, 9600)
             joined = np.concatenate([audio[start : start + 2400], audio[start + 2400 + gap :][:2400]])
-            gaps = GapFinder(14).push(joined, np.ones(14, bool))
+            gaps = DropoutFinder(14).push(joined, np.ones(14, bool))
             found += any(gap.kind == "splice" and abs(gap.sample - 2400) <= 1 for gap in gaps)
-            clean = GapFinder(14).push(audio[start : start + 4800], np.ones(14, bool))
+            clean = DropoutFinder(14).push(audio[start : start + 4800], np.ones(14, bool))
             assert clean == []
     assert found >= 160
 
@@ -402,7 +402,7 @@ def test_a_clipped_wave_is_clipped_and_a_whole_one_is_not(
     rng = np.random.default_rng(0)
     wave = amplitude * (np.sin(2 * np.pi * np.arange(9600) / period) + 0.1 * rng.standard_normal(9600))
     both = np.round(np.stack([wave, wave.clip(-9e9, limit * amplitude)], axis=1)).astype(np.float32)
-    rails = RailCounter(2)
+    rails = ClippingCounter(2)
     for hop in np.split(both, 2):
         rails.push(hop, hop.min(axis=0), hop.max(axis=0))
     share = rails.clipped_share()
@@ -413,7 +413,7 @@ def test_a_clipped_wave_is_clipped_and_a_whole_one_is_not(
 def test_place_weights_are_the_best_linear_guess_of_the_others() -> None:
     array, f = MicrophoneArray(ROOF.positions_m[::7]), np.array([400.0, 1200.0])
     usable = np.arange(8) != 2
-    weights = place_weights(array, f, usable)
+    weights = position_weights(array, f, usable)
     distance = np.linalg.norm(array.positions_m[:, None] - array.positions_m, axis=2)
     for k, frequency in enumerate(f):
         field = np.sinc(2 * frequency * distance / 343.0) + np.diag(np.where(usable, 0.2, 1e3))
@@ -439,7 +439,7 @@ def test_place_scores_are_their_definition() -> None:
             agreement = (z[:, :, m] * without.conj()).real.mean(axis=0).sum()
             expected[m, p] = agreement / np.sqrt(3 * power)
     coherence = np.einsum("tki,tkj->kij", z, z.conj()).real / 40
-    scores = place_scores(coherence.astype(np.float32), weights.astype(np.float32))
+    scores = position_scores(coherence.astype(np.float32), weights.astype(np.float32))
     np.testing.assert_allclose(scores, expected, atol=1e-5)
 
 

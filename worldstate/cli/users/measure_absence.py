@@ -10,7 +10,7 @@ from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
     from worldstate.adapters.camera.miss_rates import MissRates
-    from worldstate.operations.detectors.miss_rate_measurement import MakeDetector, Scene
+    from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
 
 DESCRIPTION = """\
 Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
@@ -83,14 +83,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _scene(
     arguments: argparse.Namespace, make: "MakeDetector", path: Path, reference: Path | None
-) -> "Scene":
+) -> "LabelledVideo":
     from dataclasses import replace
     from math import radians
 
     from worldstate.adapters.camera.detection_formats import read_any_detections
     from worldstate.adapters.camera.pinhole import PinholeCamera
     from worldstate.adapters.camera.video import open_video
-    from worldstate.operations.detectors.miss_rate_measurement import Scene, reference_by
+    from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by
 
     video = open_video(path)
     camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
@@ -98,9 +98,9 @@ def _scene(
         camera = replace(camera, half_angle_rad=radians(arguments.half_angle))
     boxes = arguments.reference or reference
     if boxes is None:
-        return Scene(video, reference_by(make(), video), camera)
+        return LabelledVideo(video, reference_by(make(), video), camera)
     size = (video.width_px, video.height_px)
-    return Scene(video, read_any_detections(boxes, video.frame_rate_hz, size), camera)
+    return LabelledVideo(video, read_any_detections(boxes, video.frame_rate_hz, size), camera)
 
 
 def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:

@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
@@ -24,6 +23,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.typing import Complex64Array, Float32Array
 
 from .bench_peers import peer_times
 from .bench_stages import (
@@ -32,7 +32,6 @@ from .bench_stages import (
     NFFT,
     RATE_HZ,
     SRP_BINS,
-    Samples,
     srp_beams,
     stage_times,
 )
@@ -138,7 +137,7 @@ def run_bench(rounds: int = 5, on_round: Callable[[], None] = lambda: None) -> B
     return _report(runs, kernels)
 
 
-def _source(rng: np.random.Generator) -> Samples:
+def _source(rng: np.random.Generator) -> Float32Array:
     """Make a plane wave of unit power and an engine line of a tenth of that, (n, 56): 2 s, three times."""
     n = 2 * RATE_HZ
     frequencies = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
@@ -154,7 +153,7 @@ def _kernel(info: Mapping[str, Any]) -> str:
     return " ".join(str(info.get(key) or "-") for key in ("internal_api", "version", "architecture"))
 
 
-def _one_round(street: Samples, noise: Samples) -> Mapping[str, Milliseconds]:
+def _one_round(street: Float32Array, noise: Float32Array) -> Mapping[str, Milliseconds]:
     hops = _hops(street)
     frames = StreamingStft(56, NFFT, range(NFFT // 2 + 1)).push(street[:5000])[:19]
     ours = {name: times[WARM_UP_HOPS:] for name, times in stage_times(hops).items()}
@@ -166,18 +165,18 @@ def _one_round(street: Samples, noise: Samples) -> Mapping[str, Milliseconds]:
     return ours | peer_times(street, frames, RATE_HZ, AZIMUTHS_RAD)
 
 
-def _hops(sound: Samples) -> list[Samples]:
+def _hops(sound: Float32Array) -> list[Float32Array]:
     ends = np.floor(np.arange(SECONDS * 10 + 1) * RATE_HZ / 10 + 0.5).astype(int)
     return [sound[a:b] for a, b in pairwise(ends)]
 
 
-def _front_end_times(hops: list[Samples], settings: FrontEndSettings) -> Milliseconds:
+def _front_end_times(hops: list[Float32Array], settings: FrontEndSettings) -> Milliseconds:
     """Time `FrontEnd.process`: what a user gets, every check included."""
     front_end = FrontEnd(roof_array_56(), RATE_HZ, settings)
     return [elapsed_ms(partial(front_end.process, samples)) for samples in hops][WARM_UP_HOPS:]
 
 
-def _on_a_tenth(frames: NDArray[np.complex64]) -> dict[str, Milliseconds]:
+def _on_a_tenth(frames: Complex64Array) -> dict[str, Milliseconds]:
     """Time SRP and MUSIC on exactly the frames that the peers get."""
     beams = srp_beams()
     used = np.ascontiguousarray(frames[:, SRP_BINS.start : SRP_BINS.stop])

@@ -11,9 +11,9 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 from .stopwatch import Milliseconds, elapsed_ms
 
@@ -22,10 +22,10 @@ SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]
 
 
 def peer_times(
-    sound: NDArray[np.float32],
-    frames: NDArray[np.complex64],
+    sound: Float32Array,
+    frames: Complex64Array,
     sample_rate_hz: int,
-    azimuths_rad: NDArray[np.float64],
+    azimuths_rad: FloatArray,
 ) -> dict[str, Milliseconds]:
     """Return milliseconds per hop of each peer, keys beginning with ``peer_``; empty where none is installed.
 
@@ -63,12 +63,12 @@ def peer_times(
 
 
 def _published_chain(
-    sound: NDArray[np.float32], sample_rate_hz: int, method: Any
+    sound: Float32Array, sample_rate_hz: int, method: Any
 ) -> tuple[float, Milliseconds, float]:
     """Return the STFT of the file, SRP of two half seconds several times, and the STFT of one second."""
     from scipy.signal import stft
 
-    def transform(part: NDArray[np.float32]) -> list[Any]:
+    def transform(part: Float32Array) -> list[Any]:
         return [stft(channel, sample_rate_hz, nperseg=NFFT)[2] for channel in part.T]
 
     file_ms = elapsed_ms(lambda: transform(sound))

@@ -22,6 +22,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.phat import power, whiten
 from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.ground.typing import Float32Array
 
 from .stopwatch import Milliseconds, elapsed_ms
 
@@ -32,8 +33,6 @@ GOAL = ("stft", "phat", "srp181_new_frames", "srp181_running_second", "feature")
 """Stages of the first goal, in milliseconds."""
 MORE = ("peaks", "bands", "looming", "tone", "music", "channel_watching")
 """Stages that `everything` adds to them."""
-
-Samples = NDArray[np.float32]
 
 
 def srp_beams() -> Steering:
@@ -47,7 +46,7 @@ def srp_beams() -> Steering:
     return Steering.towards(roof_array_56(), bin_frequencies_hz(SRP_BINS, RATE_HZ, NFFT), AZIMUTHS_RAD)
 
 
-def stage_times(hops: list[Samples]) -> dict[str, Milliseconds]:
+def stage_times(hops: list[Float32Array]) -> dict[str, Milliseconds]:
     """Time every stage on every hop, in turn, as the stream does them.
 
     Parameters
@@ -85,7 +84,7 @@ class _Stages:
         self._pairs: list[NDArray[Any]] = []
         self._energies: list[NDArray[Any]] = []
 
-    def of(self, samples: Samples) -> list[tuple[str, Callable[[], object]]]:
+    def of(self, samples: Float32Array) -> list[tuple[str, Callable[[], object]]]:
         """Return the stages of one hop, to be called in this order."""
         return [
             ("stft", partial(self._transform, samples)),
@@ -101,7 +100,7 @@ class _Stages:
             ("channel_watching", partial(self._watch, samples)),
         ]
 
-    def _transform(self, samples: Samples) -> None:
+    def _transform(self, samples: Float32Array) -> None:
         self._spectra = self._stft.push(samples)
 
     def _whiten(self) -> None:
@@ -126,7 +125,7 @@ class _Stages:
         if len(means) == 10:
             looming(np.arange(-0.95, 0.0, 0.1), np.log(means), floor_std=0.08)
 
-    def _fit_tone(self, samples: Samples) -> None:
+    def _fit_tone(self, samples: Float32Array) -> None:
         self._tone.push(samples, self._mask)
         self._tone.read()
 
@@ -134,5 +133,5 @@ class _Stages:
         self._music.push(self._spectra[:, 2:18])
         self._music.read(self._mask)
 
-    def _watch(self, samples: Samples) -> None:
+    def _watch(self, samples: Float32Array) -> None:
         self._monitor.push(samples, self._energies[-1], self._matrices)

@@ -7,11 +7,9 @@ by the functions that the front-end is made of.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
 from worldstate.frontend.approach.tone import estimate_tone
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -22,10 +20,9 @@ from worldstate.frontend.direction.peaks import find_peaks
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
+from worldstate.ground.typing import ComplexArray, FloatArray
 
-Numbers = NDArray[np.float64]
 Generator = np.random.Generator
-Complex = NDArray[np.complexfloating[Any, Any]]
 
 TONE_SAMPLES, TONE_RATE_HZ, TONE_BAND_HZ = 256, 1000.0, (40.0, 460.0)
 PAIR_FRAMES, PAIR_BIN_HZ, PAIR_LIMIT_S = 60, 50.0, 3e-3
@@ -79,13 +76,13 @@ class Efficiency:
     """
 
     name: str
-    at: Numbers
-    bound: Numbers
-    mean_square: Numbers
+    at: FloatArray
+    bound: FloatArray
+    mean_square: FloatArray
     trials: int
 
     @property
-    def ratio_db(self) -> Numbers:
+    def ratio_db(self) -> FloatArray:
         """Mean squared error over the bound, dB, shape (n,)."""
         return np.asarray(10.0 * np.log10(self.mean_square / self.bound))
 
@@ -340,6 +337,6 @@ def _mean_square(trial: Trial, snr: float, trials: int, rng: Generator) -> float
     return float(np.mean([trial.error(snr, rng) ** 2 for _ in range(trials)]))
 
 
-def _circular(rng: Generator, *shape: int) -> Complex:
+def _circular(rng: Generator, *shape: int) -> ComplexArray:
     """Circular complex noise of unit power."""
     return np.asarray(np.sqrt(0.5) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)))

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveBudget
 from worldstate.abduction.cueing.conformal import conformal_threshold, recordings_needed
@@ -15,13 +14,13 @@ from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_map
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_stream import HOP_S, HopStream
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate.operations.training.window_calibration import MISS_RATES
 
 from .false_alarm_map import FalseAlarmRate, false_alarm_rate
 
-Numbers = NDArray[np.float64]
 Method = Literal["conformal", "plain"]
 
 # With fewer false alarms in all the hours than this, their rate is not known to a factor of two.
@@ -90,7 +89,7 @@ class CueingSettings:
         """Length of a piece in hops."""
         return max(round(self.block_s / HOP_S), 1)
 
-    def threshold(self, hazard_free: Sequence[Numbers], alpha: float) -> float:
+    def threshold(self, hazard_free: Sequence[FloatArray], alpha: float) -> float:
         """Return gamma(alpha) on recordings; above all of them where no threshold has the guarantee."""
         if self.method == "plain":
             return neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
@@ -230,7 +229,7 @@ def calibrate_cueing(
     )
 
 
-def cut(stream: Numbers, block_hops: int) -> list[Numbers]:
+def cut(stream: FloatArray, block_hops: int) -> list[FloatArray]:
     """Return pieces of at least `block_hops`; what is left over at the end goes to the last one.
 
     Examples
@@ -242,17 +241,17 @@ def cut(stream: Numbers, block_hops: int) -> list[Numbers]:
     return np.split(stream, [i * block_hops for i in range(1, count)])
 
 
-def _statistics(streams: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[Numbers]:
+def _statistics(streams: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
     switches = StatisticSwitches(fixed_miss_rate=beta)
     return [stream_statistic(stream, prior, switches) for stream in streams]
 
 
-def _hazards(approaches: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[Numbers]:
+def _hazards(approaches: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
     scored = _statistics(approaches, prior, beta)
     return [s[stream.before_sight] for s, stream in zip(scored, approaches, strict=True)]
 
 
-def _budget(calm: list[Numbers], alpha: float, beta: float, settings: CueingSettings) -> BudgetReport:
+def _budget(calm: list[FloatArray], alpha: float, beta: float, settings: CueingSettings) -> BudgetReport:
     gamma = settings.threshold(calm, alpha)
     counted = false_alarm_rate(calm, gamma, settings.sustain_hops, HOP_S)
     rate, per_hour = _held_out(calm, alpha, settings)
@@ -260,7 +259,7 @@ def _budget(calm: list[Numbers], alpha: float, beta: float, settings: CueingSett
 
 
 def _held_out(
-    calm: list[Numbers], alpha: float, settings: CueingSettings
+    calm: list[FloatArray], alpha: float, settings: CueingSettings
 ) -> tuple[float, float] | tuple[None, None]:
     """Achieved rates by folds that never part a recording."""
     folds = min(settings.folds, len(calm))
@@ -278,7 +277,7 @@ def _held_out(
     return alarms / hours, onsets / hours
 
 
-def _risk_map(calm: list[Numbers], hazards: list[Numbers], time_hops: float, kept: RiskMap) -> RiskMap:
+def _risk_map(calm: list[FloatArray], hazards: list[FloatArray], time_hops: float, kept: RiskMap) -> RiskMap:
     if not hazards:
         return kept
     scores = np.concatenate([*calm, *hazards])
@@ -286,7 +285,7 @@ def _risk_map(calm: list[Numbers], hazards: list[Numbers], time_hops: float, kep
     return fit_risk_map(scores, labels, independent=scores.size / time_hops)
 
 
-def _adaptive(hazards: list[Numbers], settings: CueingSettings) -> AdaptiveBudget | None:
+def _adaptive(hazards: list[FloatArray], settings: CueingSettings) -> AdaptiveBudget | None:
     """Return the rate to keep, its threshold bounded by what half of the approaches reach."""
     if settings.keep_per_hour is None:
         return None

@@ -4,7 +4,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.camera.camera_health import CameraHealth, learn_health
 from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, Family, degrade
@@ -16,9 +15,9 @@ from worldstate.adapters.camera.static_boxes import ParkedRule, kept_and_parked
 from worldstate.adapters.camera.video import Video
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 from worldstate.measurement.sector import Sector
 
-Numbers = NDArray[np.float64]
 MakeDetector = Callable[[], Detector]
 
 # Sectors that clutter is counted in lie this far apart.
@@ -87,7 +86,7 @@ class AbsenceSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class LabelledVideo:
     """A video with what is known to be in it.
 
     Parameters
@@ -106,7 +105,7 @@ class Scene:
 
 
 def measure_absence(
-    scenes: Sequence[Scene],
+    scenes: Sequence[LabelledVideo],
     make_detector: MakeDetector,
     rng: np.random.Generator,
     settings: AbsenceSettings | None = None,
@@ -122,7 +121,7 @@ def measure_absence(
 
     Parameters
     ----------
-    scenes : sequence of Scene
+    scenes : sequence of LabelledVideo
         Videos of one camera.
     make_detector : callable
         Makes a detector; it may have a state, so each video at each level gets a new one.
@@ -183,10 +182,10 @@ class _Tally:
             mine[..., 0] = theirs[..., 0]
         return FamilyCounts(_rows(self.looks), _rows(self.misses), tuple(self.sectors), tuple(self.clutter))
 
-    def _all(self) -> tuple[Numbers, ...]:
+    def _all(self) -> tuple[FloatArray, ...]:
         return self.looks, self.misses, self.sectors, self.clutter
 
-    def look(self, scene: Scene, number: int, found: DetectionFrame, level: int) -> None:
+    def look(self, scene: LabelledVideo, number: int, found: DetectionFrame, level: int) -> None:
         """Count what was found in a frame at a level."""
         if not self._settings.warm_up <= number < len(scene.reference):
             return
@@ -205,7 +204,9 @@ class _Tally:
         false &= ~_inside(found.boxes_px, there.boxes_px)
         self._count_clutter(scene.camera, there.boxes_px, found.boxes_px[false], level)
 
-    def _count_clutter(self, camera: PinholeCamera, there_px: Numbers, false_px: Numbers, level: int) -> None:
+    def _count_clutter(
+        self, camera: PinholeCamera, there_px: FloatArray, false_px: FloatArray, level: int
+    ) -> None:
         """Count the sectors without a reference object, and those of them that a false detection touches."""
         objects, false = _azimuths(camera, there_px), _azimuths(camera, false_px)
         right, left = camera.view_rad
@@ -226,30 +227,30 @@ class _Look:
     family: Family
     level: int
 
-    def take(self, scene: Scene, number: int, frame: NDArray[np.uint8], rng: np.random.Generator) -> None:
+    def take(self, scene: LabelledVideo, number: int, frame: ImageArray, rng: np.random.Generator) -> None:
         """Degrade a frame, look at it and count."""
         found = self.detector.detect(degrade(frame, self.family, LEVELS[self.level], rng))
         self.tally.look(scene, number, found, self.level)
 
 
-def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> NDArray[np.int64]:
+def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> IntArray:
     kept, still = kept_and_parked(reference, number, settings.keep, ParkedRule())
     return kept[~still] if settings.moving_only else kept
 
 
-def _inside(boxes_px: Numbers, others_px: Numbers) -> NDArray[np.bool_]:
+def _inside(boxes_px: FloatArray, others_px: FloatArray) -> BoolArray:
     """Whether the middle of each box lies in some other one, shape (n,)."""
     middles = (boxes_px[:, None, :2] + boxes_px[:, None, 2:]) / 2.0
     held = (middles >= others_px[None, :, :2]) & (middles <= others_px[None, :, 2:])
     return np.asarray(np.any(np.all(held, axis=2), axis=1))
 
 
-def _azimuths(camera: PinholeCamera, boxes_px: Numbers) -> Collection[tuple[float, float]]:
+def _azimuths(camera: PinholeCamera, boxes_px: FloatArray) -> Collection[tuple[float, float]]:
     seen = [camera.sighting(box, "", 1.0) for box in boxes_px]
     return [(sighting.azimuth_rad, sighting.width_rad) for sighting in seen]
 
 
-def _health(scenes: Sequence[Scene], rng: np.random.Generator) -> CameraHealth | None:
+def _health(scenes: Sequence[LabelledVideo], rng: np.random.Generator) -> CameraHealth | None:
     """Learn from frames spread over the videos; None where none of them shows anything sharp."""
     frames = []
     for scene in scenes[:_HEALTH_FRAMES]:
@@ -273,5 +274,5 @@ def reference_by(detector: Detector, video: Video) -> DetectionLog:
     return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
 
 
-def _rows(values: Numbers) -> tuple[tuple[float, ...], ...]:
+def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in values.tolist())

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import in_range
+from worldstate.ground.typing import IntArray
 
 
-def recording_folds(labels: Sequence[str], folds: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def recording_folds(labels: Sequence[str], folds: int, rng: np.random.Generator) -> IntArray:
     """Deal recordings to folds at random, each label in its turn.
 
     Parameters

@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import rankdata
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray
 
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
@@ -79,7 +80,7 @@ def macro(by_group: Mapping[str, float]) -> float:
     return float(np.mean(list(by_group.values())))
 
 
-def rate(decisions: NDArray[np.bool_], among: NDArray[np.bool_]) -> float | None:
+def rate(decisions: BoolArray, among: BoolArray) -> float | None:
     """Return the share of decisions among the chosen rows, None where there are none.
 
     Examples

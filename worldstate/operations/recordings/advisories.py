@@ -8,16 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.typing import IndexArray
 
 LONGEST_LEAD_S = 5.0
 SECONDS_PER_HOUR = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Detection:
+class ApproachOutcome:
     """How the advisories of one occluded approach stand to its T0.
 
     Parameters
@@ -29,7 +30,7 @@ class Detection:
 
     Examples
     --------
-    >>> Detection(lead_time_s=1.7, false_advisories_before=0).detected
+    >>> ApproachOutcome(lead_time_s=1.7, false_advisories_before=0).detected
     True
     """
 
@@ -42,7 +43,7 @@ class Detection:
         return self.lead_time_s is not None
 
 
-def rising_edges(alarm: ArrayLike) -> NDArray[np.intp]:
+def rising_edges(alarm: ArrayLike) -> IndexArray:
     """Return the hops at which an alarm begins; one that is on from the first hop begins there.
 
     Examples
@@ -54,19 +55,19 @@ def rising_edges(alarm: ArrayLike) -> NDArray[np.intp]:
     return np.flatnonzero(on & ~np.concatenate([[False], on[:-1]]))
 
 
-def detection(onsets_s: Sequence[float], t0_s: float) -> Detection:
+def detection(onsets_s: Sequence[float], t0_s: float) -> ApproachOutcome:
     """Compare the onsets of one recording with its line-of-sight entry, both in seconds from its start.
 
     Examples
     --------
     >>> detection([0.5, 5.5, 6.75], t0_s=7.0)
-    Detection(lead_time_s=1.5, false_advisories_before=1)
+    ApproachOutcome(lead_time_s=1.5, false_advisories_before=1)
     """
     onsets = finite_array("onsets_s", np.asarray(onsets_s, dtype=np.float64), (None,))
     lead_s = in_range("t0_s", t0_s, -np.inf, np.inf) - onsets
     counted = lead_s[(lead_s > 0.0) & (lead_s <= LONGEST_LEAD_S)]
     longest_s = float(counted.max()) if counted.size else None
-    return Detection(longest_s, int((lead_s > LONGEST_LEAD_S).sum()))
+    return ApproachOutcome(longest_s, int((lead_s > LONGEST_LEAD_S).sum()))
 
 
 def false_alarms_per_hour(alarms: Sequence[ArrayLike], hop_s: float = 0.1) -> float:

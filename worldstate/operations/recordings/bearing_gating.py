@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.frontend.direction.gating import GatingCurve, gating_curve
 from worldstate.ground.checks import check_shape
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Numbers = NDArray[np.float64]
 
 # The paper's second point: 2.4 degrees at 16 % coverage, after 3.4 degrees on all.
 PUBLISHED = ((1.0, 3.4), (0.16, 2.4))
@@ -52,14 +51,14 @@ class BearingChecks:
     (3, array([1.  , 0.67, 0.33]))
     """
 
-    prominence: Numbers
-    error_rad: Numbers
+    prominence: FloatArray
+    error_rad: FloatArray
 
     def __post_init__(self) -> None:
         check_shape("error_rad", np.shape(self.error_rad), np.shape(self.prominence))
 
     @property
-    def in_view(self) -> NDArray[np.bool_]:
+    def in_view(self) -> BoolArray:
         """Where a moving box was in view, shape (n,)."""
         return np.isfinite(self.error_rad)
 
@@ -230,5 +229,5 @@ def _nearest(bearing_rad: float, moving_rad: Sequence[float]) -> float:
     return min(errors, key=abs, default=float("nan"))
 
 
-def _median(values: Numbers) -> float | None:
+def _median(values: FloatArray) -> float | None:
     return float(np.median(values)) if values.size else None

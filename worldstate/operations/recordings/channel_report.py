@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Fault
-from worldstate.frontend.health.dropouts import Gap
+from worldstate.frontend.health.dropouts import Dropout
 from worldstate.frontend.health.sample_clock import RateEstimate
 from worldstate.ground.values import NotUsable, seconds
 
@@ -58,7 +58,7 @@ class RecordingHealth:
     ----------
     verdicts : tuple of ChannelVerdict
         By channel; empty where nothing was wrong.
-    gaps : tuple of Gap
+    gaps : tuple of Dropout
         The first hundred.
     n_gaps : int
         All of them.
@@ -76,7 +76,7 @@ class RecordingHealth:
     """
 
     verdicts: tuple[ChannelVerdict, ...]
-    gaps: tuple[Gap, ...]
+    gaps: tuple[Dropout, ...]
     n_gaps: int
     n_hops: int
     coherence: float | NotUsable
@@ -114,7 +114,7 @@ class HealthLog:
     def __init__(self) -> None:
         self._n_hops = 0
         self._seen: dict[tuple[int, Fault], ChannelVerdict] = {}
-        self._gaps: list[Gap] = []
+        self._gaps: list[Dropout] = []
         self._latest: ArrayHealth | None = None
 
     def add(self, frame: AcousticFrame) -> None:

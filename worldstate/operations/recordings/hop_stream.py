@@ -5,12 +5,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.adapters.files.npz_file import load_npz, save_npz
 from worldstate.ground.checks import check_shape, finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement.measurement import Measurement
 
@@ -18,8 +18,6 @@ HOP_S = 0.1
 UNQUERIED, ABSENT, PRESENT = 0, 1, 2
 MAX_BYTES = 1 << 30
 VERSION = 1
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,14 +62,14 @@ class HopStream:
     name: str
     label: str
     t0_s: float
-    time_s: Numbers
-    log_likelihoods: Numbers
-    answer: NDArray[np.int64]
-    miss_rate: Numbers
-    clutter_rate: Numbers
-    approach: Numbers
-    seen: NDArray[np.bool_]
-    there: NDArray[np.bool_]
+    time_s: FloatArray
+    log_likelihoods: FloatArray
+    answer: IntArray
+    miss_rate: FloatArray
+    clutter_rate: FloatArray
+    approach: FloatArray
+    seen: BoolArray
+    there: BoolArray
 
     def __post_init__(self) -> None:
         n = np.size(self.time_s)
@@ -92,7 +90,7 @@ class HopStream:
         return self.label == "none"
 
     @property
-    def before_sight(self) -> NDArray[np.bool_]:
+    def before_sight(self) -> BoolArray:
         """Windows of an approach that end at or before T0, shape (n,); none where T0 is not known."""
         return np.asarray(self.time_s <= self.t0_s + 1e-6) & (not self.hazard_free)
 

@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.typing import FloatArray
 
 from .hop_stream import ABSENT, PRESENT, HopStream
-
-Numbers = NDArray[np.float64]
 
 # An approach score beyond this many standard deviations says no more than one at it.
 LARGEST_SCORE = 3.0
@@ -53,7 +51,7 @@ class StatisticSwitches:
 
 def stream_statistic(
     stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
-) -> Numbers:
+) -> FloatArray:
     r"""Return eq. (post) at a fixed prior at every hop, shape (n,), in [0, 1].
 
     .. math:: \mathrm{logit}\, s = \log \frac{\sum_k \pi_k \ell_k}
@@ -97,7 +95,7 @@ def stream_statistic(
 
 def presence_statistic(
     stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
-) -> Numbers:
+) -> FloatArray:
     """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,).
 
     Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
@@ -112,13 +110,15 @@ def presence_statistic(
     return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))
 
 
-def approach_score(stream: HopStream) -> Numbers:
+def approach_score(stream: HopStream) -> FloatArray:
     """Return the approach rate in standard deviations within three, 0 where it is not usable, shape (n,)."""
     usable = np.isfinite(stream.approach)
     return np.where(usable, np.clip(stream.approach, -LARGEST_SCORE, LARGEST_SCORE), 0.0)
 
 
-def _log_joint(stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches) -> Numbers:
+def _log_joint(
+    stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches
+) -> FloatArray:
     """Log of prior, signature and answer, up to a constant of each hop, shape (n, K + 2)."""
     prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
     joint = np.log(prior) + stream.log_likelihoods
@@ -127,7 +127,7 @@ def _log_joint(stream: HopStream, reference_prior: Sequence[float], switches: St
     return np.asarray(joint)
 
 
-def _log_visible(stream: HopStream, switches: StatisticSwitches) -> Numbers:
+def _log_visible(stream: HopStream, switches: StatisticSwitches) -> FloatArray:
     """Log p(V | visible) / p(V | hidden or none) at every hop."""
     if not switches.use_absence:
         return np.zeros(len(stream))

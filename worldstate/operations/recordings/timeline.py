@@ -5,15 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.files.atomic import atomic_path
+from worldstate.ground.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Floats = NDArray[np.float64]
 
 
 # Hops of one entity further apart than this are not joined by a line.
@@ -32,10 +30,10 @@ class EntityTrail:
         Whether it was behind an occluder.
     """
 
-    time_s: Floats
-    azimuth_rad: Floats
-    std_rad: Floats
-    hidden: NDArray[np.bool_]
+    time_s: FloatArray
+    azimuth_rad: FloatArray
+    std_rad: FloatArray
+    hidden: BoolArray
 
     def broken(self) -> "EntityTrail":
         """Return the trail with a row of NaN in every gap, so that no line is drawn across."""
@@ -78,17 +76,17 @@ class Timeline:
         Heading of the figure.
     """
 
-    time_s: Floats
-    statistic: Floats
-    risk: Floats
+    time_s: FloatArray
+    statistic: FloatArray
+    risk: FloatArray
     threshold: float
     alpha: float
-    advisory: NDArray[np.bool_]
-    azimuths_rad: Floats
-    srp: Floats
+    advisory: BoolArray
+    azimuths_rad: FloatArray
+    srp: FloatArray
     entities: tuple[EntityTrail, ...]
-    sighting_time_s: Floats
-    sighting_azimuth_rad: Floats
+    sighting_time_s: FloatArray
+    sighting_azimuth_rad: FloatArray
     t0_s: float | None
     title: str
 

@@ -9,19 +9,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.abduction.signature.published_signature import CLASSES, hazard_statistic
 from worldstate.abduction.signature.published_training import Classifier
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 
 from .prevalence import matched_risk
-from .splits import Folds, Split
+from .splits import Split
 from .window_calibration import MISS_RATES, FitMap, WindowCalibration, between, calibrate_windows
 
-Numbers = NDArray[np.float64]
 MakeClassifier = Callable[[np.random.Generator], Classifier]
 
 
@@ -41,27 +40,27 @@ class Predictions:
         Whether the statistic reached the threshold.
     """
 
-    folds: Folds
-    probabilities: Numbers
-    score: Numbers
-    risk: Numbers
-    decision: NDArray[np.bool_]
+    folds: TextArray
+    probabilities: FloatArray
+    score: FloatArray
+    risk: FloatArray
+    decision: BoolArray
 
     @classmethod
-    def blank(cls, folds: Folds) -> "Predictions":
+    def blank(cls, folds: TextArray) -> "Predictions":
         """Return arrays to be filled in, fold by fold."""
         n = len(folds)
         return cls(folds, np.empty((n, len(CLASSES))), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_))
 
-    def fill(self, rows: NDArray[np.bool_], probabilities: Numbers, calibration: WindowCalibration) -> None:
+    def fill(self, rows: BoolArray, probabilities: FloatArray, calibration: WindowCalibration) -> None:
         """Write what a calibration makes of the posteriors of some rows."""
         self.probabilities[rows] = probabilities
         self.score[rows], self.risk[rows], self.decision[rows] = calibration.apply(probabilities)
 
     @property
-    def classes(self) -> NDArray[np.str_]:
+    def classes(self) -> TextArray:
         """Most probable class of each window: the published rule."""
-        most_probable: NDArray[np.str_] = np.array(CLASSES)[self.probabilities.argmax(axis=1)]
+        most_probable: TextArray = np.array(CLASSES)[self.probabilities.argmax(axis=1)]
         return most_probable
 
 
@@ -164,7 +163,9 @@ def transfer(
     return predictions
 
 
-def out_of_fold(table: FeatureTable, folds: Folds, make: MakeClassifier, rng: np.random.Generator) -> Numbers:
+def out_of_fold(
+    table: FeatureTable, folds: TextArray, make: MakeClassifier, rng: np.random.Generator
+) -> FloatArray:
     """Return posteriors of each window from a classifier trained on the other folds, shape (n, 4)."""
     probabilities = np.empty((len(table), len(CLASSES)))
     for fold in np.unique(folds):
@@ -175,7 +176,7 @@ def out_of_fold(table: FeatureTable, folds: Folds, make: MakeClassifier, rng: np
 
 
 def predict_with(
-    table: FeatureTable, probabilities: Numbers, calibration: WindowCalibration, fold: str = "model"
+    table: FeatureTable, probabilities: FloatArray, calibration: WindowCalibration, fold: str = "model"
 ) -> Predictions:
     """Return the predictions of a finished model, as one fold."""
     predictions = Predictions.blank(np.full(len(table), fold))
@@ -188,7 +189,7 @@ def _trained(make: MakeClassifier, table: FeatureTable, rng: np.random.Generator
 
 
 def _calibration(
-    train: FeatureTable, inner: Sequence[Numbers], alpha: float, miss_rate: float, fit_map: FitMap
+    train: FeatureTable, inner: Sequence[FloatArray], alpha: float, miss_rate: float, fit_map: FitMap
 ) -> WindowCalibration:
     levels = [
         calibrate_windows(

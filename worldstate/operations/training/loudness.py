@@ -3,12 +3,11 @@
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.signature.published_signature import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.abduction.signature.site_reference import log_levels
-
-Numbers = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray
 
 
 class LoudestDirection:
@@ -24,7 +23,7 @@ class LoudestDirection:
         """Do nothing."""
         return self
 
-    def predict_proba(self, X: ArrayLike) -> Numbers:
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
         """Return posteriors of front, left, none, right, shape (n, 4): no side is preferred."""
         odds = np.exp(log_levels(X).max(axis=1))
         posteriors = np.zeros((len(odds), len(CLASSES)))

@@ -13,7 +13,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from .feature_evaluation import MakeClassifier, Predictions, cross_validate, transfer
 from .loudness import LoudestDirection
 from .site_references import with_site_references
-from .splits import Protocol, Split, junction_folds, recording_folds, split_for
+from .splits import Protocol, Split, folds_by_recording, junction_folds, split_for
 from .window_calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, FitMap
 
 Passes = list[dict[float, Predictions]]
@@ -114,7 +114,7 @@ def evaluate_pass(
 
 def _inner_splits(method: Method, protocol: Protocol) -> tuple[Split, ...]:
     split = split_for(protocol)
-    return (split, recording_folds) if method.two_levels and split is junction_folds else (split,)
+    return (split, folds_by_recording) if method.two_levels and split is junction_folds else (split,)
 
 
 def as_read(table: FeatureTable) -> FeatureTable:

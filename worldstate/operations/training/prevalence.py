@@ -1,20 +1,19 @@
 """Risk at a site without labels: shifted until hazards are as frequent there as they were in training."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
 
 SMALLEST_RISK = 1e-6
 
-Numbers = NDArray[np.float64]
 
-
-def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> Numbers:
+def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> FloatArray:
     r"""Return the risks, those of each junction shifted in log-odds, shape (n,).
 
     .. math:: r' = \sigma(\mathrm{logit}\, r + b), \qquad
@@ -59,7 +58,7 @@ def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> Numb
     return matched
 
 
-def _shift(log_odds: Numbers, mean: float) -> float:
+def _shift(log_odds: FloatArray, mean: float) -> float:
     def surplus(shift: float) -> float:
         return float(expit(log_odds + shift).mean()) - mean
 

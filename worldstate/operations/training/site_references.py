@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray
 
 
-def with_site_references(table: FeatureTable, chosen: NDArray[np.bool_] | None = None) -> FeatureTable:
+def with_site_references(table: FeatureTable, chosen: BoolArray | None = None) -> FeatureTable:
     """Append to each window the reference of its junction.
 
     No label is looked at, unless the caller chooses windows by their label: a commissioning drive is

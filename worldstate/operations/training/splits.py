@@ -4,17 +4,16 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import TextArray
 
 Protocol = Literal["cv", "lojo", "transfer"]
 PROTOCOLS: tuple[Protocol, ...] = ("cv", "lojo", "transfer")
 N_FOLDS = 5
 
-Folds = NDArray[np.str_]
-Split = Callable[[FeatureTable, np.random.Generator], Folds]
+Split = Callable[[FeatureTable, np.random.Generator], TextArray]
 
 
 def recording_labels(table: FeatureTable) -> dict[str, str]:
@@ -35,7 +34,7 @@ def recording_labels(table: FeatureTable) -> dict[str, str]:
     return labels
 
 
-def recording_folds(table: FeatureTable, rng: np.random.Generator, n_folds: int = N_FOLDS) -> Folds:
+def folds_by_recording(table: FeatureTable, rng: np.random.Generator, n_folds: int = N_FOLDS) -> TextArray:
     """Deal recordings to folds so that each holds its share of every label at every junction.
 
     Parameters
@@ -69,7 +68,7 @@ def recording_folds(table: FeatureTable, rng: np.random.Generator, n_folds: int 
     return np.array([fold_of[key] for key in table.recording_keys.tolist()])
 
 
-def junction_folds(table: FeatureTable, rng: np.random.Generator | None = None) -> Folds:
+def junction_folds(table: FeatureTable, rng: np.random.Generator | None = None) -> TextArray:
     """Return the junction of each window: leave one junction out; nothing is drawn.
 
     Raises
@@ -90,4 +89,4 @@ def split_for(protocol: Protocol) -> Split:
     >>> split_for("lojo") is junction_folds
     True
     """
-    return recording_folds if protocol == "cv" else junction_folds
+    return folds_by_recording if protocol == "cv" else junction_folds

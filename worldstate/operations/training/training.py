@@ -6,7 +6,6 @@ from importlib.metadata import version
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
@@ -16,12 +15,13 @@ from worldstate.abduction.signature.published_training import PublishedClassifie
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.model_file import Model, Provenance
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 
 from .feature_evaluation import MakeClassifier, out_of_fold
 from .methods import site_ensemble
 from .site_references import with_site_references
-from .splits import N_FOLDS, junction_folds, recording_folds
+from .splits import N_FOLDS, folds_by_recording, junction_folds
 from .window_calibration import (
     ABSENT_MISS_RATE,
     MISS_RATES,
@@ -35,8 +35,6 @@ ALPHAS = (0.01, 0.02, 0.05)
 CLASSIFIER = "standardise, linear SVC C=1, left/right mirroring, sigmoid per pair, pairwise coupling"
 ENSEMBLE = "softmax regressions, all classes mirrored: " + ", ".join(f"{r.view} {r.ridge:g}" for r in RECIPES)
 TrainingMethod = Literal["baseline", "worldstate"]
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +106,7 @@ def train_model(
     make: MakeClassifier = site_ensemble if compares else PublishedClassifier
     passes = []
     for _ in range(settings.repeats):
-        passes.append(out_of_fold(inputs, recording_folds(table, rng), make, rng))
+        passes.append(out_of_fold(inputs, folds_by_recording(table, rng), make, rng))
         on_step()
     levels = [passes]
     if compares and len(np.unique(table.environments)) > 1:
@@ -151,7 +149,7 @@ def fit_signature(inputs: FeatureTable, method: TrainingMethod, rng: np.random.G
 
 
 def _policies(
-    table: FeatureTable, signature: AnySignature, levels: list[list[Numbers]], settings: TrainingSettings
+    table: FeatureTable, signature: AnySignature, levels: list[list[FloatArray]], settings: TrainingSettings
 ) -> CueingPolicies:
     policies = []
     for miss_rate in sorted(MISS_RATES):
@@ -170,7 +168,7 @@ def _policies(
 
 
 def _calibrated(
-    table: FeatureTable, passes: list[Numbers], alpha: float, miss_rate: float, settings: TrainingSettings
+    table: FeatureTable, passes: list[FloatArray], alpha: float, miss_rate: float, settings: TrainingSettings
 ) -> WindowCalibration:
     hazards, hazard_free = (np.tile(flags, len(passes)) for flags in (table.hazards, table.hazard_free))
     fit_map = fit_platt if settings.method == "worldstate" else fit_isotonic
@@ -178,7 +176,7 @@ def _calibrated(
     return calibrate_windows(pooled, hazards, hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_map)
 
 
-def _figures(table: FeatureTable, signature: AnySignature, passes: list[Numbers]) -> dict[str, float]:
+def _figures(table: FeatureTable, signature: AnySignature, passes: list[FloatArray]) -> dict[str, float]:
     """Out-of-fold figures, mean over the repeats."""
     scored = table.hazards | table.hazard_free
     classes = np.array(signature.classes)

@@ -4,16 +4,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit, logit
 
 from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import RiskMap, fit_isotonic
 from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray
 
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 FitMap = Callable[[ArrayLike, ArrayLike], RiskMap]
 
 # The published statistic takes no account of vision; ours removes the visible explanation.
@@ -41,16 +40,16 @@ class WindowCalibration:
     gamma: float
     risk_map: RiskMap
 
-    def apply(self, probabilities: Numbers) -> tuple[Numbers, Numbers, Flags]:
+    def apply(self, probabilities: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return statistic, risk and decision of each window from posteriors, shape (n, 4)."""
         score = hazard_statistic(probabilities, self.miss_rate)
         return score, self.risk_map(score), score >= self.gamma
 
 
 def calibrate_windows(
-    probabilities: Numbers,
-    hazards: Flags,
-    hazard_free: Flags,
+    probabilities: FloatArray,
+    hazards: BoolArray,
+    hazard_free: BoolArray,
     *,
     alpha: float,
     miss_rate: float,

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.recording_folds import recording_folds
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
@@ -20,7 +20,6 @@ from .staged_recording import StagedRecording
 
 DRAWS = 1000
 
-Flags = NDArray[np.bool_]
 Interval = tuple[float, float]
 
 
@@ -161,28 +160,28 @@ class _Judged:
 
     recording: StagedRecording
     row: int
-    alarm: Flags
-    heard: Flags
+    alarm: BoolArray
+    heard: BoolArray
 
     @property
-    def seen(self) -> Flags:
+    def seen(self) -> BoolArray:
         return np.asarray(self.recording.seen[self.row])
 
     @property
-    def found(self) -> Flags:
+    def found(self) -> BoolArray:
         return np.asarray(self.recording.found[self.row])
 
     @property
-    def aware(self) -> Flags:
+    def aware(self) -> BoolArray:
         """Of a vehicle that is there: a detection of something else is no awareness of it."""
         return self.found | self.heard
 
     @property
-    def raised(self) -> Flags:
+    def raised(self) -> BoolArray:
         """Where nothing is there, any detection raises awareness."""
         return self.seen | self.heard
 
-    def in_sight(self, flags: Flags) -> Flags:
+    def in_sight(self, flags: BoolArray) -> BoolArray:
         """Return flags of the hops after T0 with the vehicle in view."""
         return np.asarray(flags[self.recording.after_sight])
 
@@ -207,7 +206,7 @@ class _Judge:
         return _Judged(one, row, alarm, np.asarray(one.presence[row] >= self._presence))
 
 
-def _row(state: str, judged: Sequence[_Judged], draws: Sequence[NDArray[np.intp]]) -> SweepRow:
+def _row(state: str, judged: Sequence[_Judged], draws: Sequence[IndexArray]) -> SweepRow:
     free = [one for one in judged if one.recording.hazard_free]
     approaches = [one for one in judged if not one.recording.hazard_free]
     aware = [one.in_sight(one.aware) for one in judged]
@@ -234,7 +233,7 @@ def _row(state: str, judged: Sequence[_Judged], draws: Sequence[NDArray[np.intp]
     )
 
 
-def _asked_miss_rates(one: _Judged) -> NDArray[np.float64]:
+def _asked_miss_rates(one: _Judged) -> FloatArray:
     recording = one.recording
     asked = recording.after_sight & (recording.answer[one.row] != UNQUERIED)
     return np.asarray(recording.miss_rate[one.row][asked])
@@ -244,11 +243,11 @@ def _onsets_s(one: _Judged) -> list[float]:
     return [float(time_s) for time_s in one.recording.time_s[rising_edges(one.alarm)]]
 
 
-def _mean(values: NDArray[np.float64] | Flags) -> float | None:
+def _mean(values: FloatArray | BoolArray) -> float | None:
     return float(np.mean(values)) if values.size else None
 
 
-def _draws(recordings: Sequence[StagedRecording], rng: np.random.Generator) -> list[NDArray[np.intp]]:
+def _draws(recordings: Sequence[StagedRecording], rng: np.random.Generator) -> list[IndexArray]:
     """Approaches in view, drawn with replacement."""
     shown = np.array([i for i, one in enumerate(recordings) if one.after_sight.any()], dtype=np.intp)
     return [rng.choice(shown, size=shown.size) for _ in range(DRAWS)]

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
@@ -11,9 +11,10 @@ from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.camera.detector import overlaps
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, moving_boxes
-from worldstate.adapters.listen import Source, line_of_sight, measure_steps
+from worldstate.adapters.listen import Source, measure_steps, unoccluded_sector
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.stream import AcousticFrame
+from worldstate.ground.typing import FloatArray
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings
 from worldstate.operations.recordings.hop_stream import hop_stream
@@ -22,7 +23,6 @@ from .degraded_detections import OFF, StagedLooks, Staging
 from .staged_recording import StagedRecording
 
 Heard = tuple[AcousticFrame, Measurement]
-Boxes = NDArray[np.float64]
 
 
 def hear_staged(
@@ -52,7 +52,7 @@ def hear_staged(
     """
     measured = list(measure_steps(source))
     there = [any(sighting.moving for sighting in m.sightings) for _, m in measured]
-    sight = line_of_sight(source.context)
+    sight = unoccluded_sector(source.context)
     queries = [seen.query(staging.camera, staging.settings, sight) for seen in looks.watched]
     rows = [list(_asked(source, measured, query)) for query in (*queries, None)]
     streams = [hop_stream(row, name=name, label=label, t0_s=source.t0_s, there=there) for row in rows]
@@ -69,7 +69,7 @@ def hear_staged(
     )
 
 
-def _reference(source: Source, staging: Staging, stamps_ns: Sequence[int]) -> list[Boxes]:
+def _reference(source: Source, staging: Staging, stamps_ns: Sequence[int]) -> list[FloatArray]:
     """Return the reference's moving boxes at each stamp, in pixels of the video, which may be smaller."""
     if source.detections is None:
         return [np.empty((0, 4))] * len(stamps_ns)
@@ -79,7 +79,7 @@ def _reference(source: Source, staging: Staging, stamps_ns: Sequence[int]) -> li
 
 
 def _found(
-    reference: Sequence[Boxes], log: DetectionLog, staging: Staging, stamps_ns: Sequence[int]
+    reference: Sequence[FloatArray], log: DetectionLog, staging: Staging, stamps_ns: Sequence[int]
 ) -> list[bool]:
     """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
     detected, least = moving_boxes(log, stamps_ns, staging.settings), AbsenceSettings().min_overlap

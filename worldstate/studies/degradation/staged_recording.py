@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.ground.checks import check_shape, finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_stream import HopStream
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,17 +50,17 @@ class StagedRecording:
     label: str
     t0_s: float
     states: tuple[str, ...]
-    time_s: Numbers
-    there: NDArray[np.bool_]
-    approach: Numbers
-    log_likelihoods: Numbers
-    answer: NDArray[np.int64]
-    miss_rate: Numbers
-    clutter_rate: Numbers
-    seen: NDArray[np.bool_]
-    degradation: Numbers
-    presence: Numbers
-    found: NDArray[np.bool_]
+    time_s: FloatArray
+    there: BoolArray
+    approach: FloatArray
+    log_likelihoods: FloatArray
+    answer: IntArray
+    miss_rate: FloatArray
+    clutter_rate: FloatArray
+    seen: BoolArray
+    degradation: FloatArray
+    presence: FloatArray
+    found: BoolArray
 
     def __post_init__(self) -> None:
         shape = len(self.states), np.size(self.time_s)
@@ -79,9 +77,9 @@ class StagedRecording:
         streams: Sequence[HopStream],
         states: Sequence[str],
         *,
-        degradation: Numbers,
-        presence: Numbers,
-        found: NDArray[np.bool_],
+        degradation: FloatArray,
+        presence: FloatArray,
+        found: BoolArray,
     ) -> "StagedRecording":
         """Return the streams of one recording, one a state, in one piece.
 
@@ -127,7 +125,7 @@ class StagedRecording:
         return self._stream(self.index(state))
 
     @property
-    def after_sight(self) -> NDArray[np.bool_]:
+    def after_sight(self) -> BoolArray:
         """Hops after T0 with the vehicle in view, shape (n,)."""
         stream = self._stream(0)
         return np.asarray(stream.there & ~stream.before_sight) & (not self.hazard_free)

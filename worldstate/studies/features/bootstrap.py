@@ -4,10 +4,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.calibration_error import brier_score, expected_calibration_error
 from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.training.feature_evaluation import Predictions
 from worldstate.operations.training.splits import recording_labels
@@ -16,8 +16,6 @@ DRAWS = 500
 COVERAGE = 0.95
 FIGURES = ("accuracy", "auroc_macro", "auroc_pooled", "worst_group_auroc", "tpr", "fpr", "ece", "brier")
 
-Numbers = NDArray[np.float64]
-Rows = NDArray[np.intp]
 Interval = tuple[float, float]
 
 
@@ -37,7 +35,7 @@ class FigureDraws:
     (1.0, 39.0)
     """
 
-    values: Mapping[str, Numbers]
+    values: Mapping[str, FloatArray]
 
     def interval(self, figure: str) -> Interval:
         """Return the middle 95 %."""
@@ -52,7 +50,7 @@ class FigureDraws:
         return {figure: _middle(self.values[figure] - other.values[figure]) for figure in self.values}
 
 
-def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = DRAWS) -> list[Rows]:
+def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = DRAWS) -> list[IndexArray]:
     """Draw recordings with replacement, as many of each label at each junction as there are.
 
     Parameters
@@ -71,13 +69,15 @@ def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = 
     """
     keys = table.recording_keys
     rows = {key: np.flatnonzero(keys == key) for key in np.unique(keys).tolist()}
-    strata: dict[tuple[str, str], list[Rows]] = {}
+    strata: dict[tuple[str, str], list[IndexArray]] = {}
     for key, label in recording_labels(table).items():
         strata.setdefault((key.split("/")[0], label), []).append(rows[key])
     return [np.concatenate(_resampled(strata.values(), rng)) for _ in range(draws)]
 
 
-def draw_figures(table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[Rows]) -> FigureDraws:
+def draw_figures(
+    table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
+) -> FigureDraws:
     """Return the figures on every sample, mean over the passes (seeds).
 
     The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
@@ -91,13 +91,13 @@ def draw_figures(table: FeatureTable, passes: Sequence[Predictions], samples: Se
 class _Outcome:
     """Labels and predictions side by side, as plain arrays of shape (n,)."""
 
-    hazards: NDArray[np.bool_]
-    hazard_free: NDArray[np.bool_]
-    sites: Rows
-    correct: NDArray[np.bool_]
-    score: Numbers
-    risk: Numbers
-    decision: NDArray[np.bool_]
+    hazards: BoolArray
+    hazard_free: BoolArray
+    sites: IndexArray
+    correct: BoolArray
+    score: FloatArray
+    risk: FloatArray
+    decision: BoolArray
 
     @classmethod
     def of(cls, table: FeatureTable, one: Predictions) -> "_Outcome":
@@ -105,7 +105,7 @@ class _Outcome:
         correct = one.classes == table.labels
         return cls(table.hazards, table.hazard_free, sites, correct, one.score, one.risk, one.decision)
 
-    def figures(self, rows: Rows) -> list[float]:
+    def figures(self, rows: IndexArray) -> list[float]:
         """Return one number for each of `FIGURES`."""
         hazards, hazard_free, decision = self.hazards[rows], self.hazard_free[rows], self.decision[rows]
         scored = rows[hazards | hazard_free]
@@ -124,12 +124,12 @@ class _Outcome:
         ]
 
 
-def _resampled(strata: Iterable[list[Rows]], rng: np.random.Generator) -> list[Rows]:
+def _resampled(strata: Iterable[list[IndexArray]], rng: np.random.Generator) -> list[IndexArray]:
     drawn = ((members, rng.integers(len(members), size=len(members))) for members in strata)
     return [members[i] for members, chosen in drawn for i in chosen]
 
 
-def _middle(values: Numbers) -> Interval:
+def _middle(values: FloatArray) -> Interval:
     tail = (1.0 - COVERAGE) / 2.0
     low, high = np.quantile(values, [tail, 1.0 - tail]).tolist()
     return low, high

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.calibration_error import (
     brier_score,
@@ -16,6 +15,7 @@ from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.recording_folds import recording_folds
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
@@ -25,8 +25,6 @@ from worldstate.operations.recordings.stream_statistic import (
     presence_statistic,
     stream_statistic,
 )
-
-Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,10 +117,10 @@ class _Scored:
     """One held-out recording with what the calibration folds made of it."""
 
     stream: HopStream
-    statistic: Numbers
-    risk: Numbers
-    alarm: NDArray[np.bool_]
-    aware: NDArray[np.bool_]
+    statistic: FloatArray
+    risk: FloatArray
+    alarm: BoolArray
+    aware: BoolArray
     weight: float
 
 
@@ -224,13 +222,13 @@ class _Learned:
         aware = stream.seen | (self._presence(stream) >= self.presence_gamma)
         return _Scored(stream, statistic, risk, alarm, aware, self.weight)
 
-    def _statistic(self, stream: HopStream, weight: float) -> Numbers:
+    def _statistic(self, stream: HopStream, weight: float) -> FloatArray:
         return stream_statistic(stream, self._prior, self._switches.statistic_with(weight))
 
-    def _presence(self, stream: HopStream) -> Numbers:
+    def _presence(self, stream: HopStream) -> FloatArray:
         return presence_statistic(stream, self._prior, self._switches.statistic_with(0.0))
 
-    def _hazards(self, approaches: Sequence[HopStream], weight: float) -> list[Numbers]:
+    def _hazards(self, approaches: Sequence[HopStream], weight: float) -> list[FloatArray]:
         return [self._statistic(stream, weight)[stream.before_sight] for stream in approaches]
 
     def _best_weight(self, free: Sequence[HopStream], approaches: Sequence[HopStream]) -> float:
@@ -244,7 +242,7 @@ class _Learned:
         return weights[int(np.argmax(areas))]
 
 
-def _windows(calm: Sequence[Numbers], hazards: Sequence[Numbers]) -> tuple[Numbers, NDArray[np.bool_]]:
+def _windows(calm: Sequence[FloatArray], hazards: Sequence[FloatArray]) -> tuple[FloatArray, BoolArray]:
     scores = np.concatenate([*calm, *hazards])
     return scores, np.arange(scores.size) >= sum(part.size for part in calm)
 
@@ -281,7 +279,7 @@ def _onsets_s(one: _Scored) -> list[float]:
     return [float(time_s) for time_s in one.stream.time_s[rising_edges(one.alarm)]]
 
 
-def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[NDArray[np.bool_]]) -> float | None:
+def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[BoolArray]) -> float | None:
     """Return the share of hops after T0, the vehicle in view, in which a flag holds."""
     streams = [one.stream for one in scored]
     after = [flag[s.there & ~s.before_sight] for s, flag in zip(streams, flags, strict=True)]

@@ -5,12 +5,11 @@ at a time.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-
-FloatArray = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray
 
 
 def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:

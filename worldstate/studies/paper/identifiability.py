@@ -18,8 +18,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_information
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-
-Numbers = NDArray[np.float64]
+from worldstate.ground.typing import FloatArray, IndexArray
 
 # A kNN estimate in more dimensions than this is far below the truth at a few hundred windows.
 _COMPONENTS = 3
@@ -144,10 +143,10 @@ class ReachOfArray:
         Bearing information relative to the best direction, the corollary's cos^2.
     """
 
-    azimuths_rad: Numbers
-    std_rad: Numbers
-    with_vision_rad: Numbers
-    endfire: Numbers
+    azimuths_rad: FloatArray
+    std_rad: FloatArray
+    with_vision_rad: FloatArray
+    endfire: FloatArray
 
 
 def reach_of_array(
@@ -215,7 +214,7 @@ def _vision_information(std_rad: float) -> float:
     return float(1.0 / in_range("vision_std_rad", std_rad, 0.0, math.inf, open_low=True) ** 2)
 
 
-def _deviation(information: Numbers) -> Numbers:
+def _deviation(information: FloatArray) -> FloatArray:
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.sqrt(information))
 
@@ -230,7 +229,7 @@ def _neighbours(features: ArrayLike, states: NDArray[np.int_]) -> float:
     return nearest_neighbour_information_bits(components / components.std(axis=0), states)
 
 
-def _spread(q: Numbers, states: NDArray[np.int_], units: NDArray[np.intp], rng: np.random.Generator) -> float:
+def _spread(q: FloatArray, states: NDArray[np.int_], units: IndexArray, rng: np.random.Generator) -> float:
     """Return the bootstrap standard deviation of the lower bound, whole recordings drawn."""
     order = np.argsort(units, kind="stable")
     rows = np.split(order, np.cumsum(np.bincount(units))[:-1])

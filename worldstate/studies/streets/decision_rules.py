@@ -4,19 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.recordings.advisories import detection, rising_edges
 
 from .recording_features import TwinRecording
-
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 FOLDS = 5
 SUSTAIN_CHOICES = (2, 3, 4, 5)
@@ -39,9 +35,9 @@ class RuleOutcome:
         Onsets in a hazard-free recording; 0 in the others.
     """
 
-    detected: Flags
-    lead_s: Numbers
-    false_onsets: Indices
+    detected: BoolArray
+    lead_s: FloatArray
+    false_onsets: IndexArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +66,7 @@ class TwinScore:
     sustained: RuleOutcome
     ours: dict[float, RuleOutcome]
     sustain_hops: tuple[int, ...]
-    risk: tuple[Numbers, ...]
+    risk: tuple[FloatArray, ...]
 
 
 def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -> TwinScore:
@@ -93,9 +89,9 @@ def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -
     """
     fold_of = deal(recordings, rng)
     n = len(recordings)
-    sustained: list[Flags] = [np.zeros(0, bool)] * n
+    sustained: list[BoolArray] = [np.zeros(0, bool)] * n
     ours = {alpha: list(sustained) for alpha in ALPHAS}
-    risk: list[Numbers] = [np.zeros(0)] * n
+    risk: list[FloatArray] = [np.zeros(0)] * n
     chosen = []
     for fold in range(int(fold_of.max()) + 1):
         calibration = [r for r, f in zip(recordings, fold_of, strict=True) if f != fold]
@@ -119,7 +115,7 @@ def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -
     )
 
 
-def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: int = FOLDS) -> Indices:
+def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: int = FOLDS) -> IndexArray:
     """Deal recordings to folds so that each holds its share of every approach at every site, shape (R,).
 
     Parameters
@@ -164,7 +160,7 @@ def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: i
     return fold_of
 
 
-def labelled_windows(recordings: Sequence[TwinRecording]) -> tuple[Numbers, Flags]:
+def labelled_windows(recordings: Sequence[TwinRecording]) -> tuple[FloatArray, BoolArray]:
     """Statistic and hazard label of all windows up to T0 and all hazard-free ones, shape (n,) each."""
     scores, labels = [], []
     for recording in recordings:
@@ -188,7 +184,7 @@ def _best_sustain(calibration: Sequence[TwinRecording]) -> int:
     return max(SUSTAIN_CHOICES, key=lambda hops: (gain[hops], -hops))
 
 
-def _outcome(recordings: Sequence[TwinRecording], alarms: Sequence[Flags]) -> RuleOutcome:
+def _outcome(recordings: Sequence[TwinRecording], alarms: Sequence[BoolArray]) -> RuleOutcome:
     leads, false = np.full(len(recordings), np.nan), np.zeros(len(recordings), np.intp)
     for i, (recording, alarm) in enumerate(zip(recordings, alarms, strict=True)):
         onsets = rising_edges(alarm)

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.calibration_error import reliability_curve
 from worldstate.adapters.files.atomic import atomic_path
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.bearing_gating import draw_gating
 
 from .decision_rules import ALPHA, TwinScore, labelled_windows
@@ -16,8 +16,6 @@ from .report import TARGETS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Numbers = NDArray[np.float64]
 
 
 def write_twin_figure(score: TwinScore, path: Path) -> None:
@@ -41,7 +39,7 @@ def write_twin_figure(score: TwinScore, path: Path) -> None:
         figure.savefig(temporary, dpi=150, format=path.suffix.lstrip(".") or "png")
 
 
-def roc_curve(positives: Numbers, negatives: Numbers) -> tuple[Numbers, Numbers]:
+def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return false- and true-positive rates at every threshold, from 0 to 1, shape (k,) each.
 
     Examples

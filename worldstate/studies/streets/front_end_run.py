@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
@@ -11,7 +11,7 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
-from worldstate.adapters.listen import line_of_sight
+from worldstate.adapters.listen import unoccluded_sector
 from worldstate.adapters.simulation import SimulatedRecording
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M
 from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
@@ -23,14 +23,12 @@ from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_stream import hop_stream
 from worldstate.state import Context
 
 from .recording_features import NONE_APPROACH, TwinRecording
-
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 # The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
 DOPPLER = DopplerSettings(min_lines=2)
@@ -45,7 +43,7 @@ class _Silent:
         return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 
-def hear(recording: SimulatedRecording, name: str = "") -> TwinRecording:
+def run_front_end(recording: SimulatedRecording, name: str = "") -> TwinRecording:
     """Listen to a recording of the 56-microphone roof array; `TwinRecording.judged` comes after.
 
     Parameters
@@ -61,7 +59,9 @@ def hear(recording: SimulatedRecording, name: str = "") -> TwinRecording:
         If it is shorter than a second.
     """
     array = roof_array_56()
-    vision = VisionQuery(PinholeCamera(), detection_log(recording), line_of_sight=line_of_sight(Context()))
+    vision = VisionQuery(
+        PinholeCamera(), detection_log(recording), line_of_sight=unoccluded_sector(Context())
+    )
     adapter = AcousticAdapter(array, recording.sample_rate_hz, _Silent(), vision=vision)
     frames = adapter.front_end.process(recording.audio)
     stream = hop_stream((adapter.interpret(frame) for frame in frames), name=name)
@@ -132,8 +132,8 @@ def _doppler(recording: SimulatedRecording, array: MicrophoneArray) -> str:
 
 
 def _music(
-    recording: SimulatedRecording, array: MicrophoneArray, frames: list[AcousticFrame], wanted: Flags
-) -> Numbers:
+    recording: SimulatedRecording, array: MicrophoneArray, frames: list[AcousticFrame], wanted: BoolArray
+) -> FloatArray:
     """MUSIC bearings of the very samples that the SRP bearings were read from, NaN where not wanted."""
     chosen, rate = FrontEndSettings(), recording.sample_rate_hz
     bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.cueing.calibration_error import expected_calibration_error
+from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.recordings.bearing_gating import BearingChecks, joined
@@ -14,8 +14,6 @@ from worldstate.operations.recordings.hop_stream import HOP_S
 from .decision_rules import ALPHA, ALPHA_LOOSE, RuleOutcome, TwinScore, labelled_windows
 from .recording_features import TwinRecording
 
-Numbers = NDArray[np.float64]
-Rows = NDArray[np.intp]
 Interval = tuple[float, float]
 
 DRAWS = 500
@@ -26,7 +24,7 @@ IMMINENT_S = 3.0
 LONGEST_TTA_S = 30.0
 
 
-def twin_figures(score: TwinScore, rows: Rows | None = None) -> dict[str, float]:
+def twin_figures(score: TwinScore, rows: IndexArray | None = None) -> dict[str, float]:
     """Return every figure on the chosen recordings; NaN where nothing is there to count.
 
     Parameters
@@ -65,7 +63,7 @@ def twin_figures(score: TwinScore, rows: Rows | None = None) -> dict[str, float]
     )
 
 
-def rule_figures(outcome: RuleOutcome, score: TwinScore, rows: Rows) -> dict[str, float]:
+def rule_figures(outcome: RuleOutcome, score: TwinScore, rows: IndexArray) -> dict[str, float]:
     """Return detection rate, mean lead over detected approaches and false alarms per hazard-free hour."""
     free = np.array([score.recordings[i].hazard_free for i in rows])
     hops = sum(len(score.recordings[i].time_s) for i in rows[free])
@@ -99,7 +97,7 @@ def _auroc(approaches: Sequence[TwinRecording], calm: Sequence[TwinRecording], h
     return _area(hazards, [r.published_statistic for r in calm])
 
 
-def _area(positives: Sequence[Numbers], negatives: Sequence[Numbers]) -> float:
+def _area(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> float:
     high, low = np.concatenate(positives), np.concatenate(negatives)
     area = auroc(np.concatenate([high, low]), np.arange(high.size + low.size) < high.size)
     return float("nan") if area is None else area
@@ -134,7 +132,7 @@ def twin_bearings(recordings: Sequence[TwinRecording]) -> BearingChecks:
     return joined(BearingChecks(r.prominence, r.srp_rad - r.reference_rad) for r in recordings)
 
 
-def _median_deg(parts: Sequence[Numbers]) -> float:
+def _median_deg(parts: Sequence[FloatArray]) -> float:
     error = np.abs(np.concatenate(parts))
     return float(np.degrees(np.median(error[np.isfinite(error)]))) if np.isfinite(error).any() else np.nan
 
@@ -165,11 +163,11 @@ def _looming(approaches: Sequence[TwinRecording], calm: Sequence[TwinRecording])
     }
 
 
-def _known(values: Numbers) -> Numbers:
+def _known(values: FloatArray) -> FloatArray:
     return values[np.isfinite(values)]
 
 
-def _calibration(recordings: Sequence[TwinRecording], risks: Sequence[Numbers]) -> dict[str, float]:
+def _calibration(recordings: Sequence[TwinRecording], risks: Sequence[FloatArray]) -> dict[str, float]:
     raw, labels = labelled_windows(recordings)
     used = [
         risk if recording.hazard_free else risk[recording.before_sight()]
@@ -179,7 +177,7 @@ def _calibration(recordings: Sequence[TwinRecording], risks: Sequence[Numbers]) 
     return {"ece_raw": expected_calibration_error(raw, labels), "ece_calibrated": calibrated}
 
 
-def _middle(values: Numbers) -> Interval:
+def _middle(values: FloatArray) -> Interval:
     known = _known(values)
     if not known.size:
         return float("nan"), float("nan")

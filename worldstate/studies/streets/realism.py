@@ -18,11 +18,11 @@ from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray, TextArray
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.training.splits import recording_folds
+from worldstate.operations.training.splits import folds_by_recording
 from worldstate.studies.features.bootstrap import recording_draws
 
-Numbers = NDArray[np.float64]
 Interval = tuple[float, float]
 
 DESCRIPTORS = ("level", "peak", "width_deg", "prominence", "change")
@@ -102,7 +102,7 @@ class Realism:
         return "\n".join(lines)
 
 
-def describe_windows(features: Numbers) -> dict[str, Numbers]:
+def describe_windows(features: FloatArray) -> dict[str, FloatArray]:
     """Return level and shape of windows, raw features (n, 60) -> (n,) for each of `DESCRIPTORS`.
 
     level is the mean, peak the largest value, prominence the ratio of each segment's peak to its median
@@ -178,7 +178,7 @@ def _medians(real: FeatureTable, simulated: FeatureTable) -> list[MedianRow]:
     return rows
 
 
-def _described(table: FeatureTable, labels: tuple[str, ...]) -> dict[str, Numbers]:
+def _described(table: FeatureTable, labels: tuple[str, ...]) -> dict[str, FloatArray]:
     return describe_windows(table.features[np.isin(table.labels, labels)])
 
 
@@ -204,7 +204,7 @@ def _transfer(
     )
 
 
-def _area(score: Numbers, table: FeatureTable, rows: NDArray[np.intp]) -> float:
+def _area(score: FloatArray, table: FeatureTable, rows: IndexArray) -> float:
     scored = rows[(table.hazards | table.hazard_free)[rows]]
     area = auroc(score[scored], table.hazards[scored])
     return float("nan") if area is None else area
@@ -212,7 +212,7 @@ def _area(score: Numbers, table: FeatureTable, rows: NDArray[np.intp]) -> float:
 
 def _c2st(real: FeatureTable, simulated: FeatureTable, rng: np.random.Generator) -> dict[str, float]:
     """Areas of a boosted classifier on descriptors and normalised shape, real against simulated."""
-    folds = [recording_folds(table, rng) for table in (real, simulated)]
+    folds = [folds_by_recording(table, rng) for table in (real, simulated)]
     inputs = np.concatenate([_c2st_input(table.features) for table in (real, simulated)])
     fold, origin = np.concatenate(folds), np.repeat([0, 1], [len(real), len(simulated)])
     seed = int(rng.integers(2**31))
@@ -226,13 +226,13 @@ def _c2st(real: FeatureTable, simulated: FeatureTable, rng: np.random.Generator)
     return {"all": auroc(score, origin) or 0.5} | _c2st_by_class(score, origin, labels)
 
 
-def _c2st_by_class(score: Numbers, origin: NDArray[np.int_], labels: NDArray[np.str_]) -> dict[str, float]:
+def _c2st_by_class(score: FloatArray, origin: NDArray[np.int_], labels: TextArray) -> dict[str, float]:
     areas = {name: np.isin(labels, group) for name, group in CLASS_GROUPS.items()}
     found = {name: auroc(score[rows], origin[rows]) for name, rows in areas.items()}
     return {name: area for name, area in found.items() if area is not None}
 
 
-def _c2st_input(features: Numbers) -> Numbers:
+def _c2st_input(features: FloatArray) -> FloatArray:
     described = describe_windows(features)
     return np.column_stack([described[name] for name in DESCRIPTORS] + [np.log(features)])
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
@@ -16,11 +15,9 @@ from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.datasets.feature_table import N_FEATURES
 from worldstate.adapters.files.npz_file import load_npz, save_npz
 from worldstate.ground.checks import check_shape
+from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_stream import HopStream
 from worldstate.operations.recordings.stream_statistic import stream_statistic
-
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MAX_BYTES = 16 << 20
 DIRECTION_COLUMNS = slice(0, 2)
@@ -78,18 +75,18 @@ class TwinRecording:
     t0_s: float
     pass_s: float
     doppler: str
-    time_s: Numbers
-    features: Numbers
-    answer: NDArray[np.int64]
-    miss_rate: Numbers
-    clutter_rate: Numbers
-    prominence: Numbers
-    log_slope_hz: Numbers
-    reference_rad: Numbers
-    srp_rad: Numbers
-    music_rad: Numbers
-    posteriors: Numbers
-    statistic: Numbers
+    time_s: FloatArray
+    features: FloatArray
+    answer: IntArray
+    miss_rate: FloatArray
+    clutter_rate: FloatArray
+    prominence: FloatArray
+    log_slope_hz: FloatArray
+    reference_rad: FloatArray
+    srp_rad: FloatArray
+    music_rad: FloatArray
+    posteriors: FloatArray
+    statistic: FloatArray
 
     def __post_init__(self) -> None:
         n = np.size(self.time_s)
@@ -103,12 +100,12 @@ class TwinRecording:
         return self.approach == NONE_APPROACH
 
     @property
-    def published_statistic(self) -> Numbers:
+    def published_statistic(self) -> FloatArray:
         """The paper's s(t) = P_left + P_right, shape (n,)."""
         return np.asarray(self.posteriors[:, DIRECTION_COLUMNS].sum(axis=1))
 
     @property
-    def argmax_hazard(self) -> Flags:
+    def argmax_hazard(self) -> BoolArray:
         """Where the likeliest class is left or right, shape (n,)."""
         return np.asarray(self.posteriors.argmax(axis=1) < DIRECTION_COLUMNS.stop)
 
@@ -130,7 +127,7 @@ class TwinRecording:
             statistic=stream_statistic(stream, signature.reference_prior),
         )
 
-    def before_sight(self, horizon_s: float = np.inf) -> Flags:
+    def before_sight(self, horizon_s: float = np.inf) -> BoolArray:
         """Windows that end within `horizon_s` before T0, T0 included, shape (n,); none without a vehicle."""
         left_s = self.t0_s - self.time_s
         return np.asarray((left_s >= -1e-6) & (left_s <= horizon_s + 1e-6))

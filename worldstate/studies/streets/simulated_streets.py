@@ -14,7 +14,7 @@ from worldstate.adapters.simulation.dataset.plan import Plan
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.ground.parallel import in_processes
 
-from .front_end_run import hear
+from .front_end_run import run_front_end
 from .recording_features import TwinRecording, load_twin, save_twin
 
 # What is heard of a recording depends on this code: a change of it is another number.
@@ -93,4 +93,4 @@ def listen_twin(plan: Plan, settings: TwinSettings) -> TwinRecording:
     recording = simulate_recording(replace(drawn, preset=settings.preset), rng)
     if settings.keep is not None:
         write_recording(settings.keep, recording, plan.number)
-    return hear(recording, name=f"{plan.number:04d}")
+    return run_front_end(recording, name=f"{plan.number:04d}")

@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 import scipy.signal
-from numpy.typing import NDArray
 
 from worldstate.adapters.datasets.feature_extraction import WINDOW_S
 from worldstate.adapters.datasets.feature_table import FeatureTable
@@ -40,8 +39,7 @@ from worldstate.frontend.spectra.phat import whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.parallel import in_processes
-
-Numbers = NDArray[np.float64]
+from worldstate.ground.typing import Float32Array, FloatArray
 
 DECIMATION = 4
 RATE_HZ = 47_998.0 / DECIMATION
@@ -113,7 +111,7 @@ def simulated_windows(
     )
 
 
-Row = tuple[Numbers, str, str, str]
+Row = tuple[FloatArray, str, str, str]
 
 
 def _plans(per_approach: int, seed: int, sites: Sequence[str]) -> list[WindowPlan]:
@@ -142,12 +140,12 @@ def _scene(plan: WindowPlan, levels: Preset, rng: np.random.Generator) -> Simula
     return replace(drawn, entry_s=ENTRY_S, ego=ego, sample_rate_hz=RATE_HZ, preset=levels)
 
 
-def _cut(audio: NDArray[np.float32], start_s: float) -> NDArray[np.float32]:
+def _cut(audio: Float32Array, start_s: float) -> Float32Array:
     first = round(start_s * RATE_HZ)
     return audio[first : first + round(WINDOW_S * RATE_HZ)]
 
 
-def window_feature(samples: NDArray[np.float32]) -> Numbers:
+def window_feature(samples: Float32Array) -> FloatArray:
     """Compute the published feature of a window at `RATE_HZ`, shape (n, 56) -> (60,)."""
     bins, array = band_bins(FEATURE_BAND_HZ, RATE_HZ, NFFT), roof_array_56()
     spectra = scipy.signal.stft(samples, nperseg=NFFT, axis=0)[2][bins.start : bins.stop]
