@@ -126,29 +126,14 @@ def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
 
     .. math:: \beta(\theta, d) = (1 - d)\, \min(0.04 + 0.004\, |\theta_{deg}|,\; 0.97) + 0.97\, d
 
-    Clean frames: .04 at boresight, .14 at 25 deg and on at that slope to the edge of the view; from there
-    linearly in d to .97 everywhere.
-
-    Parameters
-    ----------
-    half_view_deg : float
-        Half of the horizontal field of view, degrees, in (0, 180].
-
-    Returns
-    -------
-    MissRateTable
-        Over azimuth and degradation.
-
-    References
-    ----------
-    Section IX of the paper (what was measured). Derived here: straight lines between it, for want of more.
-
     Examples
     --------
     >>> table = default_miss_rates()
     >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.5)
     (0.04, 0.14, 0.97, 1.0)
     """
+    # Clean frames: .04 at boresight, .14 at 25 deg and on at that slope to the edge of the view; from there
+    # linearly in d to .97 everywhere.
     edge_deg = in_range("half_view_deg", half_view_deg, 0.0, 180.0, open_low=True)
     clean = min(BORESIGHT_MISS_RATE + MISS_RATE_PER_DEG * edge_deg, HARSHEST_MISS_RATE)
     return MissRateTable(

@@ -52,18 +52,9 @@ class Grounding:
 def observe(
     frame: AcousticFrame, bearing: Bearing | NotUsable, approach: Approach | NotUsable
 ) -> GroundedObservation:
-    """Return what a frame says beside its feature; spreads are those of the estimators' own bounds.
-
-    Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
-    harmonics: two firings a turn leave the first of them the strongest.
-
-    Parameters
-    ----------
-    frame : AcousticFrame
-        What was heard.
-    bearing, approach : Bearing, Approach or NotUsable
-        As the measurement has them; what is not usable is marginalised.
-    """
+    """Return what a frame says beside its feature; spreads are those of the estimators' own bounds."""
+    # Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
+    # harmonics: two firings a turn leave the first of them the strongest.
     tone, lines = frame.tone, {}
     if not isinstance(tone, NotUsable):
         lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)

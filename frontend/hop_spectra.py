@@ -29,22 +29,6 @@ Steered = tuple[Complex64Array, Steering]
 class HopSums:
     """Sums over the frames that end within one hop.
 
-    Parameters
-    ----------
-    n_frames : int
-        Number of these frames.
-    centre : float
-        Mean of their middles, samples from the start of the stream.
-    power : ndarray of float64, shape (E * A,)
-        Steered power: see `steered_power`. Where microphones are left out, power and
-        pairs are scaled to what all would give.
-    pairs : ndarray of complex128, shape (30,)
-        Pair sums: see `worldstate.frontend.direction.feature.pair_sum`.
-    energies : ndarray of float64, shape (M,)
-        Mean square in the looming band of every microphone.
-    health : ArrayHealth
-        What is wrong with the array, and which microphones counted.
-
     Examples
     --------
     >>> health = ArrayHealth.unknown(n_channels=2)
@@ -53,25 +37,18 @@ class HopSums:
     19
     """
 
-    n_frames: int
-    centre: float
+    n_frames: int  # Number of these frames
+    centre: float  # Mean of their middles, samples from the start of the stream
+    # shape (E * A,): Steered power: see `steered_power`. Where microphones are left out, power and pairs
+    # are scaled to what all would give.
     power: FloatArray
-    pairs: Complex128Array
-    energies: FloatArray
-    health: ArrayHealth
+    pairs: Complex128Array  # shape (30,): Pair sums: see `worldstate.frontend.direction.feature.pair_sum`
+    energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
+    health: ArrayHealth  # What is wrong with the array, and which microphones counted
 
 
 class HopSpectra:
     """Transform, whiten and steer, hop by hop; only the transform remembers the past.
-
-    Parameters
-    ----------
-    array : MicrophoneArray
-        In the order of the channels.
-    sample_rate_hz : float
-        Samples per second.
-    settings : FrontEndSettings
-        Bands, grid and frame length.
 
     Examples
     --------
@@ -106,15 +83,7 @@ class HopSpectra:
     def push(self, samples: Float32Array) -> HopSums:
         """Sum over the frames that these samples (n, M) complete; at least one frame.
 
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-            One hop.
-
-        Returns
-        -------
-        HopSums
-            Sums that running means are made of.
+        Shapes: samples (n, M).
         """
         spectra = self._stft.push(samples)
         powers = power(spectra)

@@ -18,15 +18,6 @@ _HIGHEST = 0.45
 class LevelMeter:
     """Log-energy per band and hop: microphones hear the same sound, so that a few say what all would.
 
-    Parameters
-    ----------
-    n_channels : int
-        Channels of the stream.
-    sample_rate_hz : float
-        Samples per second.
-    settings : FrontEndSettings
-        Band, number of bands and of microphones.
-
     Examples
     --------
     >>> meter = LevelMeter(n_channels=2, sample_rate_hz=16_000, settings=FrontEndSettings())
@@ -49,24 +40,9 @@ class LevelMeter:
 
         .. math:: L_b = \ln \sum_{k \in b} \overline{x^2}[k]
 
-        Of the picked microphones those count that are to be kept (M,), all if none of them is.
-
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-            One hop.
-        keep : ndarray of bool, shape (M,), or None
-            Microphones that count; all where None.
-
-        Returns
-        -------
-        ndarray of float64, shape (bands,)
-            ln mean square per band.
-
-        References
-        ----------
-        P. D. Welch 1967: see `worldstate.frontend.spectra.bands.mean_square_per_bin`.
+        Shapes: samples (n, M), keep (M,).
         """
+        # Of the picked microphones those count that are to be kept (M,), all if none of them is.
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         kept = None if keep is None else keep[self._channels]
         if kept is not None and kept.any() and not kept.all():

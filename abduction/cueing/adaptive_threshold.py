@@ -134,15 +134,6 @@ class AdaptiveBudget:
 class AdaptiveThreshold:
     """What the adaptive threshold has learned so far.
 
-    Parameters
-    ----------
-    shift_nats : float
-        x_t.
-    pending_s : float or None
-        Age of an alarm of which it is not known yet whether anything comes; None where there is none.
-    alarm : bool
-        Whether the rule was in alarm at the last hop.
-
     Examples
     --------
     Ten minutes of empty street without an alarm make it bolder, a false alarm more careful:
@@ -155,9 +146,10 @@ class AdaptiveThreshold:
     0.25
     """
 
-    shift_nats: float = 0.0
+    shift_nats: float = 0.0  # x_t
+    # Age of an alarm of which it is not known yet whether anything comes; None where there is none.
     pending_s: float | None = None
-    alarm: bool = False
+    alarm: bool = False  # Whether the rule was in alarm at the last hop
 
     def advance(
         self, budget: AdaptiveBudget, *, visible: float, none: float, alarm: bool, elapsed_s: float
@@ -168,17 +160,6 @@ class AdaptiveThreshold:
 
         with N one where an alarm has turned out false in this hop, and the time counted while the street is
         empty.
-
-        Parameters
-        ----------
-        budget : AdaptiveBudget
-            What is to be kept.
-        visible, none : float
-            Filtered probabilities of the two explanations that end an alarm.
-        alarm : bool
-            Whether the sustained rule is in alarm now.
-        elapsed_s : float
-            Time since the last hop.
 
         References
         ----------
@@ -206,18 +187,7 @@ class AdaptiveThreshold:
 
     @classmethod
     def from_dict(cls, data: object) -> "AdaptiveThreshold":
-        """Return the state that `to_dict` wrote.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
+        """Return the state that `to_dict` wrote."""
         values = _mapping(data, "threshold")
         pending, alarm = values.get("pending_s"), values.get("alarm")
         if not isinstance(alarm, bool):

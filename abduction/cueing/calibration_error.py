@@ -118,24 +118,7 @@ def calibration_error_floor(
 
     .. math:: E[ECE(r, y)], \qquad P(y_i = 1) = r_i
 
-    Parameters
-    ----------
-    risk : array_like, shape (n,)
-        Predicted probabilities in [0, 1].
-    rng : numpy.random.Generator
-        Draws the labels.
-    bins, draws : int
-        Bins of the ECE; how many sets of labels.
-
-    Returns
-    -------
-    float
-        In [0, 1].
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `reliability_curve`.
+    Shapes: risk (n,).
 
     References
     ----------
@@ -157,21 +140,7 @@ def calibration_error_sampling(
 
     .. math:: ECE = \frac1n \sum_b \Big| \sum_{i \in b} (y_i - r_i) \Big|, \qquad P(y_i = 1) = r_i
 
-    Errors are those of `calibration_error_floor`, which is the mean.
-
-    Parameters
-    ----------
-    risk : array_like, shape (n,)
-        In [0, 1].
-    rng : numpy.random.Generator
-        Draws labels.
-    bins, draws : int
-        Bins of equal width, and how often labels are drawn.
-
-    Returns
-    -------
-    mean, std : float
-        Of the ECE.
+    Shapes: risk (n,).
 
     References
     ----------
@@ -184,6 +153,7 @@ def calibration_error_sampling(
     >>> round(mean, 2), round(deviation, 3)
     (0.02, 0.016)
     """
+    # Errors are those of `calibration_error_floor`, which is the mean.
     predicted, _ = _checked_sample(risk, np.zeros(np.shape(risk)))
     index = _bin_index(predicted, bins)
     labels = rng.random((draws, predicted.size)) < predicted

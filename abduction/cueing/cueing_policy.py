@@ -23,13 +23,6 @@ from .risk_map import RiskMap, risk_map_from_dict
 class SustainedRule:
     """State of the rule "in alarm while the statistic has held for k consecutive hops".
 
-    Parameters
-    ----------
-    sustain_hops : int
-        k >= 1; 1 alarms at any single window, as the published rule does with the argmax.
-    run : int
-        Consecutive hops held so far, counted up to k.
-
     Examples
     --------
     >>> rule = SustainedRule(sustain_hops=2)
@@ -37,8 +30,8 @@ class SustainedRule:
     (False, True)
     """
 
-    sustain_hops: int
-    run: int = 0
+    sustain_hops: int  # k >= 1; 1 alarms at any single window, as the published rule does with the argmax
+    run: int = 0  # Consecutive hops held so far, counted up to k
 
     def __post_init__(self) -> None:
         _check_sustain_hops(self.sustain_hops)
@@ -49,19 +42,8 @@ class SustainedRule:
         return self.run >= self.sustain_hops
 
     def advance(self, held: bool) -> "SustainedRule":
-        """Return the state after one more hop.
-
-        ``run' = min(run + 1, k)`` if the hop held, else ``run' = 0``.
-
-        Parameters
-        ----------
-        held : bool
-            Whether the statistic is at or above the threshold.
-
-        References
-        ----------
-        Section VII of the paper.
-        """
+        """Return the state after one more hop."""
+        # ``run' = min(run + 1, k)`` if the hop held, else ``run' = 0``.
         return replace(self, run=min(self.run + 1, self.sustain_hops) if held else 0)
 
 
@@ -252,29 +234,14 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
 
     .. math:: h_t = \min(s_{t-k+1}, \dots, s_t)
 
-    The sustained rule is in alarm exactly where this is at or above the threshold.
-
-    Parameters
-    ----------
-    statistic : array_like, shape (windows,)
-        One recording, in the order of time.
-    sustain_hops : int
-        k >= 1.
-
-    Returns
-    -------
-    ndarray, shape (windows,)
-        Of the statistic's own scale.
-
-    References
-    ----------
-    Section VII of the paper. Derived here: k values are all above gamma where their least is.
+    Shapes: statistic (windows,).
 
     Examples
     --------
     >>> sustained_statistic([0.2, 0.9, 0.8, 0.1], sustain_hops=2)
     array([-inf,  0.2,  0.8,  0.1])
     """
+    # The sustained rule is in alarm exactly where this is at or above the threshold.
     values = finite_array("statistic", statistic, (None,))
     hops = _check_sustain_hops(sustain_hops)
     held = np.full(values.shape, -np.inf)
@@ -286,29 +253,14 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
 def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
     """Return where the last k hops all held, shape (windows,): `SustainedRule` over a whole recording.
 
-    ``alarm_t = held_(t-k+1) and .. and held_t``
-
-    Parameters
-    ----------
-    held : array_like of bool, shape (windows,)
-        Where the statistic is at or above the threshold.
-    sustain_hops : int
-        k >= 1.
-
-    Returns
-    -------
-    ndarray of bool, shape (windows,)
-        False in the first k - 1 windows.
-
-    References
-    ----------
-    Section VII of the paper.
+    Shapes: held (windows,).
 
     Examples
     --------
     >>> sustained_alarm([True, True, False, True], sustain_hops=2)
     array([False,  True, False, False])
     """
+    # ``alarm_t = held_(t-k+1) and .. and held_t``
     return sustained_statistic(np.asarray(held, dtype=bool), sustain_hops) >= 0.5
 
 
@@ -317,17 +269,7 @@ def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1
 
     .. math:: \hat c = \arg\max_c P_c, \qquad \hat c \in \{left, right\}
 
-    Parameters
-    ----------
-    probabilities : array_like, shape (windows, classes)
-        Columns front, left, none, right.
-    hazard_columns : tuple of int
-        Which of them are hazards.
-
-    Returns
-    -------
-    ndarray of bool, shape (windows,)
-        Ties go to the first class.
+    Shapes: probabilities (windows, classes).
 
     References
     ----------

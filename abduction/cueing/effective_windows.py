@@ -15,23 +15,7 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
 
     .. math:: \tau = 1 + 2 \sum_{j \ge 1} \rho_j,
 
-    summed while the sums of neighbouring pairs are positive (Geyer's initial positive sequence). N windows
-    tell as much of the mean as N / tau independent ones.
-
-    Parameters
-    ----------
-    streams : sequence of array_like, each of shape (windows,)
-        Recordings in the order of time; lags never reach from one into the next.
-
-    Returns
-    -------
-    float
-        Hops.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are no windows or one is not finite.
+    Shapes: streams (windows,).
 
     References
     ----------
@@ -43,6 +27,8 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
     >>> round(correlation_time_hops(white), 1), round(correlation_time_hops(np.repeat(white, 10, axis=1)))
     (1.0, 10)
     """
+    # summed while the sums of neighbouring pairs are positive (Geyer's initial positive sequence). N windows
+    # tell as much of the mean as N / tau independent ones.
     values = [finite_array("streams", stream, (None,)) for stream in streams]
     if not sum(value.size for value in values):
         raise InvalidArgumentError("streams: expected at least one window")

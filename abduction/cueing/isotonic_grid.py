@@ -17,23 +17,7 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
     .. math:: \min_g \sum_{ij} w_{ij} (g_{ij} - v_{ij})^2 \quad \text{subject to} \quad
               g_{ij} \le g_{i+1,j},\ g_{ij} \le g_{i,j+1},
 
-    by Dykstra's projections onto the two sets in turn, each a pooling of adjacent violators.
-
-    Parameters
-    ----------
-    values : array_like, shape (rows, columns)
-        For example miss rates over azimuth and degradation.
-    weights : array_like, shape (rows, columns)
-        Positive, for example counts.
-
-    Returns
-    -------
-    ndarray, shape (rows, columns)
-
-    Raises
-    ------
-    InvalidArgumentError
-        If shapes differ, a number is not finite or a weight not positive.
+    Shapes: values (rows, columns), weights (rows, columns).
 
     References
     ----------
@@ -45,6 +29,7 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
     array([[0.1, 0.4],
            [0.3, 0.4]])
     """
+    # by Dykstra's projections onto the two sets in turn, each a pooling of adjacent violators.
     grid = finite_array("values", values, (None, None)).copy()
     weight = finite_array("weights", weights, grid.shape)
     if not grid.size or (weight <= 0).any():

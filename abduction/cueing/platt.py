@@ -23,22 +23,6 @@ def sigmoid(value: FloatArray, slope: ArrayLike, offset: ArrayLike) -> FloatArra
 
     .. math:: p(f) = 1 / (1 + \exp(A f + B))
 
-    Parameters
-    ----------
-    value : ndarray
-        Any shape.
-    slope, offset : array_like, broadcast
-        Broadcast against it.
-
-    Returns
-    -------
-    ndarray
-        In (0, 1).
-
-    References
-    ----------
-    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.cueing.platt`.
-
     Examples
     --------
     >>> sigmoid(np.array([0.0, 1e6]), -1.0, 0.0)
@@ -54,26 +38,7 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
     .. math:: \hat A, \hat B = \arg\min_{A, B} -\sum_i \big[ t_i \ln p(f_i) + (1 - t_i) \ln(1 - p(f_i)) \big],
               \qquad t_+ = \frac{n_+ + 1}{n_+ + 2}, \quad t_- = \frac{1}{n_- + 2}
 
-    Parameters
-    ----------
-    values : array_like, shape (n,)
-        Decision values of samples that the machine was not trained on.
-    positive : array_like of bool, shape (n,)
-        Labels.
-
-    Returns
-    -------
-    slope, offset : float
-        A and B.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are no samples or they do not fit.
-
-    References
-    ----------
-    H.-T. Lin, C.-J. Lin and R. C. Weng 2007: see `worldstate.abduction.cueing.platt`.
+    Shapes: values (n,), positive (n,).
 
     Examples
     --------

@@ -34,26 +34,14 @@ class RiskMap(Protocol):
 class IsotonicMap:
     """Linear between knots, constant beyond them.
 
-    Parameters
-    ----------
-    statistics : tuple of float
-        Knots, not falling.
-    risks : tuple of float
-        Risk at each knot, in [0, 1], not falling.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a sequence falls, they differ in length or a risk leaves [0, 1].
-
     Examples
     --------
     >>> IsotonicMap((0.2, 0.6), (0.0, 1.0))(0.3).__round__(3)
     0.25
     """
 
-    statistics: tuple[float, ...]
-    risks: tuple[float, ...]
+    statistics: tuple[float, ...]  # Knots, not falling
+    risks: tuple[float, ...]  # Risk at each knot, in [0, 1], not falling
 
     def __post_init__(self) -> None:
         knots = finite_array("statistics", self.statistics, (None,))
@@ -83,26 +71,14 @@ class PlattMap:
 
     .. math:: r = 1 / (1 + \exp(a\, \mathrm{logit}(s) + b)), \qquad a \le 0.
 
-    Parameters
-    ----------
-    slope : float
-        a, not positive.
-    offset : float
-        b.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the slope is positive, which would fall with the statistic.
-
     Examples
     --------
     >>> PlattMap(-1.0, 0.0)(0.3).__round__(3)
     0.3
     """
 
-    slope: float
-    offset: float
+    slope: float  # a, not positive
+    offset: float  # b
 
     def __post_init__(self) -> None:
         finite_array("slope, offset", (self.slope, self.offset), (2,))
@@ -128,22 +104,7 @@ def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
 
     .. math:: \hat g = \arg\min_g \sum_i (g(s_i) - y_i)^2, \qquad g \text{ never falling}
 
-    Parameters
-    ----------
-    statistics : array_like, shape (n,)
-        Scores that the classifier gave to recordings it was not trained on.
-    hazards : array_like of bool, shape (n,)
-        Whether a hidden hazard was there.
-
-    Returns
-    -------
-    IsotonicMap
-        Never falling.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If both labels are not there.
+    Shapes: statistics (n,), hazards (n,).
 
     References
     ----------
@@ -167,17 +128,7 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
 
     .. math:: r = 1 / (1 + \exp(a\, \mathrm{logit}(s) + b)), \qquad a \le 0
 
-    Errors are those of `fit_isotonic`.
-
-    Parameters
-    ----------
-    statistics, hazards : array_like, shape (n,)
-        Scores in [0, 1], and 0 or 1.
-
-    Returns
-    -------
-    PlattMap
-        Never falling.
+    Shapes: statistics, hazards (n,).
 
     References
     ----------
@@ -188,6 +139,7 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
     >>> round(fit_platt([0.1, 0.2, 0.3, 0.9], [False, True, False, True])(0.9), 2)
     0.74
     """
+    # Errors are those of `fit_isotonic`.
     scores, labels = _checked_sample(statistics, hazards)
     slope, offset = fit_sigmoid(_logit(scores), labels)
     if slope > 0:
@@ -238,21 +190,6 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
 
 def risk_map_from_dict(data: object) -> RiskMap:
     """Return the map that `to_dict` wrote.
-
-    Parameters
-    ----------
-    data : object
-        Decoded JSON.
-
-    Returns
-    -------
-    RiskMap
-        A `PlattMap` or an `IsotonicMap`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On an unknown kind or numbers out of range.
 
     Examples
     --------

@@ -33,33 +33,18 @@ REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 / 3.6, 20.0 / 3.6
 class Coupling:
     """An observable that depends on the radial speed.
 
-    Parameters
-    ----------
-    observable : str
-        Its name, unit included.
-    speed_m_s : tuple of float
-        Knots, rising; speed towards the listener is positive.
-    curves : tuple of tuple of float
-        Values at the knots, linear between and constant beyond; several where one of them holds but not
-        known which, such as the gear, all equally likely.
-    std : float
-        How far a source of this class scatters about its curve, in the observable's unit, > 0.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If knots do not rise, a curve is of another length or a number is out of range.
-
     Examples
     --------
     >>> Coupling("spacing_hz", (0.0, 10.0), ((0.0, 100.0),), 5.0).expected([5.0])
     array([[50.]])
     """
 
-    observable: str
-    speed_m_s: tuple[float, ...]
+    observable: str  # Its name, unit included
+    speed_m_s: tuple[float, ...]  # Knots, rising; speed towards the listener is positive
+    # Values at the knots, linear between and constant beyond; several where one of them holds but not known
+    # which, such as the gear, all equally likely.
     curves: tuple[tuple[float, ...], ...]
-    std: float
+    std: float  # How far a source of this class scatters about its curve, in the observable's unit, > 0
 
     def __post_init__(self) -> None:
         knots = finite_array("speed_m_s", self.speed_m_s, (None,))
@@ -75,14 +60,7 @@ class Coupling:
         .. math:: f_g(v) = f_{g,i} + (f_{g,i+1} - f_{g,i})\, \frac{v - v_i}{v_{i+1} - v_i}, \qquad
                   v_i \le v \le v_{i+1}
 
-        Parameters
-        ----------
-        radial_speed_m_s : array_like, shape (n,)
-            v_r, m/s, positive while receding.
-
-        References
-        ----------
-        From the definition.
+        Shapes: radial_speed_m_s (n,).
         """
         speed = np.asarray(radial_speed_m_s, dtype=np.float64)
         return np.stack([np.interp(speed, self.speed_m_s, curve) for curve in self.curves])
@@ -92,16 +70,7 @@ class Coupling:
 
         .. math:: p = \frac{1}{G} \sum_g N\big(value;\ f_g(v_r),\ \sigma_c^2 + \sigma_{value}^2\big)
 
-        Parameters
-        ----------
-        value, value_std : float
-            Measured value and its standard deviation, in the unit of the curve.
-        radial_speed_m_s : array_like, shape (n,)
-            v_r, m/s.
-
-        References
-        ----------
-        Eq. (lik) of the paper, one factor of its first; the gears mixed alike.
+        Shapes: radial_speed_m_s (n,).
         """
         expected = self.expected(radial_speed_m_s)
         variance = self.std**2 + value_std**2
@@ -177,20 +146,6 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
 
     with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
 
-    Parameters
-    ----------
-    std_hz : float
-        Scatter about the curves, Hz.
-
-    Returns
-    -------
-    Coupling
-        Hz over m/s.
-
-    References
-    ----------
-    From the definition: wheels and gears that do not slip. Numbers of ordinary cars.
-
     Examples
     --------
     >>> engine_line().expected([10.0]).round(0).ravel()
@@ -211,21 +166,6 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
 
-    Parameters
-    ----------
-    std_db : float
-        Scatter about the curve, dB.
-
-    Returns
-    -------
-    Coupling
-        dB over m/s.
-
-    References
-    ----------
-    European Commission, Directive 2015/996 (CNOSSOS-EU), annex, category 1: see
-    `worldstate.abduction.grounding.class_descriptors`.
-
     Examples
     --------
     >>> tyre_noise_shape().expected([5.0, 10.0, 20.0]).round(0)
@@ -242,16 +182,6 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
     """Ratio of the frequencies heard before and after a pass-by.
 
     .. math:: f_{before} / f_{after} = (c + v) / (c - v)
-
-    Parameters
-    ----------
-    std : float
-        Scatter about the curve, a ratio.
-
-    Returns
-    -------
-    Coupling
-        A ratio over m/s.
 
     References
     ----------

@@ -34,33 +34,19 @@ _RANGES_M = np.geomspace(5.0, 60.0, 24)
 class Background:
     """Where an observable lies when it belongs to no source: the density that others are relative to.
 
-    Parameters
-    ----------
-    mean, std : float
-        Of a broad normal law, in the observable's unit.
-
     Examples
     --------
     >>> round(Background(60.0, 40.0).log_density(60.0), 2)
     -4.61
     """
 
-    mean: float
+    mean: float  # Of a broad normal law, in the observable's unit
     std: float
 
     def log_density(self, value: float) -> float:
         r"""Return the log density at a value, nats.
 
         .. math:: \log p = -\tfrac12 (x - \mu)^2 / \sigma^2 - \log(\sigma \sqrt{2 \pi})
-
-        Parameters
-        ----------
-        value : float
-            In the unit of the background.
-
-        References
-        ----------
-        From the definition of the normal law.
         """
         return float(-0.5 * ((value - self.mean) / self.std) ** 2 - np.log(self.std * np.sqrt(2 * pi)))
 
@@ -78,18 +64,13 @@ BACKGROUNDS = {
 class AzimuthPrior:
     """Where a source may stand under one explanation: a normal law about an azimuth, cut off at +-90 degrees.
 
-    Parameters
-    ----------
-    azimuth_rad, std_rad : float
-        Centre, left positive, and standard deviation; infinite for any azimuth alike.
-
     Examples
     --------
     >>> AzimuthPrior(0.0, np.inf).log_prior(np.zeros(2)).round(2)
     array([-0.69, -0.69])
     """
 
-    azimuth_rad: float
+    azimuth_rad: float  # Centre, left positive, and standard deviation; infinite for any azimuth alike
     std_rad: float
 
     def log_prior(self, azimuths_rad: FloatArray) -> FloatArray:
@@ -98,14 +79,7 @@ class AzimuthPrior:
         .. math:: P(\theta_i) \propto \exp\big(-\tfrac12 (\theta_i - \theta_0)^2 / \sigma^2\big), \qquad
                   \sum_i P(\theta_i) = 1
 
-        Parameters
-        ----------
-        azimuths_rad : ndarray, shape (n,)
-            Grid, radians.
-
-        References
-        ----------
-        From the definition: a normal law on a grid.
+        Shapes: azimuths_rad (n,).
         """
         log_weight = -0.5 * ((azimuths_rad - self.azimuth_rad) / self.std_rad) ** 2
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))
@@ -143,31 +117,18 @@ class GroundedSettings:
 class HiddenState:
     """The state z that explains an observation best, were a hidden source its cause.
 
-    Parameters
-    ----------
-    direction : str
-        Of `SignatureEvidence.directions`.
-    entity_class : str
-        Name of the descriptor.
-    labels : tuple of str
-        What a camera would report of it.
-    azimuth_rad, radial_speed_m_s : float
-        Most probable values, on the grid of the quadrature.
-    log_posterior : float
-        Of the whole of it, among hidden states, nats.
-
     Examples
     --------
     >>> HiddenState("left", "motor_vehicle", ("car",), 0.5, 8.0, -3.0).labels
     ('car',)
     """
 
-    direction: str
-    entity_class: str
-    labels: tuple[str, ...]
-    azimuth_rad: float
+    direction: str  # Of `SignatureEvidence.directions`
+    entity_class: str  # Name of the descriptor
+    labels: tuple[str, ...]  # What a camera would report of it
+    azimuth_rad: float  # Most probable values, on the grid of the quadrature
     radial_speed_m_s: float
-    log_posterior: float
+    log_posterior: float  # Of the whole of it, among hidden states, nats
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,26 +11,14 @@ from worldstate.ground.values import NotUsable
 class Observable:
     """A number with its standard deviation, which comes from a bound or from the estimator itself.
 
-    Parameters
-    ----------
-    value : float
-        In the unit that the name says.
-    std : float
-        Of the estimate, >= 0.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is not finite or the deviation is negative.
-
     Examples
     --------
     >>> Observable(85.0, 1.5).std
     1.5
     """
 
-    value: float
-    std: float
+    value: float  # In the unit that the name says
+    std: float  # Of the estimate, >= 0
 
     def __post_init__(self) -> None:
         finite_array("value", self.value, ())

@@ -101,29 +101,7 @@ def common_cause_information(
     `claimed_covariance`). Where it moves them against each other, one channel tells the disturbance in the
     other and J is above the sum.
 
-    Parameters
-    ----------
-    slopes : sequence of array_like, each of shape (n_m, p)
-        H_m.
-    covariances : sequence of array_like, each of shape (n_m, n_m)
-        R_m, noise of the modality's own.
-    effects : sequence of array_like, each of shape (n_m,)
-        g_m.
-
-    Returns
-    -------
-    ndarray, shape (p, p)
-        J.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If lengths or shapes do not fit.
-
-    References
-    ----------
-    Derived here: a common disturbance is noise of rank one across modalities; it fails assumption (A1) of
-    section VI of the paper.
+    Shapes: slopes (n_m, p), covariances (n_m, n_m), effects (n_m,).
 
     Examples
     --------
@@ -148,22 +126,7 @@ def claimed_covariance(
 
     with :math:`S_m = R_m + g_m g_m^T` and :math:`J_s = \sum_m H_m^T S_m^{-1} H_m`.
 
-    Errors are those of `common_cause_information`; also if the sum is singular.
-
-    Parameters
-    ----------
-    slopes, covariances, effects : sequence of array_like
-        As for `common_cause_information`.
-
-    Returns
-    -------
-    claimed, true : ndarray, shape (p, p)
-        Covariances of the estimate.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `common_cause_information`, and if the state cannot be told even if (A1) held.
+    Shapes: returns (p, p).
 
     References
     ----------
@@ -176,6 +139,7 @@ def claimed_covariance(
     >>> claimed.round(3), true.round(3)
     (array([[1.]]), array([[1.5]]))
     """
+    # Errors are those of `common_cause_information`; also if the sum is singular.
     H, R = _stacked(slopes, covariances, effects)
     blocks = np.zeros_like(R)
     start = 0
@@ -196,19 +160,7 @@ def at_least(larger: ArrayLike, smaller: ArrayLike) -> bool:
 
     .. math:: \lambda_{min}(J_1 - J_2) \ge 0
 
-    Parameters
-    ----------
-    larger, smaller : array_like, shape (p, p)
-        Symmetric.
-
-    Returns
-    -------
-    bool
-        Whether the difference has no negative eigenvalue beyond rounding.
-
-    References
-    ----------
-    From the definition of the Loewner order.
+    Shapes: larger, smaller (p, p).
 
     Examples
     --------

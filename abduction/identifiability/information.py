@@ -40,20 +40,7 @@ class Information(NamedTuple):
 def entropy_bits(probabilities: ArrayLike) -> float:
     r"""Return :math:`H = -\sum_k p_k \log_2 p_k`.
 
-    Parameters
-    ----------
-    probabilities : array_like, shape (K,)
-        Sum to one.
-
-    Returns
-    -------
-    float
-        Bits.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is no distribution.
+    Shapes: probabilities (K,).
 
     References
     ----------
@@ -72,20 +59,7 @@ def entropy_bits(probabilities: ArrayLike) -> float:
 def mutual_information_bits(joint: ArrayLike) -> float:
     r"""Return :math:`I(z; x) = \sum p(z, x) \log_2 \frac{p(z, x)}{p(z) p(x)}` of a joint table.
 
-    Parameters
-    ----------
-    joint : array_like, shape (states, observations)
-        Probabilities that sum to one.
-
-    Returns
-    -------
-    float
-        Bits.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is no distribution.
+    Shapes: joint (states, observations).
 
     References
     ----------
@@ -154,17 +128,7 @@ def state_entropy_bits(states: ArrayLike, count: int) -> float:
 
     with K_+ the labels that occur.
 
-    Parameters
-    ----------
-    states : array_like of int, shape (n,)
-        Labels, from 0.
-    count : int
-        K.
-
-    Returns
-    -------
-    float
-        Bits, at most log2 K.
+    Shapes: states (n,).
 
     References
     ----------
@@ -328,36 +292,15 @@ def conditional_information(acoustic: ArrayLike, both: ArrayLike, states: ArrayL
 
     .. math:: \hat I = \overline{\log_2 \frac{q(z_i | x_{ac,i}, x_{vis,i})}{q(z_i | x_{ac,i})}}
 
-    It is what is lost with vision, and no acoustic detector can bring it back at run time. A difference of
-    two lower bounds, so itself no bound; negative where the posteriors of both are the worse ones.
-
-    Parameters
-    ----------
-    acoustic, both : array_like, shape (n, K)
-        Posteriors without and with vision; `fuse` forms the second under (A1).
-    states : array_like of int, shape (n,)
-        True states.
-
-    Returns
-    -------
-    float
-        Bits.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `information_from_posteriors`.
-
-    References
-    ----------
-    Section VI of the paper (the vision-unique part); its estimate from posteriors: see
-    `information_from_posteriors`.
+    Shapes: acoustic, both (n, K), states (n,).
 
     Examples
     --------
     >>> round(conditional_information([[0.5, 0.5]] * 2, [[0.9, 0.1], [0.1, 0.9]], [0, 1]), 3)
     0.848
     """
+    # It is what is lost with vision, and no acoustic detector can bring it back at run time. A difference of
+    # two lower bounds, so itself no bound; negative where the posteriors of both are the worse ones.
     without, z = _checked(acoustic, states)
     with_vision, _ = _checked(both, states)
     check_shape("both", with_vision.shape, without.shape)
@@ -371,26 +314,7 @@ def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> FloatArray
 
     .. math:: q(z | x_{ac}, x_{vis}) \propto q(z | x_{ac})\, q(z | x_{vis}) / p(z)
 
-    Parameters
-    ----------
-    acoustic, visual : array_like, shape (n, K)
-        Posteriors of each at the same prior.
-    prior : array_like, shape (K,)
-        p(z), positive.
-
-    Returns
-    -------
-    ndarray, shape (n, K)
-        Rows that sum to one.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If shapes differ or a row is no distribution.
-
-    References
-    ----------
-    Bayes' rule under assumption (A1), section VI of the paper.
+    Shapes: acoustic, visual (n, K), prior (K,).
 
     Examples
     --------

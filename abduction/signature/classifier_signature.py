@@ -25,15 +25,7 @@ class FittedClassifier(Protocol):
     def predict_proba(self, X: Any) -> Any:
         """Return posteriors, shape (n, classes).
 
-        Parameters
-        ----------
-        X : array_like, shape (n, features)
-            One row a window.
-
-        Returns
-        -------
-        ndarray, shape (n, classes)
-            Rows that sum to one.
+        Shapes: X (n, features).
         """
         ...
 

@@ -27,21 +27,14 @@ _ITERATIONS = 1000
 class Recipe:
     """What one expert looks at and how strongly it is held back.
 
-    Parameters
-    ----------
-    view : str
-        See `Expert`.
-    ridge : float
-        Weight of half the squared norm of the coefficients beside the mean log loss, > 0.
-
     Examples
     --------
     >>> Recipe("mean", 1e-3).view
     'mean'
     """
 
-    view: str
-    ridge: float
+    view: str  # See `Expert`
+    ridge: float  # Weight of half the squared norm of the coefficients beside the mean log loss, > 0
 
 
 # Chosen on eight junctions, every choice judged on a junction that it was not made on; see docs/signature.md.

@@ -23,34 +23,19 @@ VIEWS = (*KINDS, SHAPE, SHAPE_CHANGE)
 class Expert:
     """One linear softmax classifier and what it looks at.
 
-    Parameters
-    ----------
-    view : str
-        ``mean``, ``median`` or ``quiet``: log-levels above that summary of the site; ``shape``: a few numbers
-        of the window alone; ``shape_change``: how they differ from those of the site's median.
-    mean, scale : ndarray, shape (inputs,)
-        Standardisation; scale > 0.
-    weights : ndarray, shape (4, inputs)
-        One row for each of front, left, none, right.
-    intercepts : ndarray, shape (4,)
-        Added to the weighted sums.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the view is unknown, shapes do not agree, a number is not finite or a scale is not positive.
-
     Examples
     --------
     >>> Expert("mean", np.zeros(6), np.ones(6), np.zeros((4, 6)), np.zeros(4)).view
     'mean'
     """
 
+    # ``mean``, ``median`` or ``quiet``: log-levels above that summary of the site; ``shape``: a few numbers
+    # of the window alone; ``shape_change``: how they differ from those of the site's median.
     view: str
-    mean: FloatArray
+    mean: FloatArray  # shape (inputs,): Standardisation; scale > 0
     scale: FloatArray
-    weights: FloatArray
-    intercepts: FloatArray
+    weights: FloatArray  # shape (4, inputs): One row for each of front, left, none, right
+    intercepts: FloatArray  # shape (4,): Added to the weighted sums
 
     def __post_init__(self) -> None:
         if self.view not in VIEWS:
@@ -69,14 +54,7 @@ class Expert:
 
         .. math:: \ell = \log \mathrm{softmax}\, \big( W (v - \mu) / \sigma + b \big)
 
-        Parameters
-        ----------
-        seen : ndarray, shape (n, inputs)
-            Its view of the windows.
-
-        References
-        ----------
-        From the definition of logistic regression.
+        Shapes: seen (n, inputs).
         """
         return log_softmax((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
@@ -87,18 +65,7 @@ class Expert:
 
     @classmethod
     def from_dict(cls, data: object) -> "Expert":
-        """Return the expert that `to_dict` wrote; unknown keys are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
+        """Return the expert that `to_dict` wrote; unknown keys are ignored."""
         if not isinstance(data, Mapping):
             raise InvalidArgumentError("expert: expected an object")
         rows = read_rows(data.get("weights"), "weights")
@@ -116,23 +83,7 @@ def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatAr
 
     with phi by `shape_features`.
 
-    Parameters
-    ----------
-    wanted : collection of str
-        Some of `VIEWS`.
-    levels : ndarray, shape (n, features)
-        Natural logarithms.
-    reference : ndarray, shape (n, 3 * features)
-        Mean, median and quiet reference behind one another.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n, inputs)
-        By name.
-
-    References
-    ----------
-    Derived here: a difference of logarithms takes out what every window of a site shares.
+    Shapes: levels (n, features), reference (n, 3 * features).
 
     Examples
     --------
@@ -153,19 +104,7 @@ def log_softmax(sums: FloatArray) -> FloatArray:
 
     .. math:: \ell_c = a_c - \log \sum_{c'} e^{a_{c'}}
 
-    Parameters
-    ----------
-    sums : ndarray, shape (n, classes)
-        Any numbers.
-
-    Returns
-    -------
-    ndarray, shape (n, classes)
-        Logarithms of rows that sum to one.
-
-    References
-    ----------
-    From the definition.
+    Shapes: sums (n, classes).
 
     Examples
     --------
@@ -181,19 +120,7 @@ def total(values: FloatArray) -> FloatArray:
 
     .. math:: s_i = \sum_j x_{ij}
 
-    Parameters
-    ----------
-    values : ndarray, shape (n, columns)
-        Any numbers.
-
-    Returns
-    -------
-    ndarray, shape (n, 1)
-        Sums of rows.
-
-    References
-    ----------
-    From the definition; summed in rising order, because rounding depends on the order.
+    Shapes: values (n, columns).
 
     Examples
     --------
@@ -208,19 +135,7 @@ def split_reference(X: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     .. math:: x = \ln \max(X, 10^{-4})
 
-    Parameters
-    ----------
-    X : ndarray, shape (n, 4 * features)
-        A level and its site's three statistics, side by side.
-
-    Returns
-    -------
-    levels, reference : ndarray, shape (n, features) and (n, 3 * features)
-        Natural logarithms.
-
-    References
-    ----------
-    From the definition.
+    Shapes: X (n, 4 * features), returns (n, features).
 
     Examples
     --------

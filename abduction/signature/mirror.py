@@ -10,21 +10,7 @@ def mirror_features(X: FloatArray, segments: int = SEGMENTS) -> FloatArray:
 
     .. math:: \bar x_{s,a} = x_{s, A - 1 - a}
 
-    Parameters
-    ----------
-    X : ndarray, shape (n, segments * azimuths)
-        Segment-major: all azimuths of the first segment, then those of the next.
-    segments : int
-        Stretches of time that a feature vector covers.
-
-    Returns
-    -------
-    ndarray, shape of `X`
-        A copy.
-
-    References
-    ----------
-    From the definition: azimuths are evenly spaced about straight ahead.
+    Shapes: X (n, segments * azimuths).
 
     Examples
     --------

@@ -23,16 +23,6 @@ SMALLEST_PROBABILITY = 1e-7
 def class_pairs(n_classes: int) -> list[tuple[int, int]]:
     """Return all pairs i < j in the order of a one-against-one machine.
 
-    Parameters
-    ----------
-    n_classes : int
-        K.
-
-    Returns
-    -------
-    list of (int, int)
-        K (K - 1) / 2 pairs.
-
     Examples
     --------
     >>> class_pairs(3)
@@ -45,22 +35,6 @@ def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
     r"""Return class probabilities, shape (n, classes), positive and summing to one.
 
     .. math:: \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2, \qquad \sum_i p_i = 1
-
-    Parameters
-    ----------
-    pairwise : ndarray, shape (n, classes * (classes - 1) / 2)
-        P(i | i or j) for each of `class_pairs`.
-    n_classes : int
-        At least 2.
-
-    Returns
-    -------
-    ndarray, shape (n, classes)
-        Rows that sum to one.
-
-    References
-    ----------
-    T.-F. Wu, C.-J. Lin and R. C. Weng 2004, second method: see `pairwise_coupling`.
 
     Examples
     --------

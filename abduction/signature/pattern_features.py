@@ -13,25 +13,7 @@ def shape_features(levels: FloatArray, segments: int = 2) -> FloatArray:
     .. math:: p = \sum_a w_a u_a, \qquad \sigma^2 = \sum_a w_a u_a^2 - p^2, \qquad
               w_a \propto e^{4 (x_a - \max x)}, \quad \sum_a w_a = 1
 
-    are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
-
-    Mirroring the directions exchanges the sides and changes the sign of what points to one.
-
-    Parameters
-    ----------
-    levels : ndarray, shape (n, segments * directions)
-        Natural logarithms, segment by segment; at least three directions.
-    segments : int
-        Stretches of time, at least two; the change is that from the first to the last.
-
-    Returns
-    -------
-    ndarray, shape (n, 13 * segments + 5)
-        In the unit of the log-levels, directions in steps.
-
-    References
-    ----------
-    Derived here: the weights are a softmax, so that only directions near the peak say where it is.
+    Shapes: levels (n, segments * directions).
 
     Examples
     --------
@@ -41,6 +23,9 @@ def shape_features(levels: FloatArray, segments: int = 2) -> FloatArray:
     >>> shape_features(rising)[:, -2].round(2)  # the peak rises by a factor of two
     array([0.69])
     """
+    # are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
+    #
+    # Mirroring the directions exchanges the sides and changes the sign of what points to one.
     stretches = levels.reshape(len(levels), segments, -1)
     by_segment = np.stack(_columns(stretches), axis=2).reshape(len(levels), -1)
     change = np.stack(_change(stretches[:, 0], stretches[:, -1]), axis=1)

@@ -230,21 +230,7 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatA
 
     .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
 
-    Parameters
-    ----------
-    probabilities : array_like, shape (n, 4)
-        Posteriors of front, left, none, right.
-    miss_rate : float
-        beta: 1 gives the published statistic, 0 removes the visible explanation.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In [0, 1].
-
-    References
-    ----------
-    Eq. (post) of the paper at the training prior.
+    Shapes: probabilities (n, 4).
 
     Examples
     --------
@@ -262,17 +248,7 @@ def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatA
 
     .. math:: \log \ell_c = \log P_c - \log \pi_c
 
-    Parameters
-    ----------
-    posteriors : ndarray, shape (n, 4)
-        Of front, left, none, right.
-    class_prior : array_like, shape (4,)
-        In the same order.
-
-    Returns
-    -------
-    ndarray, shape (n, 4)
-        Nats.
+    Shapes: posteriors (n, 4), class_prior (4,).
 
     References
     ----------
@@ -290,15 +266,7 @@ def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatA
 def evidence_of(log_likelihoods: FloatArray) -> SignatureEvidence:
     """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
 
-    Parameters
-    ----------
-    log_likelihoods : ndarray, shape (4,)
-        Of left, right, visible, none; nats.
-
-    Returns
-    -------
-    SignatureEvidence
-        Directions left and right.
+    Shapes: log_likelihoods (4,).
 
     Examples
     --------

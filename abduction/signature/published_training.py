@@ -29,27 +29,14 @@ class Classifier(Protocol):
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Learn from features (n, features) and class names (n,).
 
-        Parameters
-        ----------
-        X : array_like, shape (n, features)
-            One row a window.
-        y : array_like of str, shape (n,)
-            Class names.
-
-        Returns
-        -------
-        Classifier
-            Itself.
+        Shapes: X (n, features), y (n,).
         """
         ...
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
         """Return posteriors of front, left, none, right, shape (n, 4).
 
-        Parameters
-        ----------
-        X : array_like, shape (n, features)
-            One row a window.
+        Shapes: X (n, features).
         """
         ...
 
@@ -171,27 +158,14 @@ def mirror_hazards(X: FloatArray, y: TextArray) -> tuple[FloatArray, TextArray]:
     .. math:: (x, left) \to (\bar x, right), \qquad (x, right) \to (\bar x, left), \qquad
               \bar x_{s,a} = x_{s, A - 1 - a}
 
-    Only these two classes are mirrored, as published: hazards become more frequent than they were.
-
-    Parameters
-    ----------
-    X : ndarray, shape (n, 2 * azimuths)
-    y : ndarray of str, shape (n,)
-
-    Returns
-    -------
-    X, y : ndarray
-        Longer by the number of hazard windows.
-
-    References
-    ----------
-    Y. Schulz et al. 2021: see `SignatureModel`.
+    Shapes: X (n, 2 * azimuths), y (n,).
 
     Examples
     --------
     >>> mirror_hazards(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array(["left", "none"]))[1]
     array(['left', 'none', 'right'], dtype='<U5')
     """
+    # Only these two classes are mirrored, as published: hazards become more frequent than they were.
     hazard = np.isin(y, (CLASSES[LEFT], CLASSES[RIGHT]))
     swapped = np.where(y[hazard] == CLASSES[LEFT], CLASSES[RIGHT], CLASSES[LEFT])
     return np.concatenate([X, mirror_features(X[hazard])]), np.concatenate([y, swapped])
@@ -200,22 +174,7 @@ def mirror_hazards(X: FloatArray, y: TextArray) -> tuple[FloatArray, TextArray]:
 def checked_labels(y: ArrayLike, n: int) -> TextArray:
     """Return class names as an array; the sides stand in for each other, the other classes must be there.
 
-    Parameters
-    ----------
-    y : array_like of str, shape (n,)
-        Class names.
-    n : int
-        How many there should be.
-
-    Returns
-    -------
-    ndarray of str, shape (n,)
-        As they came.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are not `n` names, or a class is unknown or missing.
+    Shapes: y (n,).
 
     Examples
     --------

@@ -11,21 +11,6 @@ AnySignature = SignatureModel | EnsembleModel
 def signature_from_dict(data: object) -> AnySignature:
     """Return the model that a `to_dict` wrote: an ensemble where it says so, else the published classifier.
 
-    Parameters
-    ----------
-    data : object
-        Decoded JSON.
-
-    Returns
-    -------
-    SignatureModel or EnsembleModel
-        Ready to use.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If something is missing, of the wrong type or out of range.
-
     Examples
     --------
     >>> signature_from_dict({"kind": "ensemble"})

@@ -22,27 +22,16 @@ KINDS = ("mean", "median", "quiet")
 class SiteReference:
     """Three summaries of the log-levels at one site, none of which needs a label.
 
-    Parameters
-    ----------
-    mean, median : ndarray, shape (features,)
-        Over all windows.
-    quiet : ndarray, shape (features,)
-        Mean over the 35 % of the windows whose loudest feature is the least: close to what the site is like
-        while nobody comes, whatever share of the windows that is.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the shapes differ or a number is not finite.
-
     Examples
     --------
     >>> site_reference(np.log([[1.0, 2.0], [1.0, 4.0], [1.0, 8.0]])).median.round(2)
     array([0.  , 1.39])
     """
 
-    mean: FloatArray
+    mean: FloatArray  # shape (features,): Over all windows
     median: FloatArray
+    # shape (features,): Mean over the 35 % of the windows whose loudest feature is the least: close to what
+    # the site is like while nobody comes, whatever share of the windows that is.
     quiet: FloatArray
 
     def __post_init__(self) -> None:
@@ -60,15 +49,7 @@ class SiteReference:
     def from_row(cls, row: ArrayLike) -> "SiteReference":
         """Return the reference whose `row` this is.
 
-        Parameters
-        ----------
-        row : array_like, shape (3 * features,)
-            The statistics, one after the other.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If its length is no multiple of three or a number is not finite.
+        Shapes: row (3 * features,).
         """
         values = finite_array("reference", row, (None,))
         if values.size % len(KINDS):
@@ -78,17 +59,9 @@ class SiteReference:
     def shifted(self, offset: ArrayLike) -> "SiteReference":
         """Return the reference of a site whose log-levels are higher by `offset`, shape (features,).
 
-        ``r' = r + offset`` for each of the three.
-
-        Parameters
-        ----------
-        offset : array_like, shape (features,)
-            Natural logarithms.
-
-        References
-        ----------
-        From the definition.
+        Shapes: offset (features,).
         """
+        # ``r' = r + offset`` for each of the three.
         return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
 
 
@@ -96,20 +69,6 @@ def log_levels(X: ArrayLike) -> FloatArray:
     r"""Return the natural logarithm of levels, silence held at 1e-4.
 
     .. math:: x = \ln \max(X, 10^{-4})
-
-    Parameters
-    ----------
-    X : array_like, any shape
-        Levels >= 0.
-
-    Returns
-    -------
-    ndarray, same shape
-        Natural logarithms.
-
-    References
-    ----------
-    From the definition.
 
     Examples
     --------
@@ -125,25 +84,7 @@ def site_reference(levels: ArrayLike) -> SiteReference:
     .. math:: r = \big(\langle x \rangle,\; \mathrm{median}\, x,\;
               \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
 
-    Parameters
-    ----------
-    levels : array_like, shape (windows, features)
-        Natural logarithms of levels.
-
-    Returns
-    -------
-    SiteReference
-        Statistics over the windows.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no window or a number is not finite.
-
-    References
-    ----------
-    Derived here: whoever comes raises the loudest direction, so that the windows where it is least hold
-    nobody.
+    Shapes: levels (windows, features).
 
     Examples
     --------

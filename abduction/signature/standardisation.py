@@ -10,19 +10,7 @@ def standardisation(inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     .. math:: \mu = \frac1n \sum_i x_i, \qquad \sigma^2 = \frac1n \sum_i (x_i - \mu)^2
 
-    Parameters
-    ----------
-    inputs : ndarray, shape (n, columns)
-        Any numbers.
-
-    Returns
-    -------
-    mean, std : ndarray, shape (columns,)
-        In the units of the columns.
-
-    References
-    ----------
-    From the definition.
+    Shapes: inputs (n, columns), returns (columns,).
 
     Examples
     --------

@@ -35,16 +35,6 @@ class DataSize(NamedTuple):
 def data_size(path: Path) -> DataSize | None:
     """Read the size of the data chunk of a RIFF, RF64 or W64 file.
 
-    Parameters
-    ----------
-    path : Path
-        An existing file.
-
-    Returns
-    -------
-    DataSize or None
-        None for another container, a missing data chunk, or a size left open by a streaming writer.
-
     Examples
     --------
     >>> from tempfile import TemporaryDirectory

@@ -123,13 +123,7 @@ class AudioSource:
 
 
 class SilentChannelsError(InputFileError):
-    """Channels of a recording hold one constant value through its first second.
-
-    Attributes
-    ----------
-    channels : tuple of int
-        From 1, as in the file.
-    """
+    """Channels of a recording hold one constant value through its first second."""
 
     def __init__(self, path: Path, channels: tuple[int, ...], expected: str) -> None:
         numbers = ", ".join(map(str, channels))

@@ -25,21 +25,11 @@ HEALTH_PERIOD_NS = 400_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Watched:
-    """What a camera reported, and how far it could be trusted while it did.
+    """What a camera reported, and how far it could be trusted while it did."""
 
-    Parameters
-    ----------
-    detections : DetectionLog
-        One entry a frame.
-    degradation : DegradationLog
-        d as last read, on the scale of the measured table.
-    rates : MissRates
-        Miss and clutter rates of the same detector behind the same camera.
-    """
-
-    detections: DetectionLog
-    degradation: DegradationLog
-    rates: MissRates
+    detections: DetectionLog  # One entry a frame
+    degradation: DegradationLog  # d as last read, on the scale of the measured table
+    rates: MissRates  # Miss and clutter rates of the same detector behind the same camera
 
     def query(
         self,
@@ -47,20 +37,7 @@ class Watched:
         settings: VisionSettings | None = None,
         line_of_sight: Sector | None = None,
     ) -> VisionQuery:
-        """Return the channel to be asked: beta and clutter follow d, which nobody had to tell.
-
-        Parameters
-        ----------
-        camera : PinholeCamera
-            That took the frames.
-        settings, line_of_sight
-            As for `VisionQuery`.
-
-        Raises
-        ------
-        InputFileError
-            If a box lies outside the image.
-        """
+        """Return the channel to be asked: beta and clutter follow d, which nobody had to tell."""
         return VisionQuery(
             camera,
             self.detections,
@@ -120,20 +97,7 @@ class Watcher:
 
 
 def watch(frames: Iterable[tuple[int, ImageArray]], detector: Detector, rates: MissRates) -> Watched:
-    """Run a detector over stamped frames and read the camera's health from the same frames.
-
-    Parameters
-    ----------
-    frames : iterable of (int, ndarray of uint8)
-        Stamp on the stream's clock, nanoseconds, and image, in the order of time.
-    detector, rates
-        As for `Watcher`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no frame, or the rates hold no scale of health.
-    """
+    """Run a detector over stamped frames and read the camera's health from the same frames."""
     watcher = Watcher(detector, rates)
     for stamp_ns, frame in frames:
         watcher.look(stamp_ns, frame)
@@ -141,15 +105,7 @@ def watch(frames: Iterable[tuple[int, ImageArray]], detector: Detector, rates: M
 
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
-    """Read d from every frame of a video that starts with the recording.
-
-    Raises
-    ------
-    InputFileError
-        If no frame can be decoded.
-    InvalidArgumentError
-        If the rates hold no scale of health.
-    """
+    """Read d from every frame of a video that starts with the recording."""
     health = _scale(rates)
     stamped = ((nanoseconds(i / video.frame_rate_hz), frame) for i, frame in enumerate(video.frames()))
     return degradation_log(stamped, health, rates.level)

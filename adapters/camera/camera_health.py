@@ -45,20 +45,6 @@ class Health:
 class CameraHealth:
     """What this camera's images measure when clean and at every staged level: the scale that d is read on.
 
-    Parameters
-    ----------
-    brightness : float
-        Mean grey level of clean images, > 0.
-    sharpness : tuple of float
-        At the five levels of blur, not rising.
-    noise : tuple of float
-        At the five levels of noise, not falling.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the numbers do not fit the levels.
-
     Examples
     --------
     >>> health = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
@@ -67,9 +53,9 @@ class CameraHealth:
     (0.25, 0.5, 0.0)
     """
 
-    brightness: float
-    sharpness: tuple[float, ...]
-    noise: tuple[float, ...]
+    brightness: float  # Mean grey level of clean images, > 0
+    sharpness: tuple[float, ...]  # At the five levels of blur, not rising
+    noise: tuple[float, ...]  # At the five levels of noise, not falling
 
     def __post_init__(self) -> None:
         in_range("brightness", self.brightness, 0.0, 255.0, open_low=True)
@@ -81,10 +67,8 @@ class CameraHealth:
             raise InvalidArgumentError("expected a positive sharpness and a noise >= 0")
 
     def estimate(self, quality: ImageQuality) -> Health:
-        """Return d of each family.
-
-        Sharpness that the noise drowns says nothing of blur: then the noise is the larger trouble anyway.
-        """
+        """Return d of each family."""
+        # Sharpness that the noise drowns says nothing of blur: then the noise is the larger trouble anyway.
         blur = 0.0
         if quality.sharpness is not None:
             blur = float(np.interp(-quality.sharpness, -np.array(self.sharpness), LEVELS))
@@ -102,13 +86,7 @@ class CameraHealth:
 
     @classmethod
     def from_dict(cls, data: object) -> "CameraHealth":
-        """Return what `to_dict` wrote; unknown keys are ignored.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
+        """Return what `to_dict` wrote; unknown keys are ignored."""
         if not isinstance(data, Mapping):
             raise InvalidArgumentError("health: expected an object")
         return cls(
@@ -119,27 +97,7 @@ class CameraHealth:
 
 
 def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> CameraHealth:
-    """Learn the scale of a camera from clean images, by degrading them itself.
-
-    Parameters
-    ----------
-    clean : iterable of ndarray of uint8
-        A few images, taken apart in time; of each quantity the median over them counts.
-    rng : numpy.random.Generator
-        Draws the staged noise.
-
-    Returns
-    -------
-    CameraHealth
-        Ready to monitor that camera.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no image, or none in which sharpness can be measured.
-    MissingExtraError
-        If OpenCV is not installed.
-    """
+    """Learn the scale of a camera from clean images, by degrading them itself."""
     brightness, sharpness, noise = [], [], []
     for frame in clean:
         brightness.append(image_quality(frame).brightness)
@@ -158,21 +116,6 @@ def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> Camer
 class HealthMonitor:
     """Follows a camera's health, with a clean reference that moves along with the day.
 
-    While an image is clean (every d at most `clean`) the brightness and sharpness of reference follow it with
-    time constant `follow_s`, but never by more than a factor `most_drift` from what was learned: a lens that
-    soils slowly must not become the measure of cleanliness.
-
-    Parameters
-    ----------
-    health : CameraHealth
-        The camera's scale.
-    follow_s : float
-        Seconds.
-    clean : float
-        In [0, 1].
-    most_drift : float
-        >= 1.
-
     Examples
     --------
     >>> health = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
@@ -182,6 +125,10 @@ class HealthMonitor:
     >>> round(seen.darkness, 3), round(monitor.reference.brightness)
     (0.0, 90)
     """
+
+    # While an image is clean (every d at most `clean`) the brightness and sharpness of reference follow it
+    # with time constant `follow_s`, but never by more than a factor `most_drift` from what was learned: a
+    # lens that soils slowly must not become the measure of cleanliness.
 
     def __init__(
         self, health: CameraHealth, follow_s: float = 120.0, clean: float = 0.15, most_drift: float = 1.5
@@ -221,18 +168,6 @@ class HealthMonitor:
 class DegradationLog:
     """Degradation over time, callable as `VisionQuery` wants it.
 
-    Parameters
-    ----------
-    stamps_ns : ndarray of int, shape (n,)
-        Increasing.
-    degradation : ndarray, shape (n,)
-        d in [0, 1].
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is empty, lengths differ, or a number is out of range.
-
     Examples
     --------
     >>> log = DegradationLog(np.array([0, 10**9]), np.array([0.0, 0.5]))
@@ -240,8 +175,8 @@ class DegradationLog:
     (0.0, 0.0, 0.5)
     """
 
-    stamps_ns: IntArray
-    degradation: FloatArray
+    stamps_ns: IntArray  # shape (n,): Increasing
+    degradation: FloatArray  # shape (n,): d in [0, 1]
 
     def __post_init__(self) -> None:
         d = finite_array("degradation", self.degradation, (np.size(self.stamps_ns),))
@@ -259,27 +194,7 @@ def degradation_log(
     health: CameraHealth,
     level: Callable[[Health], float] = lambda health: health.worst,
 ) -> DegradationLog:
-    """Read the degradation of every frame of a video.
-
-    Parameters
-    ----------
-    frames : iterable of (int, ndarray of uint8)
-        Stamp and image, in the order of time.
-    health : CameraHealth
-        The camera's scale.
-    level : callable
-        From the degradation by family to the one d of a table; `MissRates.level` is one.
-
-    Returns
-    -------
-    DegradationLog
-        One entry a frame.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no frame.
-    """
+    """Read the degradation of every frame of a video."""
     monitor, stamps, levels = HealthMonitor(health), [], []
     for stamp_ns, frame in frames:
         stamps.append(stamp_ns)

@@ -39,30 +39,12 @@ _QUANTILES = 1 << 16
 def strength(family: str, degradation: float) -> float:
     """Return the strength of one of the three families at a degradation d in [0, 1].
 
-    Linear between the levels, darkness in the logarithm.
-
-    Parameters
-    ----------
-    family : str
-        Blur, darkness or noise: see `FAMILIES`.
-    degradation : float
-        d in [0, 1].
-
-    Returns
-    -------
-    float
-        In the unit of the family.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another family, or d outside [0, 1].
-
     Examples
     --------
     >>> strength("blur", 0.5), round(strength("darkness", 0.125), 3), strength("noise", 1.0)
     (4.0, 0.707, 100.0)
     """
+    # Linear between the levels, darkness in the logarithm.
     level = in_range("degradation", degradation, 0.0, 1.0)
     if family not in STRENGTHS:
         raise InvalidArgumentError(f"family: expected {', '.join(STRENGTHS)}, got {family!r:.40}")
@@ -74,18 +56,6 @@ def strength(family: str, degradation: float) -> float:
 
 def level_of(family: str, staged: float) -> float:
     """Return the d in [0, 1] of a strength, the inverse of `strength`; beyond the last level it is 1.
-
-    Parameters
-    ----------
-    family : str
-        Blur, darkness or noise: see `FAMILIES`.
-    staged : float
-        Strength, in the unit of the family.
-
-    Returns
-    -------
-    float
-        d in [0, 1].
 
     Examples
     --------
@@ -106,28 +76,7 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
     with :math:`\sigma`, a and s those of the family at d; ``"all"`` takes the three together: optics first,
     exposure next, the sensor last.
 
-    Parameters
-    ----------
-    frame : ndarray of uint8, shape (height, width) or (height, width, 3)
-        Untouched.
-    family : {"blur", "darkness", "noise", "all"}
-        What is staged.
-    degradation : float
-        d in [0, 1]; 0 returns the frame itself.
-    rng : numpy.random.Generator
-        Draws the noise.
-
-    Returns
-    -------
-    ndarray of uint8, shape of `frame`
-        A new one.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another family, type or range.
-    MissingExtraError
-        If blur is asked for and OpenCV is not installed.
+    Shapes: frame (height, width).
 
     Examples
     --------

@@ -83,30 +83,6 @@ def read_coco_results(
 ) -> DetectionLog:
     """Read a COCO results file: ``[{"image_id", "category_id", "bbox": [x, y, w, h], "score"}, ...]``.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file; at most 64 MiB.
-    frame_rate_hz : float
-        Image `first_image` + i shows the time i / rate.
-    categories : mapping of int to str
-        Names of the numbers; others are called by their number.
-    first_image : int
-        `image_id` of the first frame.
-    frames : int, optional
-        How many there are; such a file says nothing of images without boxes, so those after the last box are
-        only counted where this is given.
-
-    Returns
-    -------
-    DetectionLog
-        In the order of time.
-
-    Raises
-    ------
-    InputFileError
-        If it is missing, too large, no such list, or a number is out of range.
-
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -140,27 +116,6 @@ def read_yolo_text(
     frames: int | None = None,
 ) -> DetectionLog:
     """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder; the number before ``.txt`` is that of the frame. A frame without a file has no boxes.
-    size_px : tuple of int
-        Width and height of the image.
-    frame_rate_hz, first_image, frames
-        As for `read_coco_results`.
-    classes : mapping of int to str
-        Names of the numbers; others are called by their number.
-
-    Returns
-    -------
-    DetectionLog
-        In the order of time.
-
-    Raises
-    ------
-    InputFileError
-        If there is no such file, one is too large, or a line is none of these.
 
     Examples
     --------

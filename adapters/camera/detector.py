@@ -33,15 +33,7 @@ def overlaps(boxes_px: FloatArray, others_px: FloatArray) -> FloatArray:
 
     .. math:: IoU = |A \cap B| / |A \cup B|
 
-    Parameters
-    ----------
-    boxes_px, others_px : ndarray, shapes (n, 4) and (m, 4)
-        Left, top, right, bottom.
-
-    Returns
-    -------
-    ndarray, shape (n, m)
-        In [0, 1]; 0 where both are empty.
+    Shapes: boxes_px, others_px (n, 4).
 
     Examples
     --------
@@ -58,19 +50,7 @@ def overlaps(boxes_px: FloatArray, others_px: FloatArray) -> FloatArray:
 def suppress(boxes_px: FloatArray, scores: FloatArray, most_overlap: float) -> IntArray:
     """Return the indices of boxes that no better one overlaps by more, the best first.
 
-    Parameters
-    ----------
-    boxes_px : ndarray, shape (n, 4)
-        Left, top, right, bottom, pixels.
-    scores : ndarray, shape (n,)
-        Higher is better.
-    most_overlap : float
-        Largest intersection over union with a better box.
-
-    Returns
-    -------
-    ndarray of int
-        Indices into `boxes_px`.
+    Shapes: boxes_px (n, 4), scores (n,).
 
     Examples
     --------

@@ -17,20 +17,7 @@ _CONTRAST_PERCENTILE = 75.0
 def difference(frame: ImageArray, background: ImageArray) -> Float32Array:
     """Return how far a frame differs from its background, the largest over the colours, (height, width).
 
-    Parameters
-    ----------
-    frame, background : ndarray of uint8, shape (height, width, 3)
-        Of one size.
-
-    Returns
-    -------
-    ndarray of float, shape (height, width)
-        0..255.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the shapes differ.
+    Shapes: frame, background (height, width, 3).
 
     Examples
     --------
@@ -49,9 +36,6 @@ def difference(frame: ImageArray, background: ImageArray) -> Float32Array:
 def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> float:
     r"""Return the share of a region's outline that is an edge.
 
-    A pixel of the outline counts where, within `width_px` of it, the change rises by its whole contrast over
-    at most that width,
-
     .. math:: \max_{|q - p| \le w} |\nabla D(q)| \ge C / w,
 
     with C the 75th percentile of the change D over the region. An edge that a lens smears by
@@ -59,24 +43,7 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
     :math:`\sigma \approx 0.4 w`. The glow of lamps on a wall, a passing cloud and a step of the exposure
     change many pixels, but by less from each to the next.
 
-    Parameters
-    ----------
-    apart : ndarray of float32, shape (height, width)
-        From `difference`.
-    region : ndarray of bool, shape (height, width)
-        Pixels that changed, at least one.
-    width_px : float
-        Widest edge, w > 0.
-
-    Returns
-    -------
-    float
-        In [0, 1].
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the shapes differ or the region is empty.
+    Shapes: apart (height, width), region (height, width).
 
     References
     ----------
@@ -91,6 +58,8 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
     >>> [round(outlined_share(image, region, width_px=6.0), 1) for image in (sharp, soft)]
     [1.0, 0.0]
     """
+    # A pixel of the outline counts where, within `width_px` of it, the change rises by its whole contrast
+    # over at most that width,
     in_range("width_px", width_px, 0.0, 1e6, open_low=True)
     if apart.shape != region.shape or not region.any():
         raise InvalidArgumentError(

@@ -22,54 +22,28 @@ _QUANTISATION = 1.0 / 12.0
 class ImageQuality:
     """Three numbers of one image.
 
-    Parameters
-    ----------
-    brightness : float
-        Mean grey level, 0 to 255.
-    noise : float
-        Standard deviation of the pixel noise, grey levels.
-    sharpness : float or None
-        Gradient energy at 1 px over that at 4 px, noise taken off: it does not depend on the brightness. None
-        where the noise drowns it.
-
     Examples
     --------
     >>> ImageQuality(110.0, 2.0, 5.0).noise
     2.0
     """
 
-    brightness: float
-    noise: float
+    brightness: float  # Mean grey level, 0 to 255
+    noise: float  # Standard deviation of the pixel noise, grey levels
+    # Gradient energy at 1 px over that at 4 px, noise taken off: it does not depend on the brightness. None
+    # where the noise drowns it.
     sharpness: float | None
 
 
 def image_quality(frame: ImageArray) -> ImageQuality:
     r"""Measure a frame.
 
-    The noise is that of the median absolute deviation of a second difference, in which smooth surfaces and
-    straight edges cancel,
-
     .. math:: \hat\sigma = 1.4826\, \mathrm{med} |D * x| / 6,
-
-    and the sharpness compares two scales of the gradient, less what white noise adds to each,
 
     .. math:: q = \frac{E_1}{E_4}, \qquad
               E_s = \overline{|\nabla (G_s * x)|^2} - \frac{\hat\sigma^2 + 1/12}{4 \pi s^4}.
 
-    Parameters
-    ----------
-    frame : ndarray of uint8, shape (height, width) or (height, width, 3)
-        At least 16 px a side. Its central 640 px are looked at.
-
-    Returns
-    -------
-    ImageQuality
-        Brightness, noise and sharpness.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is no such image.
+    Shapes: frame (height, width).
 
     References
     ----------
@@ -81,6 +55,10 @@ def image_quality(frame: ImageArray) -> ImageQuality:
     >>> round(image_quality(noise.round().astype(np.uint8)).noise)
     10
     """
+    # The noise is that of the median absolute deviation of a second difference, in which smooth surfaces and
+    # straight edges cancel,
+    #
+    # and the sharpness compares two scales of the gradient, less what white noise adds to each,
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or min(frame.shape[:2]) < 16:
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
     grey = _central_grey(frame)

@@ -35,19 +35,6 @@ Rows = tuple[tuple[float, ...], ...]
 class FamilyCounts:
     """What one family of degradations came to.
 
-    Parameters
-    ----------
-    looks, misses : tuple of tuple of float
-        Reference objects that were there, and those that were not found again; one row an azimuth bin, one
-        column a level of degradation.
-    sectors, clutter : tuple of float
-        Query sectors without a reference object, and those of them with a false detection, at each level.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If shapes differ or there are more misses than looks.
-
     Examples
     --------
     >>> counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
@@ -55,8 +42,11 @@ class FamilyCounts:
     ([[0.05, 0.14, 0.23, 0.5, 0.95]], 0.005)
     """
 
+    # Reference objects that were there, and those that were not found again; one row an azimuth bin, one
+    # column a level of degradation.
     looks: Rows
     misses: Rows
+    # Query sectors without a reference object, and those of them with a false detection, at each level.
     sectors: tuple[float, ...]
     clutter: tuple[float, ...]
 
@@ -69,16 +59,9 @@ class FamilyCounts:
             raise InvalidArgumentError("counts: expected 0 <= misses <= looks and 0 <= clutter <= sectors")
 
     def miss_rates(self, repeats: float = 1.0) -> FloatArray:
-        """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation.
-
-        A cell that nobody looked at is at one half, as far as its neighbours let it: not known is neither
-        found nor missed.
-
-        Parameters
-        ----------
-        repeats : float
-            Frames that say the same: counts are divided by it before the prior comes in.
-        """
+        """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation."""
+        # A cell that nobody looked at is at one half, as far as its neighbours let it: not known is neither
+        # found nor missed.
         looks, misses = np.array(self.looks) / repeats, np.array(self.misses) / repeats
         weight = looks + 2.0 * PRIOR
         return isotonic_grid((misses + PRIOR) / weight, weight)

@@ -26,52 +26,28 @@ Background = Literal["mog2", "knn"]
 class MotionSettings:
     """What counts as a moving object.
 
-    Parameters
-    ----------
-    background : {"mog2", "knn"}
-        Model of the background: Gaussian mixtures or nearest neighbours, both OpenCV's.
-    width_px : int
-        Frames are reduced to this width first.
-    history : int
-        Frames that the background remembers.
-    warm_up : int
-        First frames, in which nothing is reported.
-    least_contrast : float
-        Smallest difference that is motion, grey levels, Euclidean over the colours, > 0. The codec and the
-        sensor of a street camera scatter by some 3 grey levels a colour, 5 over three: three times that.
-    min_area : float
-        Smallest object as a share of the image, in (0, 1).
-    max_area : float
-        Larger regions are changes of the light.
-    edge_width : float
-        Widest edge of an object as a share of the image's width, in (0, 1]. A change without one on at least
-        `outlined` of its outline is light: the glow of lamps, a cloud, or what a lens out of focus leaves.
-    outlined : float
-        In [0, 1]; 0 lets everything through. Below one half, as a car has no edge where it meets its shadow.
-    label : str
-        Motion knows no classes: everything is called this.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
     Examples
     --------
     >>> MotionSettings(label="road user").background
     'mog2'
     """
 
+    # Model of the background: Gaussian mixtures or nearest neighbours, both OpenCV's.
     background: Background = "mog2"
-    width_px: int = 640
-    history: int = 100
-    warm_up: int = 5
+    width_px: int = 640  # Frames are reduced to this width first
+    history: int = 100  # Frames that the background remembers
+    warm_up: int = 5  # First frames, in which nothing is reported
+    # Smallest difference that is motion, grey levels, Euclidean over the colours, > 0. The codec and the
+    # sensor of a street camera scatter by some 3 grey levels a colour, 5 over three: three times that.
     least_contrast: float = 15.0
-    min_area: float = 0.0015
-    max_area: float = 0.6
+    min_area: float = 0.0015  # Smallest object as a share of the image, in (0, 1)
+    max_area: float = 0.6  # Larger regions are changes of the light
+    # Widest edge of an object as a share of the image's width, in (0, 1]. A change without one on at least
+    # `outlined` of its outline is light: the glow of lamps, a cloud, or what a lens out of focus leaves.
     edge_width: float = 0.01
+    # In [0, 1]; 0 lets everything through. Below one half, as a car has no edge where it meets its shadow.
     outlined: float = 0.25
-    label: str = "car"
+    label: str = "car"  # Motion knows no classes: everything is called this
 
     def __post_init__(self) -> None:
         if self.background not in get_args(Background):

@@ -37,32 +37,16 @@ class Session(Protocol):
 class OnnxSettings:
     """How the output of a model is read.
 
-    Parameters
-    ----------
-    labels : tuple of str
-        Names of the classes in the order of the model.
-    min_score : float
-        Lowest score that is reported.
-    most_overlap : float
-        Of two boxes that overlap by more, the better one is kept.
-    size_px : int
-        Side of the square that the model takes, where it does not say.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are no labels or a number is out of range.
-
     Examples
     --------
     >>> OnnxSettings(labels=("car", "bicycle")).min_score
     0.25
     """
 
-    labels: tuple[str, ...]
-    min_score: float = 0.25
-    most_overlap: float = 0.5
-    size_px: int = 640
+    labels: tuple[str, ...]  # Names of the classes in the order of the model
+    min_score: float = 0.25  # Lowest score that is reported
+    most_overlap: float = 0.5  # Of two boxes that overlap by more, the better one is kept
+    size_px: int = 640  # Side of the square that the model takes, where it does not say
 
     def __post_init__(self) -> None:
         if not self.labels:
@@ -180,27 +164,7 @@ def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
 def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, FloatArray, IntArray]:
     r"""Turn the raw output of a YOLO model into boxes.
 
-    Three forms are told apart by their shape, with C classes and n candidates: (1, 4 + C, n), centre and size
-    with a score a class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6), corners,
-    score and class, of a model that suppresses doubles itself. Six columns with one class are read as the
-    second.
-
-    Parameters
-    ----------
-    output : ndarray
-        As the model gives it.
-    classes : int
-        C.
-
-    Returns
-    -------
-    boxes, scores, classes : ndarray, shapes (n, 4), (n,), (n,)
-        Corners in pixels of the model's input; scores cut to [0, 1].
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another shape, a class out of range, or numbers that are not finite.
+    Shapes: returns (n, 4).
 
     Examples
     --------
@@ -209,6 +173,10 @@ def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, 
     >>> boxes.tolist(), scores.tolist(), labels.tolist()
     ([[40.0, 35.0, 60.0, 45.0]], [0.9], [1])
     """
+    # Three forms are told apart by their shape, with C classes and n candidates: (1, 4 + C, n), centre and
+    # size with a score a class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6),
+    # corners, score and class, of a model that suppresses doubles itself. Six columns with one class are
+    # read as the second.
     array = np.asarray(output, dtype=np.float64)
     if array.ndim != 3 or array.shape[0] != 1 or not np.isfinite(array).all():
         raise InvalidArgumentError(f"output: expected finite numbers of shape (1, ., .), got {array.shape}")

@@ -8,16 +8,6 @@ from worldstate.ground.errors import MissingExtraError
 def opencv() -> Any:
     """Return the module `cv2`.
 
-    Returns
-    -------
-    module
-        `cv2`.
-
-    Raises
-    ------
-    MissingExtraError
-        If it is not installed.
-
     Examples
     --------
     >>> opencv().__name__

@@ -16,30 +16,17 @@ from .detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
 class ParkedRule:
     """A box is parked when a box stood at its place in `share` of the frames of the last `span_s` seconds.
 
-    For a standing camera: seen from a moving one nothing stands still, so that nothing is parked.
-
-    Parameters
-    ----------
-    span_s : float
-        How long it must have stood, > 0.
-    tolerance_px : float
-        How far every edge may have moved.
-    share : float
-        Share of the past frames in which it must be there; below 1 because detectors miss now and then.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
     Examples
     --------
     >>> ParkedRule().tolerance_px
     5.0
     """
 
-    span_s: float = 1.0
-    tolerance_px: float = 5.0
+    # For a standing camera: seen from a moving one nothing stands still, so that nothing is parked.
+
+    span_s: float = 1.0  # How long it must have stood, > 0
+    tolerance_px: float = 5.0  # How far every edge may have moved
+    # Share of the past frames in which it must be there; below 1 because detectors miss now and then.
     share: float = 0.8
 
     def __post_init__(self) -> None:
@@ -51,22 +38,7 @@ class ParkedRule:
 def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule) -> BoolArray:
     """Tell which boxes of `frame` have stood still, from that frame and earlier ones alone.
 
-    Parameters
-    ----------
-    log : DetectionLog
-        All boxes, unfiltered: a parked car may be seen with a lower score for a moment.
-    frame : int
-        Number of the frame that the boxes are in.
-    boxes_px : ndarray
-        Shape (n, 4).
-    rule : ParkedRule
-        How still and for how long.
-
-    Returns
-    -------
-    ndarray
-        Shape (n,). All False as long as the log does not reach back over the whole span: not known to be
-        parked.
+    Shapes: boxes_px (n, 4), returns (n,).
 
     Examples
     --------
@@ -90,23 +62,7 @@ def kept_and_parked(
 ) -> tuple[IntArray, BoolArray]:
     """Return the indices of the boxes of `frame` that count, and which of those are parked.
 
-    Parameters
-    ----------
-    log : DetectionLog
-        All boxes, unfiltered.
-    frame : int
-        Number of the frame.
-    keep : DetectionFilter
-        Which boxes count.
-    rule : ParkedRule
-        How still and for how long.
-
-    Returns
-    -------
-    kept : ndarray of int, shape (n,)
-        Indices among the frame's boxes.
-    stood : ndarray of bool, shape (n,)
-        As from `parked`.
+    Shapes: returns (n,), returns (n,).
     """
     here = log.frames[frame]
     kept = here.select(keep)

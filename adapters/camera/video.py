@@ -18,34 +18,16 @@ MAX_SIDE_PX = 8192
 
 @dataclass(frozen=True, slots=True)
 class Video:
-    """A video file that was opened once and found readable.
+    """A video file that was opened once and found readable."""
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    width_px, height_px : int
-        Size of a frame.
-    frame_rate_hz : float
-        As the file says.
-    count : int
-        Frames, as the file says; the truth is what `frames` yields.
-    """
-
-    path: Path
-    width_px: int
+    path: Path  # The file
+    width_px: int  # Size of a frame
     height_px: int
-    frame_rate_hz: float
-    count: int
+    frame_rate_hz: float  # As the file says
+    count: int  # Frames, as the file says; the truth is what `frames` yields
 
     def frames(self) -> Iterator[ImageArray]:
-        """Yield frames of shape (height, width, 3), uint8, blue first, from the beginning.
-
-        Raises
-        ------
-        InputFileError
-            If no frame can be decoded or there are more than 100,000.
-        """
+        """Yield frames of shape (height, width, 3), uint8, blue first, from the beginning."""
         capture = _open(self.path)
         number = 0
         try:

@@ -231,19 +231,7 @@ def moving_boxes(
 ) -> list[FloatArray]:
     """Return the moving boxes that count, of the frame at each stamp.
 
-    Parameters
-    ----------
-    log : DetectionLog
-        Of a standing camera.
-    stamps_ns : collection of int
-        On the stream's clock.
-    settings : VisionSettings, optional
-        Which boxes count, which are parked, and how old a frame may be.
-
-    Returns
-    -------
-    list of ndarray
-        One a stamp, shape (boxes, 4); without boxes where there is no frame.
+    Shapes: returns (boxes, 4).
     """
     chosen = settings or VisionSettings()
     found = []

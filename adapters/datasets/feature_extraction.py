@@ -26,54 +26,22 @@ OPTIONAL = ("File", "End", "T0")
 
 @dataclass(frozen=True, slots=True)
 class LabelledWindow:
-    """One line of a list of labels.
+    """One line of a list of labels."""
 
-    Parameters
-    ----------
-    window_id, label, environment, recording : str
-        As in the feature table.
-    t0_frame : int or None
-        Line-of-sight entry, frame number at 10 a second.
-    path : Path
-        Sound file.
-    end_s : float or None
-        End of the window in its file, seconds; None where the file ends.
-    """
-
-    window_id: str
+    window_id: str  # As in the feature table
     label: str
     environment: str
     recording: str
-    t0_frame: int | None
-    path: Path
-    end_s: float | None
+    t0_frame: int | None  # Line-of-sight entry, frame number at 10 a second
+    path: Path  # Sound file
+    end_s: float | None  # End of the window in its file, seconds; None where the file ends
 
 
 def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
-    """Read which window of which recording carries which label.
-
-    Columns ID, Class, Environment and Recording ID as in the feature table, with these beside them where
-    wanted: File, relative to the data set; End, seconds from the start of the file; T0. Where no File is
-    given, ``<Environment>/<Class>/<ID>/out_multi.wav`` and ``<ID>.wav`` are looked for.
-
-    Parameters
-    ----------
-    path : str or Path
-        CSV file.
-    dataset : str or Path
-        Folder that files are looked for in; a name that leads out of it is refused.
-
-    Returns
-    -------
-    list of LabelledWindow
-        In the order of the list.
-
-    Raises
-    ------
-    InputFileError
-        If the list is missing or damaged, a label is unknown or a sound file is not there; the message names
-        the line.
-    """
+    """Read which window of which recording carries which label."""
+    # Columns ID, Class, Environment and Recording ID as in the feature table, with these beside them where
+    # wanted: File, relative to the data set; End, seconds from the start of the file; T0. Where no File is
+    # given, ``<Environment>/<Class>/<ID>/out_multi.wav`` and ``<ID>.wav`` are looked for.
     name, root = Path(path), Path(dataset)
     present = _optional_columns(name)
     rows = read_rows(name, (*REQUIRED, *present))
@@ -110,17 +78,7 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
 def feature_table(windows: list[LabelledWindow], features: list[FloatArray]) -> FeatureTable:
     """Return windows and features, in the same order, as a table.
 
-    Parameters
-    ----------
-    windows : list of LabelledWindow
-        From `read_labels`.
-    features : list of ndarray, shape (60,)
-        One a window.
-
-    Returns
-    -------
-    FeatureTable
-        In the same order.
+    Shapes: features (60,).
     """
     columns = zip(*((w.label, w.window_id, w.environment, w.recording) for w in windows), strict=True)
     labels, ids, environments, recordings = (np.array(column) for column in columns)

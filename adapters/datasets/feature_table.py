@@ -183,23 +183,7 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
 
 
 def read_ids(path: str | Path) -> frozenset[str]:
-    """Read a list of window IDs: a CSV file with a column ``ID``.
-
-    Parameters
-    ----------
-    path : str or Path
-        CSV file.
-
-    Returns
-    -------
-    frozenset of str
-        IDs.
-
-    Raises
-    ------
-    InputFileError
-        If the file is missing or too large, or has no such column or no rows.
-    """
+    """Read a list of window IDs: a CSV file with a column ``ID``."""
     ids = frozenset(row["ID"] for _, row in read_rows(Path(path), ("ID",))) - {""}
     if not ids:
         raise InputFileError(path, "expected at least one ID below the header")

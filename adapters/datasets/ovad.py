@@ -175,21 +175,6 @@ class OvadDataset:
 def read_id_list(path: str | Path) -> frozenset[str]:
     r"""Read the IDs of an official list: a CSV file with a column ID.
 
-    Parameters
-    ----------
-    path : str or Path
-        CSV file.
-
-    Returns
-    -------
-    frozenset of str
-        IDs.
-
-    Raises
-    ------
-    InputFileError
-        If it is missing, has no such column, or names an ID that is none or one twice.
-
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -206,16 +191,6 @@ def read_id_list(path: str | Path) -> frozenset[str]:
 
 def to_base_link(ovad_azimuth_rad: FloatArray) -> FloatArray:
     """Turn azimuths that grow to the right, as OVAD counts them, into left-positive ones.
-
-    Parameters
-    ----------
-    ovad_azimuth_rad : ndarray
-        Radians, right positive, any shape.
-
-    Returns
-    -------
-    ndarray
-        Radians in (-pi, pi], left positive, same shape and order.
 
     Examples
     --------

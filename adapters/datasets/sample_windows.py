@@ -13,54 +13,20 @@ FRONT = "front"
 def window_ends_s(label: str, t0_s: float, moving_ego: bool) -> dict[str, float]:
     """Return by label when the windows of a recording end.
 
-    With a standing ego the window of the recording's own label ends at T0, with a moving one 0.5 s later; an
-    approach has a front window besides, which ends 1.5 s after that.
-
-    Parameters
-    ----------
-    label : str
-        Of the recording: left, none or right.
-    t0_s : float
-        Line-of-sight entry, or what the log says without a vehicle; seconds from the start.
-    moving_ego : bool
-        Whether the ego drives.
-
-    Returns
-    -------
-    dict of str to float
-        One window or two, seconds from the start.
-
     Examples
     --------
     >>> window_ends_s("left", 7.0, moving_ego=False), window_ends_s("none", 7.0, moving_ego=True)
     ({'left': 7.0, 'front': 8.5}, {'none': 7.5})
     """
+    # With a standing ego the window of the recording's own label ends at T0, with a moving one 0.5 s later;
+    # an approach has a front window besides, which ends 1.5 s after that.
     end_s = t0_s + (MOVING_LATER_S if moving_ego else 0.0)
     return {label: end_s} if label == "none" else {label: end_s, FRONT: end_s + FRONT_LATER_S}
 
 
 def sample_windows(root: str | Path) -> tuple[list[LabelledWindow], int]:
-    """List the windows of every recording that ``DataLog.csv`` names.
-
-    Front windows are numbered among themselves, class number 0, as in the released list.
-
-    Parameters
-    ----------
-    root : str or Path
-        Folder with ``DataLog.csv``.
-
-    Returns
-    -------
-    windows : list of LabelledWindow
-        Those that lie within their recording.
-    left_out : int
-        How many do not.
-
-    Raises
-    ------
-    InputFileError
-        If the log or a sound file is missing or damaged.
-    """
+    """List the windows of every recording that ``DataLog.csv`` names."""
+    # Front windows are numbered among themselves, class number 0, as in the released list.
     windows: list[LabelledWindow] = []
     fronts = left_out = 0
     for number, recording in enumerate(OvadDataset(root).recordings):

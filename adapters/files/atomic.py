@@ -16,24 +16,6 @@ from worldstate.ground.errors import InputFileError
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Lend a temporary sibling of `path`; it takes the name on success and disappears on error.
 
-    The sibling keeps the suffix, because writers such as ``numpy.savez`` and ``soundfile`` look at it. It may
-    be made a file or a folder; a folder can only take a name that is free or an empty folder.
-
-    Parameters
-    ----------
-    path : str or Path
-        Where the finished file shall stand; its folder must exist.
-
-    Yields
-    ------
-    Path
-        A name beside `path` at which nothing stands yet.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing, or a folder stands where a file shall go.
-
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -43,6 +25,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     ...     [p.name for p in Path(folder).iterdir()]
     ['states.jsonl']
     """
+    # The sibling keeps the suffix, because writers such as ``numpy.savez`` and ``soundfile`` look at it. It
+    # may be made a file or a folder; a folder can only take a name that is free or an empty folder.
     target = Path(path)
     if not target.parent.is_dir():
         raise InputFileError(target, f"expected an existing folder {target.parent} to write into")
@@ -56,18 +40,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8 with plain newlines, whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        Exactly this file.
-    text : str
-        Its content.
-
-    Raises
-    ------
-    InputFileError
-        As `atomic_path`.
 
     Examples
     --------

@@ -13,23 +13,6 @@ MAX_BYTES = 16 << 20
 def read_rows(path: Path, columns: Collection[str]) -> list[tuple[int, dict[str, str]]]:
     r"""Read the wanted columns of a CSV file with a header.
 
-    Parameters
-    ----------
-    path : Path
-        The file, UTF-8, at most 16 MiB.
-    columns : collection of str
-        Names that the header must hold; others are ignored.
-
-    Returns
-    -------
-    list of (int, dict)
-        Line number and values, stripped, empty where the row is short.
-
-    Raises
-    ------
-    InputFileError
-        If the file is missing, too large, not UTF-8, no CSV, or lacks a column.
-
     Examples
     --------
     >>> from tempfile import TemporaryDirectory

@@ -154,18 +154,7 @@ def save_model(path: str | Path, model: Model) -> None:
 
 
 def model_to_dict(model: Model) -> dict[str, Any]:
-    """Return JSON-able values.
-
-    Parameters
-    ----------
-    model : Model
-        What to write.
-
-    Returns
-    -------
-    dict
-        For `json.dumps`.
-    """
+    """Return JSON-able values."""
     origin = model.provenance
     return {
         **schema_stamp(SCHEMA, VERSION),
@@ -185,25 +174,7 @@ def model_to_dict(model: Model) -> dict[str, Any]:
 
 
 def model_from_dict(data: object, source: object) -> Model:
-    """Return the model that `model_to_dict` wrote; unknown keys are ignored.
-
-    Parameters
-    ----------
-    data : object
-        Decoded JSON.
-    source : object
-        What the message calls it: a path.
-
-    Returns
-    -------
-    Model
-        With its provenance.
-
-    Raises
-    ------
-    InputFileError, SchemaVersionError
-        As `read_model`; the message begins with `source`.
-    """
+    """Return the model that `model_to_dict` wrote; unknown keys are ignored."""
     fields = check_schema(data, SCHEMA, VERSION, source)
     try:
         policies = _list(fields.get("policies"), "policies", MOST_POLICIES)

@@ -14,13 +14,7 @@ Result = TypeVar("Result")
 
 
 def save_npz(path: str | Path, values: Mapping[str, Any]) -> None:
-    """Write arrays by name.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Write arrays by name."""
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **values)
 
@@ -29,22 +23,6 @@ def load_npz(
     path: str | Path, what: str, max_bytes: int, read: Callable[[dict[str, np.ndarray]], Result]
 ) -> Result:
     """Return what `read` makes of the arrays of a file.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    what : str
-        What it should hold, for messages; in the plural.
-    max_bytes : int
-        A larger file is refused.
-    read : callable
-        From arrays by name to the value; whatever it raises is the file's fault.
-
-    Raises
-    ------
-    InputFileError
-        If the file is missing, too large or damaged.
 
     Examples
     --------

@@ -35,52 +35,33 @@ LEAST_SWING_DB = 3.0
 class DopplerSettings:
     """When Doppler counts as usable.
 
-    Parameters
-    ----------
-    min_windows : int
-        Fewest windows in the track.
-    min_share : float
-        Least share of windows in which the line was found.
-    min_lines : int
-        Fewest harmonics (median over windows); with 1 a single tone will do and their agreement is not
-        tested.
-    max_disagreement : float
-        Largest median reduced chi-squared of the harmonics against one fundamental.
-    relative_floor : float
-        Relative standard deviation added to every frequency: what even a steady engine does.
-    min_gain : float
-        By how much the S-curve's BIC must beat each rival's.
-    max_misfit : float
-        Largest reduced chi-squared of the S-curve.
-    min_level_gain, max_level_gain : float
-        Slope of the line's level against -20 log10 of the fitted range, 1 in free field, where that range
-        changes by 3 dB or more. An engine that slows down at the kerb keeps its level.
-    min_level_correlation : float
-        Least correlation of the two under the same condition. A gain in (-inf, inf) and a correlation of -1
-        skip the test.
-    max_std_m_s : float
-        Largest standard deviation of the radial speed (median over the track).
-    max_speed_m_s : float
-        Fastest vehicle. An engine that runs down while its vehicle passes reads as a faster one: in town, set
-        what is driven there.
-
     Examples
     --------
     >>> DopplerSettings(min_lines=3).min_lines
     3
     """
 
-    min_windows: int = 12
-    min_share: float = 0.6
+    min_windows: int = 12  # Fewest windows in the track
+    min_share: float = 0.6  # Least share of windows in which the line was found
+    # Fewest harmonics (median over windows); with 1 a single tone will do and their agreement is not
+    # tested.
     min_lines: int = 1
+    # Largest median reduced chi-squared of the harmonics against one fundamental.
     max_disagreement: float = 4.0
+    # Relative standard deviation added to every frequency: what even a steady engine does.
     relative_floor: float = 3e-4
-    min_gain: float = 10.0
-    max_misfit: float = 4.0
+    min_gain: float = 10.0  # By how much the S-curve's BIC must beat each rival's
+    max_misfit: float = 4.0  # Largest reduced chi-squared of the S-curve
+    # Slope of the line's level against -20 log10 of the fitted range, 1 in free field, where that range
+    # changes by 3 dB or more. An engine that slows down at the kerb keeps its level.
     min_level_gain: float = 0.4
     max_level_gain: float = 2.5
+    # Least correlation of the two under the same condition. A gain in (-inf, inf) and a correlation of -1
+    # skip the test.
     min_level_correlation: float = 0.8
-    max_std_m_s: float = 1.0
+    max_std_m_s: float = 1.0  # Largest standard deviation of the radial speed (median over the track)
+    # Fastest vehicle. An engine that runs down while its vehicle passes reads as a faster one: in town, set
+    # what is driven there.
     max_speed_m_s: float = 40.0
 
     def __post_init__(self) -> None:

@@ -33,23 +33,6 @@ MAX_SAMPLES = 200_000_000
 class HarmonicTrack:
     """A fundamental over time; windows without a usable tooth are left out.
 
-    Parameters
-    ----------
-    time_s : (K,) float
-        Centre of each window from the first sample, on the receiver's clock.
-    frequency_hz : (K,) float
-        Fundamental.
-    variance_hz2 : (K,) float
-        Of the fundamental, from the SNR of its teeth, widened where they disagree.
-    lines : (K,) int
-        Teeth that entered.
-    misfit : (K,) float
-        Reduced chi-squared of harmonic consistency; 0 with a single tooth, which proves nothing.
-    level_db : (K,) float
-        Power of all teeth, 10 log10, relative to samples of unit mean square.
-    windows : int
-        Number of windows looked at; K of them could be used.
-
     Examples
     --------
     >>> one = np.ones(1)
@@ -57,13 +40,14 @@ class HarmonicTrack:
     3
     """
 
-    time_s: FloatArray
-    frequency_hz: FloatArray
-    variance_hz2: FloatArray
-    lines: IndexArray
+    time_s: FloatArray  # Centre of each window from the first sample, on the receiver's clock
+    frequency_hz: FloatArray  # Fundamental
+    variance_hz2: FloatArray  # Of the fundamental, from the SNR of its teeth, widened where they disagree
+    lines: IndexArray  # Teeth that entered
+    # Reduced chi-squared of harmonic consistency; 0 with a single tooth, which proves nothing.
     misfit: FloatArray
-    level_db: FloatArray
-    windows: int
+    level_db: FloatArray  # Power of all teeth, 10 log10, relative to samples of unit mean square
+    windows: int  # Number of windows looked at; K of them could be used
 
 
 def track_fundamental(

@@ -28,42 +28,25 @@ MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 class HarmonicSettings:
     """What fundamental to look for, and how finely.
 
-    Parameters
-    ----------
-    low_hz, high_hz : float
-        Range of the fundamental; a firing frequency is 20 to 200 Hz.
-    band_high_hz : float
-        Highest tooth used.
-    max_harmonics : int
-        Most teeth used; 1 follows a single tone.
-    window_s, hop_s : float
-        Analysis window (Hann) and its step. The fundamental must be resolved: low_hz > 4 / window_s.
-    max_rate_hz : float
-        Largest relative change of the fundamental, |df/dt| / f, per second.
-    tooth_price : float
-        q, nats per tooth. An empty tooth has 0.6 nats of evidence on average: a lower price lets f / 2 win, a
-        much higher one 2 f where upper harmonics are missing.
-    floor_width_hz : float
-        Width of the running median that estimates the noise floor.
-    tooth_snr : float
-        Power over the floor from which a tooth enters the combined estimate.
-
     Examples
     --------
     >>> HarmonicSettings(low_hz=40.0).low_hz
     40.0
     """
 
-    low_hz: float = 25.0
+    low_hz: float = 25.0  # Range of the fundamental; a firing frequency is 20 to 200 Hz
     high_hz: float = 200.0
-    band_high_hz: float = 1200.0
-    max_harmonics: int = 20
+    band_high_hz: float = 1200.0  # Highest tooth used
+    max_harmonics: int = 20  # Most teeth used; 1 follows a single tone
+    # Analysis window (Hann) and its step. The fundamental must be resolved: low_hz > 4 / window_s.
     window_s: float = 0.25
     hop_s: float = 0.1
-    max_rate_hz: float = 0.4
+    max_rate_hz: float = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
+    # q, nats per tooth. An empty tooth has 0.6 nats of evidence on average: a lower price lets f / 2 win, a
+    # much higher one 2 f where upper harmonics are missing.
     tooth_price: float = 1.0
-    floor_width_hz: float = 250.0
-    tooth_snr: float = 15.0
+    floor_width_hz: float = 250.0  # Width of the running median that estimates the noise floor
+    tooth_snr: float = 15.0  # Power over the floor from which a tooth enters the combined estimate
 
     def __post_init__(self) -> None:
         in_range("low_hz", self.low_hz, 4.0 / self.window_s, np.inf)
@@ -86,19 +69,7 @@ def spectrum_and_floor(
     .. math:: P_k[b] = \Big| \sum_n x_k[n]\, e^{-j 2\pi b n / 4N} \Big|^2, \qquad
               \nu_k[b] = \frac{1}{\ln 2}\, \mathrm{median}_{b'}\, P_k[b'] \text{ around } b
 
-    Parameters
-    ----------
-    frames : (K, n) float
-        Windowed samples.
-    rate : float
-        Hz.
-    settings : HarmonicSettings
-        Band and width of the running median.
-
-    Returns
-    -------
-    powers, floor : ndarray, shape (K, bins)
-        Squared magnitudes, in the units of the windows squared.
+    Shapes: frames (K, n), returns (K, bins).
 
     References
     ----------
@@ -132,23 +103,7 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
 
     with Q of the module's head, i_k the place of f_k on the grid, and r the largest change in a hop.
 
-    Parameters
-    ----------
-    ratio : (K, bins) float
-        Power over noise floor.
-    bin_hz : float
-        Spacing of the bins.
-    settings : HarmonicSettings
-        Range, teeth and rate of change.
-
-    Returns
-    -------
-    ndarray, shape (K,)
-        Hz.
-
-    References
-    ----------
-    A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the path): see `harmonic_sum`.
+    Shapes: ratio (K, bins).
 
     Examples
     --------

@@ -31,17 +31,6 @@ REACH = 0.75
 class Fundamental:
     """What the teeth of K windows say together.
 
-    Parameters
-    ----------
-    frequency_hz, variance_hz2 : (K,) float
-        Fundamental and its variance, widened where the teeth disagree; no meaning without teeth.
-    lines : (K,) int
-        Teeth that entered.
-    misfit : (K,) float
-        Reduced chi-squared of the teeth; 0 with fewer than two.
-    power : (K,) float
-        Sum of the teeth's powers above the floor, in the units of the spectrum.
-
     Examples
     --------
     >>> one = np.ones(1)
@@ -49,27 +38,17 @@ class Fundamental:
     array([60.])
     """
 
+    # Fundamental and its variance, widened where the teeth disagree; no meaning without teeth.
     frequency_hz: FloatArray
     variance_hz2: FloatArray
-    lines: IndexArray
-    misfit: FloatArray
-    power: FloatArray
+    lines: IndexArray  # Teeth that entered
+    misfit: FloatArray  # Reduced chi-squared of the teeth; 0 with fewer than two
+    power: FloatArray  # Sum of the teeth's powers above the floor, in the units of the spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class Windows:
     """Samples of every window with the noise floor of their spectra.
-
-    Parameters
-    ----------
-    frames : (K, n) float
-        Samples, not windowed.
-    shape : (n,) float
-        The window.
-    floor : (K, bins) float
-        Noise power of the windowed, zero-padded spectra.
-    rate_hz : float
-        Sample rate.
 
     Examples
     --------
@@ -77,10 +56,10 @@ class Windows:
     array([-1.,  0.,  1.])
     """
 
-    frames: FloatArray
-    shape: FloatArray
-    floor: FloatArray
-    rate_hz: float
+    frames: FloatArray  # Samples, not windowed
+    shape: FloatArray  # The window
+    floor: FloatArray  # Noise power of the windowed, zero-padded spectra
+    rate_hz: float  # Sample rate
 
     @property
     def n(self) -> FloatArray:
@@ -96,24 +75,7 @@ def measure_fundamental(
     .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
               \mathrm{var}(\hat f) = \frac{\max(\chi^2, 1)}{\sum_h h^2 / \sigma_h^2}
 
-    Parameters
-    ----------
-    windows : Windows
-        K of them.
-    fundamental_hz, slope_hz_s : (K,) float
-        Track so far and its rate of change.
-    settings : HarmonicSettings
-        Which teeth count.
-
-    Returns
-    -------
-    Fundamental
-        One value a window.
-
-    References
-    ----------
-    Weighted least squares, from the definition; sigma_h is the first-order error of the maximum of D. C. Rife
-    and R. R. Boorstyn 1974: see `worldstate.frontend.approach.partials`.
+    Shapes: fundamental_hz, slope_hz_s (K,).
 
     Examples
     --------

@@ -32,24 +32,15 @@ ROUGH_EVALUATIONS, EVALUATIONS, FINALISTS = 12, 300, 2
 class PassBy:
     """A fitted pass-by.
 
-    Parameters
-    ----------
-    values : (4,) float
-        f_0 in Hz, v in m/s, tau_0 in seconds on the receiver's clock, d in metres.
-    covariance : (4, 4) float
-        Of these, from the information of the fit.
-    chi_squared : float
-        Sum of squared normalised residuals.
-
     Examples
     --------
     >>> PassBy(np.array([100.0, 12.0, 2.0, 5.0]), np.eye(4), chi_squared=36.0).values[1].item()
     12.0
     """
 
-    values: FloatArray
-    covariance: FloatArray
-    chi_squared: float
+    values: FloatArray  # f_0 in Hz, v in m/s, tau_0 in seconds on the receiver's clock, d in metres
+    covariance: FloatArray  # Of these, from the information of the fit
+    chi_squared: float  # Sum of squared normalised residuals
 
 
 def radial_speed_m_s(
@@ -59,24 +50,6 @@ def radial_speed_m_s(
 
     .. math:: v_r = \frac{v^2 s}{\sqrt{d^2 + v^2 s^2}}, \qquad
               s = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}, \quad T = t - \tau_0
-
-    Parameters
-    ----------
-    time_s : ndarray, any shape
-        Receiver's clock, seconds.
-    speed_m_s, closest_s, range_m : float
-        v, tau_0 (emission time) and d.
-    sound_m_s : float
-        c > v.
-
-    Returns
-    -------
-    ndarray, shape of `time_s`
-        m/s.
-
-    References
-    ----------
-    P. M. Morse and K. U. Ingard 1968, section 11.2: see `worldstate.frontend.approach.pass_by`.
 
     Examples
     --------
@@ -102,19 +75,7 @@ def fit_pass_by(
               \frac{\big[f_0 / (1 + v_r(t_k) / c) - f_k\big]^2}{\sigma_k^2}, \qquad
               \mathrm{cov} = (J^T J)^{-1}
 
-    Parameters
-    ----------
-    time_s, frequency_hz, std_hz : (K,) float
-        Track of the tone and its standard deviation.
-    max_speed_m_s : float
-        Upper limit of v.
-    sound_m_s : float
-        c.
-
-    Returns
-    -------
-    PassBy
-        The best of all starting points.
+    Shapes: time_s, frequency_hz, std_hz (K,).
 
     References
     ----------
@@ -156,23 +117,7 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: flo
     .. math:: \frac{\partial v_r}{\partial p_i} \approx \frac{v_r(p + h_i) - v_r(p - h_i)}{2 h_i}, \qquad
               h_i = 10^{-5} \max(1, |p_i|)
 
-    Parameters
-    ----------
-    time_s : (K,) float
-        Receiver's clock.
-    values : (4,) float
-        As in `PassBy`.
-    sound_m_s : float
-        c.
-
-    Returns
-    -------
-    ndarray, shape (K, 4)
-        m/s per unit of each parameter.
-
-    References
-    ----------
-    From the definition: central differences; f_0 does not enter.
+    Shapes: time_s (K,), values (4,).
 
     Examples
     --------

@@ -150,24 +150,7 @@ def climb(
 
     with P the projection off the columns of H, as in `estimate_tone`.
 
-    Parameters
-    ----------
-    y : (n,) float64 or complex128
-        Real samples are fitted by a cosine and a sine.
-    omega : float
-        Where to begin, radians a sample; within half a resolution, pi / n, of the peak.
-    bounds : (float, float)
-        Where to stay, radians a sample.
-    tolerance : float
-        A step below this share of the resolution is the last; where the fit is good, the next would be its
-        square.
-    steps : int
-        At most so many.
-
-    Returns
-    -------
-    float, complex
-        Radians a sample, and A exp(j phase) at the centre of the samples.
+    Shapes: y (n,).
 
     References
     ----------
@@ -196,22 +179,6 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
 
     .. math:: z_n = e^{j \omega (n - (N - 1) / 2)}
 
-    Parameters
-    ----------
-    omega : float
-        Radians a sample.
-    count : int
-        Number of samples.
-
-    Returns
-    -------
-    ndarray of complex128, shape (count,)
-        Of modulus one.
-
-    References
-    ----------
-    From the definition.
-
     Examples
     --------
     >>> np.angle(tone_wave(0.1, 2)).round(3)
@@ -226,10 +193,8 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
 def _step(
     y: FloatArray | ComplexArray, omega: float, n: FloatArray
 ) -> tuple[float, FloatArray | ComplexArray]:
-    """Least-squares step in frequency, the amplitude being refitted along with it (variable projection).
-
-    Everything is a product of few rows: the tone's H, its derivative by omega, and y.
-    """
+    """Least-squares step in frequency, the amplitude being refitted along with it (variable projection)."""
+    # Everything is a product of few rows: the tone's H, its derivative by omega, and y.
     rows = _rows(y, omega, n)
     gram = rows.conj() @ rows.T
     k = len(rows) // 2

@@ -45,52 +45,22 @@ _FEWEST_PERIODS = 4.0
 class ToneReading:
     """A tone that stands out of the noise.
 
-    Parameters
-    ----------
-    frequency_hz : float
-        Mean over the window, by the stream's own sample rate.
-    frequency_std_hz : float
-        From the bound at this SNR; a line that wanders within the window is known worse.
-    snr : float
-        eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from the noise around the line.
-    mean_square : float
-        A^2 / 2 of the averaged microphones, squared units of the samples.
-    age_s : float
-        How long before the end of the hop the middle of the window was, seconds.
-
     Examples
     --------
     >>> ToneReading(61.2, 0.02, 0.5, 1e-4, 0.5).frequency_hz
     61.2
     """
 
-    frequency_hz: float
+    frequency_hz: float  # Mean over the window, by the stream's own sample rate
+    # From the bound at this SNR; a line that wanders within the window is known worse.
     frequency_std_hz: float
-    snr: float
-    mean_square: float
-    age_s: float
+    snr: float  # eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from the noise around the line
+    mean_square: float  # A^2 / 2 of the averaged microphones, squared units of the samples
+    age_s: float  # How long before the end of the hop the middle of the window was, seconds
 
 
 class ToneStage:
     """Remembers the band of one averaged channel over the window; memory does not grow.
-
-    Parameters
-    ----------
-    array : MicrophoneArray
-        In the order of the channels.
-    sample_rate_hz : float
-        Samples per second.
-    band_hz : (float, float)
-        Where the line is looked for.
-    window_s : float
-        Length of the window.
-    n_channels : int
-        So many microphones are averaged: the living ones next to the middle of the array.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the band reaches half the sample rate or below four periods a window.
 
     Examples
     --------
@@ -130,19 +100,13 @@ class ToneStage:
 
         .. math:: y[m] = \sum_n h[n]\, \frac1{|C|} \sum_{i \in C} x_i[m D + n]
 
-        over the microphones C next to the middle.
-
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-            One hop.
-        mask : ChannelMask
-            Microphones that count.
+        Shapes: samples (n, M).
 
         References
         ----------
         From the definition; h and D as in `Decimator`, after J. F. Kaiser 1974.
         """
+        # over the microphones C next to the middle.
         if not np.array_equal(mask.keep, self._keep):
             self._weights, self._keep = self._mean_of(mask.keep)
         new = self._decimator.push(samples @ self._weights)
@@ -158,15 +122,6 @@ class ToneStage:
                   \sigma_f^2 = \frac{12\, f_s^2}{(2\pi)^2\, \eta\, N (N^2 - 1)}
 
         where :math:`\eta N / 2 > 18`.
-
-        Returns
-        -------
-        ToneReading or NotUsable
-            Not usable before the window is full, and where no line stands out.
-
-        References
-        ----------
-        D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.approach.tone`.
         """
         if self._n_out < len(self._heard):
             return NotUsable(f"needs {len(self._heard) / self._rate:.2f} s of sound")

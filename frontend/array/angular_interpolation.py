@@ -29,13 +29,6 @@ _TOLERANCE = 1e-7
 class AngularInterpolation:
     """Directions that are computed, and how the others follow.
 
-    Parameters
-    ----------
-    index : ndarray of int, shape (N,)
-        Among all directions.
-    spread : ndarray of float64, shape (N, directions)
-        Power at all directions is power at the nodes times this.
-
     Examples
     --------
     Two microphones: power is a constant and a wave, so that three directions say it all.
@@ -47,8 +40,8 @@ class AngularInterpolation:
     (3, True)
     """
 
-    index: IndexArray
-    spread: FloatArray
+    index: IndexArray  # shape (N,): Among all directions
+    spread: FloatArray  # shape (N, directions): Power at all directions is power at the nodes times this
 
     @classmethod
     def of(cls, vectors: Complex128Array) -> "AngularInterpolation | None":
@@ -58,19 +51,7 @@ class AngularInterpolation:
 
         with the kernel G of the module's head and N the directions chosen.
 
-        Parameters
-        ----------
-        vectors : ndarray of complex128, shape (bins, M, directions)
-            Steering vectors.
-
-        Returns
-        -------
-        AngularInterpolation or None
-            None where more than half of the directions would be needed.
-
-        References
-        ----------
-        N. J. Higham 1990 (the pivoting): see `worldstate.frontend.array.angular_interpolation`.
+        Shapes: vectors (bins, M, directions).
         """
         count = vectors.shape[2]
         rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)

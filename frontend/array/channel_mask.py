@@ -17,11 +17,6 @@ from worldstate.ground.typing import BoolArray, Complex64Array
 class ChannelMask:
     """Which microphones count.
 
-    Parameters
-    ----------
-    keep : ndarray of bool, shape (M,)
-        False for those left out.
-
     Examples
     --------
     >>> mask = ChannelMask(np.array([True, False, True, True]))
@@ -29,22 +24,11 @@ class ChannelMask:
     (3, 1.778, 2.0)
     """
 
-    keep: BoolArray
+    keep: BoolArray  # shape (M,): False for those left out
 
     @classmethod
     def all_of(cls, n_channels: int) -> "ChannelMask":
-        """Leave none out.
-
-        Parameters
-        ----------
-        n_channels : int
-            M.
-
-        Returns
-        -------
-        ChannelMask
-            A whole one.
-        """
+        """Leave none out."""
         return cls(np.ones(n_channels, bool))
 
     @property
@@ -71,38 +55,16 @@ class ChannelMask:
     def silence(self, spectra: Complex64Array) -> None:
         """Set the channels left out to zero in place, (..., M).
 
-        ``X_m = 0`` where microphone m does not count.
-
-        Parameters
-        ----------
-        spectra : ndarray of complex64, shape (..., M)
-            Changed in place.
-
-        References
-        ----------
-        From the definition.
+        Shapes: spectra (..., M).
         """
+        # ``X_m = 0`` where microphone m does not count.
         if not self.is_whole:
             spectra[..., ~self.keep] = 0.0
 
     def cross(self, matrices: Complex64Array) -> Complex64Array:
         """Return cross-spectra (..., M, M) without the channels left out; the same array if there are none.
 
-        ``R'_ij = k_i k_j R_ij`` with k one for the channels kept and else zero.
-
-        Parameters
-        ----------
-        matrices : ndarray of complex64, shape (..., M, M)
-            Left as they are.
-
-        Returns
-        -------
-        ndarray of complex64, shape (..., M, M)
-            Rows and columns of the channels left out are zero.
-
-        References
-        ----------
-        From the definition.
+        Shapes: matrices (..., M, M).
 
         Examples
         --------
@@ -110,6 +72,7 @@ class ChannelMask:
         array([[1., 0.],
                [0., 0.]], dtype=float32)
         """
+        # ``R'_ij = k_i k_j R_ij`` with k one for the channels kept and else zero.
         if self.is_whole:
             return matrices
         return np.asarray(matrices * (self.keep[:, None] & self.keep))

@@ -23,18 +23,6 @@ def mirror_reflection(array: MicrophoneArray) -> FloatArray | NotUsable:
 
     .. math:: T = I - 2 n n^T \text{ (planar)}, \qquad T = 2 a a^T - I \text{ (linear, level)}
 
-    Not usable where there is none in another azimuth, or where every azimuth is one.
-
-    Parameters
-    ----------
-    array : MicrophoneArray
-        Microphones.
-
-    Returns
-    -------
-    ndarray, shape (3, 3), or NotUsable
-        Its own inverse.
-
     References
     ----------
     A. S. Householder, "Unitary triangularization of a nonsymmetric matrix", J. ACM 5, 1958 (the reflection).
@@ -48,6 +36,7 @@ def mirror_reflection(array: MicrophoneArray) -> FloatArray | NotUsable:
            [ 0.,  1.,  0.],
            [ 0.,  0.,  1.]])
     """
+    # Not usable where there is none in another azimuth, or where every azimuth is one.
     if array.ambiguity == "none":
         return NotUsable("a three-dimensional array has no twin directions")
     if array.ambiguity == "up-down":
@@ -67,21 +56,7 @@ def mirror_azimuth_rad(reflection: FloatArray | NotUsable, azimuth_rad: float) -
 
     .. math:: \theta' = \mathrm{atan2}(u'_y, u'_x), \qquad u' = T\, (\cos\theta, \sin\theta, 0)^T
 
-    Parameters
-    ----------
-    reflection : ndarray, shape (3, 3), or NotUsable
-        From `mirror_reflection`.
-    azimuth_rad : float
-        Left positive.
-
-    Returns
-    -------
-    float or NotUsable
-        Radians.
-
-    References
-    ----------
-    From the definition.
+    Shapes: reflection (3, 3).
 
     Examples
     --------

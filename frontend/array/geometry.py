@@ -23,15 +23,6 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
 
-    Parameters
-    ----------
-    azimuths_rad, elevations_rad : array_like, broadcast together
-        Azimuth, left positive, and elevation, up positive.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-
     References
     ----------
     From the definition: spherical coordinates on the axes of REP-103, 2010.
@@ -54,17 +45,7 @@ def nearest_spacings_m(positions_m: FloatArray) -> FloatArray:
 
     .. math:: d_m = \min_{j \ne m} \|p_m - p_j\|
 
-    Parameters
-    ----------
-    positions_m : ndarray, shape (M, 3)
-
-    Returns
-    -------
-    ndarray, shape (M,)
-
-    References
-    ----------
-    From the definition.
+    Shapes: positions_m (M, 3).
 
     Examples
     --------
@@ -83,29 +64,17 @@ def ambiguity(positions_m: FloatArray) -> Ambiguity:
     last, an array is linear for :math:`s_2 < 10^{-3} s_1` and else planar for :math:`s_3 < 10^{-3} s_1`,
     across the road for :math:`|n_x| > 0.985` and flat for :math:`|n_z| > 0.985`.
 
-    A linear array knows only the angle to its axis (``cone``). A planar one cannot tell a direction from its
-    mirror image in its own plane: ``front-back`` if it stands across the road, ``up-down`` if it lies flat,
-    ``mirror`` if it is tilted or faces sideways. A three-dimensional array has no such twin (``none``).
-
-    Parameters
-    ----------
-    positions_m : ndarray, shape (M, 3)
-
-    Returns
-    -------
-    str
-        ``cone``, ``front-back``, ``up-down``, ``mirror`` or ``none``.
-
-    References
-    ----------
-    Derived here: delays hold u in the products p . u only, so that its part across a line or a plane shows
-    nowhere, or with either sign.
+    Shapes: positions_m (M, 3).
 
     Examples
     --------
     >>> ambiguity(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]))
     'front-back'
     """
+    # A linear array knows only the angle to its axis (``cone``). A planar one cannot tell a direction from
+    # its mirror image in its own plane: ``front-back`` if it stands across the road, ``up-down`` if it lies
+    # flat, ``mirror`` if it is tilted or faces sideways. A three-dimensional array has no such twin
+    # (``none``).
     spread, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=True)[1:]
     thickness = np.pad(spread, (0, 3 - len(spread)))
     if thickness[1] < _FLAT * thickness[0]:

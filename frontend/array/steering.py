@@ -23,20 +23,6 @@ class Steering:
     .. math:: y_t[k, \theta] = \sum_m \overline{a_{k,m}(\theta)}\, x_{t,k,m}
               \approx \big(x_{t,k}^T B_k\big)\, C_k(\theta)
 
-    Beams across azimuth at one elevation, below the alias frequency, span few of the M dimensions (15 to 20
-    of 56), so that B (M x r) and C (r x directions) cost a third of W = B C. The rest is cut where no
-    steering vector is missed by more than 1e-6 of its length: nothing that single precision would show.
-
-    Parameters
-    ----------
-    basis : ndarray of complex64, shape (bins, M, r), or None
-        Orthonormal columns; None where the factors would not be thinner than the weights.
-    weights, conjugate : ndarray of complex64, shape (bins, r or M, directions)
-        C and its conjugate.
-    nodes : NodeBeams, optional
-        The same beams at the few directions that say the power at all the others; None where there are no
-        such few.
-
     Examples
     --------
     >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5, 1.0])
@@ -44,9 +30,16 @@ class Steering:
     (3, True)
     """
 
+    # Beams across azimuth at one elevation, below the alias frequency, span few of the M dimensions (15 to 20
+    # of 56), so that B (M x r) and C (r x directions) cost a third of W = B C. The rest is cut where no
+    # steering vector is missed by more than 1e-6 of its length: nothing that single precision would show.
+
+    # shape (bins, M, r): Orthonormal columns; None where the factors would not be thinner than the weights.
     basis: Complex64Array | None
-    weights: Complex64Array
+    weights: Complex64Array  # shape (bins, r or M, directions): C and its conjugate
     conjugate: Complex64Array
+    # The same beams at the few directions that say the power at all the others; None where there are no
+    # such few.
     nodes: "NodeBeams | None" = None
 
     @classmethod
@@ -62,21 +55,7 @@ class Steering:
 
         .. math:: W_k = \overline{A_k}, \qquad W_k \approx B_k C_k, \quad C_k = B_k^H W_k
 
-        Parameters
-        ----------
-        array : MicrophoneArray
-            Microphones.
-        frequencies_hz : array_like, shape (bins,)
-            Hz.
-        azimuths_rad, elevations_rad : array_like, broadcast to shape (directions,)
-            Azimuth, left positive, and elevation, up positive.
-        speed_of_sound_m_s : float
-            c.
-
-        Returns
-        -------
-        Steering
-            In coordinates centred on the array.
+        Shapes: frequencies_hz (bins,), azimuths_rad, elevations_rad (directions,).
 
         References
         ----------
@@ -104,19 +83,7 @@ class Steering:
 
         .. math:: Q_k = \sum_t (B_k^T x_{t,k}) (B_k^T x_{t,k})^H
 
-        Parameters
-        ----------
-        spectra : ndarray of complex64, shape (frames, bins, M)
-            Whitened or not.
-
-        Returns
-        -------
-        ndarray of complex64, shape (bins, r, r)
-            Hermitian.
-
-        References
-        ----------
-        From the definition.
+        Shapes: spectra (frames, bins, M).
         """
         by_bin = spectra.transpose(1, 0, 2)
         projected = by_bin if self.basis is None else by_bin @ self.basis
@@ -125,19 +92,7 @@ class Steering:
     def compress(self, matrices: Complex64Array) -> Complex64Array:
         r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r).
 
-        Parameters
-        ----------
-        matrices : ndarray of complex64, shape (bins, M, M)
-            Any, not only Hermitian ones.
-
-        Returns
-        -------
-        ndarray of complex64, shape (bins, r, r)
-            The same where there is no basis.
-
-        References
-        ----------
-        Derived here: W = B C turns a form in W into one in C.
+        Shapes: matrices (bins, M, M).
         """
         if self.basis is None:
             return matrices
@@ -148,19 +103,7 @@ class Steering:
 
         .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
 
-        Parameters
-        ----------
-        matrices : ndarray of complex64, shape (bins, r, r)
-            In coordinates of the basis.
-
-        Returns
-        -------
-        ndarray of complex128, shape (directions,)
-            Real for Hermitian matrices.
-
-        References
-        ----------
-        From the definition of beam power; at most directions by the `nodes`, exact to single precision.
+        Shapes: matrices (bins, r, r).
         """
         beams = self if self.nodes is None else self.nodes
         products = matrices @ beams.conjugate
@@ -173,15 +116,7 @@ class Steering:
 
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
 
-        Parameters
-        ----------
-        vectors : ndarray of complex64, shape (bins, M, k)
-            Orthonormal columns E.
-
-        Returns
-        -------
-        ndarray of float64, shape (bins, directions)
-            From 0 to M.
+        Shapes: vectors (bins, M, k).
 
         References
         ----------
@@ -198,19 +133,7 @@ class Steering:
 
         .. math:: \|a_k(\theta)\|^2 = \sum_{m \in kept} |a_{k,m}(\theta)|^2
 
-        Parameters
-        ----------
-        keep : ndarray of bool, shape (M,)
-            Microphones that count.
-
-        Returns
-        -------
-        ndarray of float64, shape (bins, directions)
-            Their number, where beams are not whitened.
-
-        References
-        ----------
-        From the definition.
+        Shapes: keep (M,).
         """
         if self.basis is None:
             kept = self.weights[:, keep]
@@ -224,13 +147,6 @@ class Steering:
 class NodeBeams:
     """Beams at a few directions: see `worldstate.frontend.array.angular_interpolation`.
 
-    Parameters
-    ----------
-    weights, conjugate : ndarray of complex64, shape (bins, r or M, N)
-        C at the nodes, and its conjugate.
-    spread : ndarray of float64, shape (N, directions)
-        From power there to power everywhere.
-
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
@@ -239,9 +155,9 @@ class NodeBeams:
     (True, 61)
     """
 
-    weights: Complex64Array
+    weights: Complex64Array  # shape (bins, r or M, N): C at the nodes, and its conjugate
     conjugate: Complex64Array
-    spread: FloatArray
+    spread: FloatArray  # shape (N, directions): From power there to power everywhere
 
     @classmethod
     def of(cls, weights: Complex128Array) -> "NodeBeams | None":
@@ -249,19 +165,7 @@ class NodeBeams:
 
         .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta)
 
-        Parameters
-        ----------
-        weights : ndarray of complex128, shape (bins, r or M, directions)
-            Beams in coordinates of the basis.
-
-        Returns
-        -------
-        NodeBeams or None
-            None where too many would be needed.
-
-        References
-        ----------
-        N. J. Higham 1990: see `worldstate.frontend.array.angular_interpolation`.
+        Shapes: weights (bins, r or M, directions).
         """
         nodes = AngularInterpolation.of(weights)
         if nodes is None:
@@ -271,11 +175,9 @@ class NodeBeams:
 
 
 def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:
-    """Find orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance.
-
-    Gram-Schmidt with pivoting: the vector that is missed most is the next column. None if `max_rank` are
-    not enough.
-    """
+    """Find orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance."""
+    # Gram-Schmidt with pivoting: the vector that is missed most is the next column. None if `max_rank` are
+    # not enough.
     missed = weights.copy()
     columns: list[Complex128Array] = []
     limit = _TOLERANCE * np.sqrt(weights.shape[1])
@@ -296,19 +198,7 @@ def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | No
 def cross_spectra(spectra: Complex64Array) -> Complex64Array:
     r"""Sum over frames :math:`R_{ij} = \sum_t x_{t,i} \overline{x_{t,j}}`, (bins, frames, M) -> (bins, M, M).
 
-    Parameters
-    ----------
-    spectra : ndarray of complex64, shape (bins, frames, M)
-        x.
-
-    Returns
-    -------
-    ndarray of complex64, shape (bins, M, M)
-        Hermitian.
-
-    References
-    ----------
-    From the definition.
+    Shapes: spectra (bins, frames, M).
 
     Examples
     --------

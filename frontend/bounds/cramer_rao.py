@@ -163,26 +163,6 @@ def bearing_information(
     .. math:: J = \frac{8\pi^2 N}{c^2} \Big(\sum_b f_b^2\,\mathrm{SNR}_b\Big)\, D^T S D,
               \qquad D = [\dot u_\theta\ \dot u_\phi]
 
-    Parameters
-    ----------
-    positions_m, azimuth_rad, frequencies_hz, snr, snapshots, elevation_rad, random_signal, speed_of_sound_m_s
-        As for `bearing_crb_rad2`.
-
-    Returns
-    -------
-    (2, 2) float
-        Per radian squared.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On wrong shapes or values out of range.
-
-    References
-    ----------
-    Van Trees 2002, Stoica and Nehorai 1990: see `bearing_crb_rad2`. The first entry, for an array in the y-z
-    plane, is the inverse of eq. (crbtheta) of the paper.
-
     Examples
     --------
     >>> bearing_information(0.1 * np.eye(3), 0.0, 1000.0, 10.0, 1).round(1)
@@ -212,26 +192,7 @@ def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> Floa
     presence and on the radial speed does not depend on the bearing: what remains of a laterally approaching
     source is that it is there, how fast it comes and its coarse side.
 
-    Parameters
-    ----------
-    positions_m : (M, 3) float
-        Microphones in `base_link` axes, metres.
-    azimuths_rad : (...) float
-        Directions asked for, at elevation 0.
-
-    Returns
-    -------
-    (...) float
-        In [0, 1].
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the microphones have no horizontal extent.
-
-    References
-    ----------
-    Corollary (cor:endfire) of the paper.
+    Shapes: positions_m (M, 3).
 
     Examples
     --------
@@ -250,25 +211,7 @@ def broadside_rad(positions_m: ArrayLike) -> float:
 
     .. math:: \theta = \arg\max_\theta \dot u_\theta^T S\, \dot u_\theta
 
-    Parameters
-    ----------
-    positions_m : (M, 3) float
-        Microphones in `base_link` axes, metres.
-
-    Returns
-    -------
-    float
-        In (-pi/2, pi/2]; any direction where all are equal.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the microphones have no horizontal extent.
-
-    References
-    ----------
-    Derived here: the information of eq. (crbtheta) of the paper is greatest where the bearing turns the wave
-    along the array's longest horizontal axis.
+    Shapes: positions_m (M, 3).
 
     Examples
     --------

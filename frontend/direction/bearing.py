@@ -19,24 +19,15 @@ _MIN_COSINE = 0.2
 class AcousticBearing:
     """Peak of a spatial spectrum as a measurement.
 
-    Parameters
-    ----------
-    azimuth_rad : float
-        Left positive.
-    std_rad : float
-        Standard deviation.
-    prominence : float
-        Peak-to-median ratio, >= 1; 1 in silence.
-
     Examples
     --------
     >>> AcousticBearing(0.3, 0.06, 1.4).std_rad
     0.06
     """
 
-    azimuth_rad: float
-    std_rad: float
-    prominence: float
+    azimuth_rad: float  # Left positive
+    std_rad: float  # Standard deviation
+    prominence: float  # Peak-to-median ratio, >= 1; 1 in silence
 
 
 def bearing_std_rad(
@@ -47,29 +38,6 @@ def bearing_std_rad(
     .. math:: \sigma = \min\Big( \frac{\sigma_0}{\max(\cos\theta, 0.2)}
               \sqrt{1 + \Big(\frac{0.15}{\rho - 1}\Big)^2},\; \frac{\Delta}{\sqrt{12}} \Big)
 
-    sigma_0 is what a prominent line-of-sight source shows on the road; the cosine is the geometry of eq.
-    (crbtheta); the root lets the prominence rho fade into ignorance, which is uniform over the searched
-    span Delta. An empirical model, not a bound.
-
-    Parameters
-    ----------
-    azimuth_rad : float
-        From broadside of an array that faces forward.
-    prominence : float
-        rho, peak-to-median ratio.
-    broadside_std_rad, span_rad : float
-        sigma_0 and Delta.
-
-    Returns
-    -------
-    float
-        Radians, at most the span over sqrt(12).
-
-    References
-    ----------
-    Derived here: the cosine from eq. (crbtheta) of the paper, the last term from a uniform distribution; the
-    root between them is empirical.
-
     Examples
     --------
     >>> cases = ((0, 3.0), (60, 3.0), (0, 1.05))
@@ -77,6 +45,9 @@ def bearing_std_rad(
     >>> np.degrees(sigma).round(1)
     array([ 3.4,  6.8, 10.8])
     """
+    # sigma_0 is what a prominent line-of-sight source shows on the road; the cosine is the geometry of eq.
+    # (crbtheta); the root lets the prominence rho fade into ignorance, which is uniform over the searched
+    # span Delta. An empirical model, not a bound.
     uniform = span_rad / np.sqrt(12.0)
     excess = prominence - 1.0
     if excess <= 0.0:
@@ -94,21 +65,7 @@ def strongest_bearing(
 
     with the standard deviation of `bearing_std_rad`.
 
-    Parameters
-    ----------
-    spectrum, azimuths_rad : ndarray, shape (A,)
-        Azimuths ascending and evenly spaced.
-    broadside_std_rad : float
-        sigma_0 of `bearing_std_rad`.
-
-    Returns
-    -------
-    AcousticBearing
-        Interpolated between the points of the grid.
-
-    References
-    ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001 (the bearing): see `worldstate.frontend.direction.srp`.
+    Shapes: spectrum, azimuths_rad (A,).
 
     Examples
     --------
@@ -124,32 +81,15 @@ def strongest_bearing(
 def bearing_of(peaks: Sequence[Peak], azimuths_rad: FloatArray, broadside_std_rad: float) -> AcousticBearing:
     """Take the first of the peaks that were found on a grid, highest first, for a bearing.
 
-    ``theta = theta_1`` with ``sigma = bearing_std_rad(theta_1, rho_1)``; in silence ``theta = (first + last)
-    / 2`` with ``sigma = span / sqrt(12)``.
-
-    Parameters
-    ----------
-    peaks : sequence of Peak
-        Highest first; none in silence.
-    azimuths_rad : ndarray, shape (A,)
-        The grid, ascending.
-    broadside_std_rad : float
-        sigma_0 of `bearing_std_rad`.
-
-    Returns
-    -------
-    AcousticBearing
-        In silence the middle of the grid, with its span's uncertainty.
-
-    References
-    ----------
-    From the definition; in silence the mean and deviation of a uniform distribution over the grid.
+    Shapes: azimuths_rad (A,).
 
     Examples
     --------
     >>> bearing_of([Peak(0.3, 0.5, 2.0)], np.linspace(-1.5, 1.5, 31), 0.06).prominence
     2.0
     """
+    # ``theta = theta_1`` with ``sigma = bearing_std_rad(theta_1, rho_1)``; in silence ``theta = (first +
+    # last) / 2`` with ``sigma = span / sqrt(12)``.
     span = float(azimuths_rad[-1] - azimuths_rad[0])
     if not peaks:
         middle = float(0.5 * (azimuths_rad[0] + azimuths_rad[-1]))

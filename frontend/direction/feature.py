@@ -55,28 +55,6 @@ def feature_steering(
 
     .. math:: w_k(\theta_i) = \overline{a_k(\theta_i)}, \qquad \theta_i = 90^\circ - i\, 180^\circ / 29
 
-    Parameters
-    ----------
-    array : MicrophoneArray
-        Microphones.
-    bins : range
-        Of the one-sided spectrum: see `band_bins`.
-    sample_rate_hz : float
-        Samples per second.
-    nfft : int
-        Frame length, samples.
-    speed_of_sound_m_s : float
-        c.
-
-    Returns
-    -------
-    Steering
-        Thirty directions, from left to right.
-
-    References
-    ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
-
     Examples
     --------
     >>> feature_steering(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), range(1, 16), 47_998).n_directions
@@ -92,19 +70,7 @@ def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
     .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
               \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta)
 
-    Parameters
-    ----------
-    whitened : ndarray of complex64, shape (frames, bins, M)
-    steering : Steering
-        For the same bins.
-
-    Returns
-    -------
-    ndarray of complex128, shape (directions,)
-
-    References
-    ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
+    Shapes: whitened (frames, bins, M).
 
     Examples
     --------
@@ -121,21 +87,7 @@ def pair_sum_of(matrices: Complex64Array, steering: Steering) -> Complex128Array
 
     .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
 
-    Parameters
-    ----------
-    matrices : ndarray of complex64, shape (bins, M, M)
-        Sums of x_i conj(x_j) over frames, whitened.
-    steering : Steering
-        For the same bins.
-
-    Returns
-    -------
-    ndarray of complex128, shape (directions,)
-        As `pair_sum`.
-
-    References
-    ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
+    Shapes: matrices (bins, M, M).
 
     Examples
     --------
@@ -155,21 +107,7 @@ def segment_feature(
 
     .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_s S_s(\theta) \Big|, \qquad P = M (M - 1) / 2
 
-    Parameters
-    ----------
-    sums : sequence of ndarray of complex128, shape (directions,)
-        Pair sums that make up the segment.
-    n_frames, n_bins, n_microphones : int
-        What they were summed over, all sums together.
-
-    Returns
-    -------
-    ndarray of float64, shape (directions,)
-        0..1.
-
-    References
-    ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
+    Shapes: sums (directions,).
 
     Examples
     --------

@@ -61,21 +61,6 @@ class PairDelays:
 def all_pairs(microphones: int) -> IndexArray:
     """Return every pair i < j, shape (M (M - 1) / 2, 2).
 
-    Parameters
-    ----------
-    microphones : int
-        M >= 2.
-
-    Returns
-    -------
-    ndarray of int, shape (M (M - 1) / 2, 2)
-        In the order of `numpy.triu_indices`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        With fewer than two microphones.
-
     Examples
     --------
     >>> all_pairs(3).tolist()
@@ -91,24 +76,7 @@ def pair_coherence(spectra: ArrayLike, pairs: ArrayLike) -> FloatArray:
 
     .. math:: C_{ij}(f) = |G_{ij}|^2 / (G_{ii} G_{jj})
 
-    With K independent frames its mean is about 1/K where there is no common signal; one frame always gives 1.
-
-    Parameters
-    ----------
-    spectra : (frames, bins, M) complex
-        STFT of the microphones.
-    pairs : (P, 2) int
-        Microphone indices.
-
-    Returns
-    -------
-    (P, bins) float
-        In [0, 1]; 0 where a microphone is silent.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On a wrong shape, non-finite spectra or an index out of range.
+    Shapes: spectra (frames, bins, M), pairs (P, 2).
 
     References
     ----------
@@ -120,6 +88,8 @@ def pair_coherence(spectra: ArrayLike, pairs: ArrayLike) -> FloatArray:
     >>> pair_coherence(np.concatenate([x, 2 * x], axis=2), [[0, 1]]).round(6)
     array([[1., 1., 1., 1.]])
     """
+    # With K independent frames its mean is about 1/K where there is no common signal; one frame always
+    # gives 1.
     X = finite_complex("spectra", spectra, (None, None, None))
     index = _checked_pairs(pairs, X.shape[2])
     return _coherence(*_moments(X, index))

@@ -25,44 +25,20 @@ from worldstate.ground.typing import ComplexArray, FloatArray, RealArray
 class Subspace:
     """Signal subspace of every bin.
 
-    Parameters
-    ----------
-    vectors : (bins, M, k) complex
-        Orthonormal columns, strongest last.
-    eigenvalues : (bins, k) float
-        Power along them, ascending.
-
     Examples
     --------
     >>> Subspace(np.array([[[0.0], [1.0]]]), np.array([[5.0]])).vectors.shape
     (1, 2, 1)
     """
 
-    vectors: ComplexArray
-    eigenvalues: RealArray
+    vectors: ComplexArray  # Orthonormal columns, strongest last
+    eigenvalues: RealArray  # Power along them, ascending
 
 
 def covariance(spectra: ArrayLike) -> ComplexArray:
     r"""Average the spatial covariance over frames: :math:`R_b = \langle x_b x_b^H \rangle`.
 
-    Parameters
-    ----------
-    spectra : (frames, bins, M) complex
-        STFT of the microphones.
-
-    Returns
-    -------
-    (bins, M, M) complex
-        Hermitian, single precision if the spectra are.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On a wrong shape, no frames or non-finite values.
-
-    References
-    ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
+    Shapes: spectra (frames, bins, M).
 
     Examples
     --------
@@ -81,27 +57,7 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
     the Gram matrix :math:`X^H X / T` (T x T), and :math:`E_s = X V \Lambda^{-1/2} / \sqrt T`: exact, and (M /
     T)^3 cheaper.
 
-    Parameters
-    ----------
-    spectra : (frames, bins, M) complex
-        STFT of the microphones.
-    sources : int
-        Dimension k of the subspace, 1 <= k < M and k <= frames.
-
-    Returns
-    -------
-    Subspace
-        Of the sample covariance.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On a wrong shape, non-finite values or a dimension out of range.
-
-    References
-    ----------
-    R. O. Schmidt 1986: see `music`; L. Sirovich, "Turbulence and the dynamics of coherent
-    structures", Quart. Appl. Math. 45, 1987 (the smaller eigenproblem).
+    Shapes: spectra (frames, bins, M).
 
     Examples
     --------
@@ -131,26 +87,7 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
 
     .. math:: R\, e_i = \lambda_i e_i, \quad \lambda_i \le \lambda_{i+1}, \qquad E_s = [e_{M-k+1} \dots e_M]
 
-    Parameters
-    ----------
-    covariance_matrix : (bins, M, M) complex
-        Hermitian.
-    sources : int
-        Dimension k, 1 <= k < M.
-
-    Returns
-    -------
-    Subspace
-        The k strongest eigenpairs of each bin.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On a wrong shape, non-finite values or a dimension out of range.
-
-    References
-    ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
+    Shapes: covariance_matrix (bins, M, M).
 
     Examples
     --------
@@ -234,22 +171,7 @@ def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
 def checked_covariance(covariance_matrix: ArrayLike, sources: int) -> ComplexArray:
     """Return covariances (bins, M, M) that are finite and large enough for a subspace of this dimension.
 
-    Parameters
-    ----------
-    covariance_matrix : array_like, shape (bins, M, M)
-        Complex.
-    sources : int
-        Dimension of the signal subspace, below M.
-
-    Returns
-    -------
-    ndarray of complex, shape (bins, M, M)
-        Single precision stays single.
-
-    Raises
-    ------
-    InvalidArgumentError
-        Otherwise.
+    Shapes: covariance_matrix (bins, M, M).
 
     Examples
     --------

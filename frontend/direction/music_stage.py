@@ -19,23 +19,15 @@ from .subspace import SubspaceTracker
 class MusicReading:
     """What MUSIC says of one window.
 
-    Parameters
-    ----------
-    azimuth_rad : float
-        Highest peak, left positive.
-    prominence : float
-        Its ratio to the median of the spectrum.
-    spectrum : ndarray of float64, shape (A,)
-        Over the grid of azimuths, the highest over elevations; every bin counts alike: at most 1.
-
     Examples
     --------
     >>> MusicReading(0.3, 4.0, np.ones(3)).azimuth_rad
     0.3
     """
 
-    azimuth_rad: float
-    prominence: float
+    azimuth_rad: float  # Highest peak, left positive
+    prominence: float  # Its ratio to the median of the spectrum
+    # shape (A,): Over the grid of azimuths, the highest over elevations; every bin counts alike: at most 1.
     spectrum: FloatArray
 
 
@@ -44,24 +36,6 @@ class MusicStage:
 
     Fed with prewhitened spectra and read with prewhitened beams it is the generalised eigenvalue form: the
     eigenvectors of :math:`R^{-1/2} R_x R^{-1/2}`, R being the noise (`prewhitening`).
-
-    Parameters
-    ----------
-    beams : Steering
-        At the directions of the grid, elevation by elevation.
-    azimuths_rad : ndarray, shape (A,)
-        Ascending, evenly spaced; the number of directions is a multiple of A.
-    sources : int
-        Dimension of the signal subspace, 1 to M - 1.
-    n_microphones : int
-        M.
-    window_hops : int
-        Hops in the window.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are not more microphones than sources.
 
     Examples
     --------
@@ -97,16 +71,7 @@ class MusicStage:
 
         .. math:: R_k = \sum_{t \in window} x_{t,k}\, x_{t,k}^H
 
-        Parameters
-        ----------
-        spectra : ndarray of complex64, shape (frames, K, M)
-            One hop.
-        beams : Steering or None
-            Where the spectra are whitened, the beams whitened alike.
-
-        References
-        ----------
-        R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
+        Shapes: spectra (frames, K, M).
         """
         by_bin = spectra.transpose(1, 0, 2)
         np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.open_slot())
@@ -118,20 +83,6 @@ class MusicStage:
 
         .. math:: P(\theta) = \frac1K \sum_k \frac{\min_{\theta'} D_k(\theta')}{D_k(\theta)}, \qquad
                   D_k = \|a_k\|^2 - \|E_k^H a_k\|^2
-
-        Parameters
-        ----------
-        mask : ChannelMask
-            Microphones that count.
-
-        Returns
-        -------
-        MusicReading or NotUsable
-            Not usable before the window is full.
-
-        References
-        ----------
-        R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
         """
         if mask.n_kept <= self._sources:
             return NotUsable(f"{mask.n_kept} microphones left for {self._sources} sources")

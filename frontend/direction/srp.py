@@ -54,21 +54,7 @@ def normalised(total: FloatArray, n_frames: int, n_bins: int, n_microphones: int
 
     .. math:: P(\theta) = \frac{\max(S(\theta), 0)}{T K M^2}
 
-    Parameters
-    ----------
-    total : ndarray, shape (directions,)
-        From `steered_power`.
-    n_frames, n_bins, n_microphones : int
-        What it was summed over.
-
-    Returns
-    -------
-    ndarray of float64, shape (directions,)
-        0..1.
-
-    References
-    ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.direction.srp`.
+    Shapes: total (directions,).
 
     Examples
     --------

@@ -34,27 +34,6 @@ _LEAST_GAP = 1e-4
 class SubspaceTracker:
     r"""Follows the k strongest eigenvectors of a running covariance.
 
-    Parameters
-    ----------
-    sources : int
-        Dimension k of the signal subspace.
-    guard : int
-        Extra columns carried along: what counts as noise begins below them.
-    tolerance : float
-        Largest angle, by its bound, between the subspace found and the true one before a bin is decomposed in
-        full.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a setting is out of range.
-
-    Notes
-    -----
-    Sources: Y. Zhou, Y. Saad, M. Tiago and J. Chelikowsky, "Self-consistent-field calculations using
-    Chebyshev-filtered subspace iteration", J. Comput. Phys. 219, 2006; C. Davis and W. Kahan, "The rotation
-    of eigenvectors by a perturbation III", 1970.
-
     Examples
     --------
     >>> tracker = SubspaceTracker(sources=1)
@@ -64,6 +43,10 @@ class SubspaceTracker:
     >>> tracker.full_decompositions
     1
     """
+
+    # Sources: Y. Zhou, Y. Saad, M. Tiago and J. Chelikowsky, "Self-consistent-field calculations using
+    # Chebyshev-filtered subspace iteration", J. Comput. Phys. 219, 2006; C. Davis and W. Kahan, "The rotation
+    # of eigenvectors by a perturbation III", 1970.
 
     def __init__(self, sources: int, *, guard: int = 3, tolerance: float = 0.05) -> None:
         if sources < 1 or guard < 0:
@@ -83,24 +66,7 @@ class SubspaceTracker:
 
         with the Chebyshev polynomial T_m, the edge of the noise c and the probe r.
 
-        Parameters
-        ----------
-        covariance : (bins, M, M) complex
-            Hermitian. Another shape than last time starts anew.
-
-        Returns
-        -------
-        Subspace
-            k eigenpairs per bin, strongest last.
-
-        Raises
-        ------
-        InvalidArgumentError
-            On a wrong shape or non-finite values.
-
-        References
-        ----------
-        Y. Zhou et al. 2006 (the filter), C. Davis and W. Kahan 1970 (the bound): see `SubspaceTracker`.
+        Shapes: covariance (bins, M, M).
         """
         return self.follow(checked_covariance(covariance, self._sources))
 
@@ -109,19 +75,7 @@ class SubspaceTracker:
 
         .. math:: V \leftarrow \mathrm{Ritz}\big(T_m(2 R / c - I)\, [V, r]\big)
 
-        Parameters
-        ----------
-        R : ndarray of complex, shape (bins, M, M)
-            Hermitian, finite.
-
-        Returns
-        -------
-        Subspace
-            As `update`.
-
-        References
-        ----------
-        Y. Zhou et al. 2006 (the filter), C. Davis and W. Kahan 1970 (the bound): see `SubspaceTracker`.
+        Shapes: R (bins, M, M).
         """
         width = min(self._sources + self._guard, R.shape[1] - 1)
         if self._basis is None or self._values is None or self._basis.shape != (len(R), width, R.shape[1]):

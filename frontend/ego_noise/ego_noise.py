@@ -113,24 +113,6 @@ class EgoNoiseSettings:
 class EgoNoise:
     """Learns the ego-noise of a stream and whitens its spectra, hop by hop.
 
-    Until something from below has been learned, spectra are what they were, bit for bit. Set `weight` to the
-    probability that no source is there: it holds for all hops from then on.
-
-    Parameters
-    ----------
-    settings : EgoNoiseSettings
-        Speed, guard and strength.
-    frames_per_s : float
-        Frames of the transform a second.
-    n_microphones : int
-        M.
-    beams : sequence of (Steering, slice)
-        Beams to keep whitened, each with its bins among those of the spectra.
-    engine : HarmonicCanceller, optional
-        For the bins of the beams, from the first to the last.
-    elevation_split : ElevationSplit, optional
-        For these bins; without it all that is learned counts as from below.
-
     Examples
     --------
     >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -143,6 +125,9 @@ class EgoNoise:
     >>> round(ego.learned_frames, 1), whitened.shape
     (39.6, (20, 1, 2))
     """
+
+    # Until something from below has been learned, spectra are what they were, bit for bit. Set `weight` to
+    # the probability that no source is there: it holds for all hops from then on.
 
     def __init__(
         self,
@@ -188,20 +173,7 @@ class EgoNoise:
         with the lines l of the engine and the covariance R learned so far, shrunk as far as it is the
         street's.
 
-        Parameters
-        ----------
-        spectra : ndarray of complex64, shape (frames, bins, M)
-            One hop.
-
-        Returns
-        -------
-        list of (ndarray of complex64, shape (frames, its bins, M), Steering)
-            For each set of beams.
-
-        References
-        ----------
-        K. Nakamura et al. 2009 (whitening), B. Widrow et al. 1975 (cancelling), Y. Chen et al. 2010
-        (shrinkage): see `prewhitening` and `harmonic_cancellation`.
+        Shapes: spectra (frames, bins, M).
         """
         heard = spectra[:, self._bins]
         if self.engine is not None:
@@ -221,17 +193,7 @@ class EgoNoise:
 
         with u in [0, 1], how far what was learned is used.
 
-        Parameters
-        ----------
-        power : ndarray of float64, shape (directions,)
-            Of the first set of beams, summed over the frames of the hop that was processed last.
-        n_frames : int
-            Their number.
-
-        Returns
-        -------
-        ndarray of float64, shape (directions,)
-            White noise of unit modulus has M in every frame and bin. As it was where nothing is whitened.
+        Shapes: power (directions,).
 
         References
         ----------
@@ -321,16 +283,6 @@ def _use_of(below: float, street: float) -> float:
 
 def spanned(slices: Iterable[slice]) -> slice:
     """Return the bins from the first to the last of several sets.
-
-    Parameters
-    ----------
-    slices : iterable of slice
-        At least one, with start and stop.
-
-    Returns
-    -------
-    slice
-        Covers them all.
 
     Examples
     --------

@@ -34,14 +34,6 @@ _TINY = 1e-12
 class ElevationSplit:
     """Tells noise of the own vehicle from that of the street, by elevation.
 
-    Parameters
-    ----------
-    below, street : ndarray of float32, shape (bins, 2 M^2)
-        Combinations of the model fields, real and imaginary parts in turn, that give the power of one field
-        times the determinant.
-    can_tell : bool
-        Whether the array has the height for it.
-
     Examples
     --------
     >>> from worldstate.frontend.array.microphone_array import roof_array_56
@@ -54,9 +46,11 @@ class ElevationSplit:
     [True, False]
     """
 
+    # shape (bins, 2 M^2): Combinations of the model fields, real and imaginary parts in turn, that give the
+    # power of one field times the determinant.
     below: Float32Array
     street: Float32Array
-    can_tell: bool
+    can_tell: bool  # Whether the array has the height for it
 
     @classmethod
     def of(
@@ -70,28 +64,10 @@ class ElevationSplit:
         .. math:: \Gamma = \langle a a^H \rangle \text{ off the diagonal}, \qquad
                   w_b = G_{ss} \Gamma^b - G_{bs} \Gamma^s, \quad w_s = G_{bb} \Gamma^s - G_{bs} \Gamma^b
 
-        over the directions of each field, with G their inner products: w of R is the power times the
-        determinant.
-
-        Parameters
-        ----------
-        array : MicrophoneArray
-            Microphones.
-        frequencies_hz : array_like, shape (bins,)
-            Hz.
-        speed_of_sound_m_s : float
-            c.
-
-        Returns
-        -------
-        ElevationSplit
-            For covariances of these bins.
-
-        References
-        ----------
-        B. F. Cron and C. H. Sherman 1962 (model fields): see `elevation_split`; the normal
-        equations of least squares, by Cramer's rule.
+        Shapes: frequencies_hz (bins,).
         """
+        # over the directions of each field, with G their inner products: w of R is the power times the
+        # determinant.
         b, s = (_field(array, frequencies_hz, el, speed_of_sound_m_s) for el in (_BELOW_DEG, _STREET_DEG))
         bb, ss, bs = (np.einsum("kn,kn->k", x, y)[:, None] for x, y in ((b, b), (s, s), (b, s)))
         contrast = float((bb * ss - bs**2).sum() / max(float((bb * ss).sum()), _TINY))
@@ -105,15 +81,7 @@ class ElevationSplit:
 
         .. math:: P_b = \sum_k \Delta_k\, \hat p_{b,k}, \qquad P_s = \sum_k \Delta_k\, \hat p_{s,k}
 
-        Parameters
-        ----------
-        covariance : ndarray of complex64, shape (bins, M, M)
-            All bins at like power; a sum or a mean.
-
-        Returns
-        -------
-        ndarray of float64, shape (2,)
-            By chance they may be negative.
+        Shapes: covariance (bins, M, M).
 
         References
         ----------
@@ -130,15 +98,7 @@ class ElevationSplit:
 
         .. math:: q = P_b / (P_b + P_s)
 
-        Parameters
-        ----------
-        covariance : ndarray of complex64, shape (bins, M, M)
-            All bins at like power.
-
-        Returns
-        -------
-        float
-            In [0, 1]; 1 for an array that cannot tell.
+        Shapes: covariance (bins, M, M).
 
         References
         ----------
@@ -151,20 +111,6 @@ def share_of(below: float, street: float) -> float:
     r"""Return the share of the first power, negative ones counted as none.
 
     .. math:: q = \frac{\max(P_b, 0)}{\max(P_b, 0) + \max(P_s, 0)}
-
-    Parameters
-    ----------
-    below, street : float
-        See `ElevationSplit.powers`.
-
-    Returns
-    -------
-    float
-        In [0, 1].
-
-    References
-    ----------
-    From the definition.
 
     Examples
     --------

@@ -9,19 +9,14 @@ Item = TypeVar("Item")
 class GuardDelay(Generic[Item]):
     """A queue of hops; each comes out some hops later with the least weight since.
 
-    So a source is not learned in the moments before anybody believes in it.
-
-    Parameters
-    ----------
-    hops : int
-        How long a hop waits.
-
     Examples
     --------
     >>> guard: GuardDelay[str] = GuardDelay(1)
     >>> [guard.push(item, weight) for item, weight in (("a", 1.0), ("b", 0.4), ("c", 0.9))]
     [None, ('a', 0.4), ('b', 0.4)]
     """
+
+    # So a source is not learned in the moments before anybody believes in it.
 
     def __init__(self, hops: int) -> None:
         self._waiting: deque[Item] = deque()
@@ -31,22 +26,6 @@ class GuardDelay(Generic[Item]):
         r"""Take a hop with its weight; return the one that has waited long enough.
 
         .. math:: w'_n = \min(w_n, w_{n+1}, \dots, w_{n + hops})
-
-        Parameters
-        ----------
-        item : Item
-            What is kept of the hop.
-        weight : float
-            In [0, 1].
-
-        Returns
-        -------
-        (Item, float) or None
-            With the least weight since; None while none has waited long enough.
-
-        References
-        ----------
-        Derived here: a hop is learned by whoever trusts it least, before and after it was heard.
         """
         self._waiting.append(item)
         self._weights.append(weight)

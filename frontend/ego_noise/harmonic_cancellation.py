@@ -45,13 +45,6 @@ _TINY = 1e-30
 class EngineState:
     """Where the fundamental is at the middle of the last frame.
 
-    Parameters
-    ----------
-    phase_rad, frequency_hz, rate_hz_per_s : float
-        Phase, its derivative over 2 pi, and the derivative of that.
-    hops : int
-        Number of hops since it was told.
-
     Examples
     --------
     >>> state = EngineState(phase_rad=0.0, frequency_hz=30.0)
@@ -59,29 +52,17 @@ class EngineState:
     (array([18.85]), 25.0)
     """
 
-    phase_rad: float
+    phase_rad: float  # Phase, its derivative over 2 pi, and the derivative of that
     frequency_hz: float
     rate_hz_per_s: float = 0.0
-    hops: int = 0
+    hops: int = 0  # Number of hops since it was told
 
     def phases(self, time_s: FloatArray) -> FloatArray:
         r"""Continue the phase to later times, radians.
 
         .. math:: \varphi(t) = \varphi + 2\pi \big(f t + \tfrac12 \dot f t^2\big)
 
-        Parameters
-        ----------
-        time_s : ndarray, shape (n,)
-            Seconds after the instant of this state.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Radians.
-
-        References
-        ----------
-        From the definition.
+        Shapes: time_s (n,).
         """
         cycles = self.frequency_hz * time_s + 0.5 * self.rate_hz_per_s * time_s**2
         return np.asarray(self.phase_rad + 2.0 * np.pi * cycles)
@@ -91,19 +72,7 @@ class EngineState:
 
         .. math:: f(t) = f + \dot f t
 
-        Parameters
-        ----------
-        time_s : ndarray, shape (n,)
-            Seconds after the instant of this state.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Hz.
-
-        References
-        ----------
-        From the definition.
+        Shapes: time_s (n,).
         """
         return np.asarray(self.frequency_hz + self.rate_hz_per_s * time_s)
 
@@ -114,18 +83,6 @@ class EngineState:
                   \dot f' = \dot f + 0.1\, \frac{\epsilon}{2\pi T^2}
 
         with g falling from 1 to 1/2; the rate waits until the frequency has settled.
-
-        Parameters
-        ----------
-        time_s : float
-            Length of the hop, seconds.
-        phase_error_rad : float
-            Measured less predicted phase, radians.
-
-        Returns
-        -------
-        EngineState
-            At the end of the hop.
 
         References
         ----------
@@ -146,20 +103,6 @@ class EngineState:
         r"""Keep the frequency between two limits; one that has to be moved keeps no rate.
 
         .. math:: f' = \min(\max(f, f_{low}), f_{high})
-
-        Parameters
-        ----------
-        low_hz, high_hz : float
-            Limits of the fundamental, Hz.
-
-        Returns
-        -------
-        EngineState
-            The same where it is inside.
-
-        References
-        ----------
-        From the definition.
         """
         if low_hz <= self.frequency_hz <= high_hz:
             return self
@@ -168,24 +111,6 @@ class EngineState:
 
 class HarmonicCanceller:
     """Subtracts the harmonics of an engine from the spectra of a stream.
-
-    Parameters
-    ----------
-    bins : range
-        Bins of the spectra.
-    sample_rate_hz : float
-        Samples per second.
-    nfft : int
-        Frame length N; Hann-windowed frames overlap by half.
-    harmonics : int
-        Highest order that is cancelled.
-    memory_s : float
-        Time constant of the amplitudes, seconds.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
 
     Examples
     --------
@@ -223,21 +148,7 @@ class HarmonicCanceller:
         return None if self._engine is None else self._engine.frequency_hz
 
     def follow(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
-        """Say the fundamental: from the engine's speed, or from `harmonics.track_fundamental`.
-
-        Parameters
-        ----------
-        fundamental_hz : float or None
-            10 to 1000 Hz; None stops cancelling.
-        tolerance : float
-            How wrong it may be, as a share; the loop stays within. Half a per cent for an engine's own speed
-            signal.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Out of range.
-        """
+        """Say the fundamental: from the engine's speed, or from `harmonics.track_fundamental`."""
         if fundamental_hz is None:
             self._engine = self._fit = None
             return
@@ -257,25 +168,7 @@ class HarmonicCanceller:
         with the sums over the memory and a ridge of a thousandth, W the inverse power of the bins, and e_h
         the power of a line over that which noise alone would give it.
 
-        Parameters
-        ----------
-        spectra : ndarray of complex64, shape (frames, bins, M)
-            One hop.
-
-        Returns
-        -------
-        ndarray of complex64, same shape
-            A copy.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If the spectra have another number of bins.
-
-        References
-        ----------
-        B. Widrow et al. 1975, H. Vold and J. Leuridan 1993: see `harmonic_cancellation`.
-        Derived here: kappa takes off what noise adds to the power of an amplitude, once more for safety.
+        Shapes: spectra (frames, bins, M).
         """
         if self._engine is None or not len(spectra):
             return spectra
@@ -310,19 +203,10 @@ class HarmonicCanceller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LineShapes:
-    """The g of the module's equation for unit N, as the product of what bins and frames see.
+    """The g of the module's equation for unit N, as the product of what bins and frames see."""
 
-    Parameters
-    ----------
-    orders : (H,) int
-        Successive.
-    kernel : (bins, H) float
-        Over a hop that of its middle: the frequency moves by a small part of a bin.
-    turn : (frames, H) complex
-    """
-
-    orders: IntArray
-    kernel: Float32Array
+    orders: IntArray  # Successive
+    kernel: Float32Array  # Over a hop that of its middle: the frequency moves by a small part of a bin
     turn: Complex64Array
 
     @classmethod
@@ -357,21 +241,12 @@ class _LineShapes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """Normal equations of the amplitudes.
-
-    Parameters
-    ----------
-    orders : (H,) int
-    gram : (H, H) complex
-    moment : (H, M) complex
-    energy, count : float
-        Weighted sum of |X|^2 per microphone and number of values behind it.
-    """
+    """Normal equations of the amplitudes."""
 
     orders: IntArray
     gram: ComplexArray
     moment: ComplexArray
-    energy: float
+    energy: float  # Weighted sum of |X|^2 per microphone and number of values behind it
     count: float
 
     @classmethod
@@ -441,15 +316,14 @@ class _Fit:
 def _signed_kernel(place: FloatArray, bins: IntArray) -> Float32Array:
     r"""Spectrum of the Hann window per sample for lines at `place`, bins, times (-1)^k: (bins, H).
 
-    sinc(u) / (2 (1 - u^2)) with u = place - k, cut beyond four bins. As sin(pi u) = (-1)^k sin(pi place), the
-    sign goes into one sine a line.
-
     Examples
     --------
     >>> _signed_kernel(np.array([4.0]), np.array([3, 4, 5, 9])).round(3).ravel() + 0.0
     array([-0.25,  0.5 , -0.25,  0.  ], dtype=float32)
     """
-    # Numerator and denominator both vanish at whole distances: stand a hair beside them.
+    # sinc(u) / (2 (1 - u^2)) with u = place - k, cut beyond four bins. As sin(pi u) = (-1)^k sin(pi place),
+    # the sign goes into one sine a line. Numerator and denominator both vanish at whole distances: stand a
+    # hair beside them.
     place = np.where(np.abs(place - np.round(place)) < 1e-6, place + 1e-6, place)
     u = place - bins[:, None]
     kernel = (np.sin(np.pi * place) / (2.0 * np.pi)) / (u * (1.0 - u * u))

@@ -15,13 +15,6 @@ _LEVEL_HOPS = 10.0
 class NoiseCovariance:
     """Recursive mean of unit-length snapshots' covariance, per bin.
 
-    Parameters
-    ----------
-    n_bins, n_microphones : int
-        Shape.
-    forgetting_frames : float
-        Time constant, learned frames.
-
     Examples
     --------
     >>> noise = NoiseCovariance(n_bins=1, n_microphones=2, forgetting_frames=1e6)
@@ -40,19 +33,7 @@ class NoiseCovariance:
 
         .. math:: S \leftarrow e^{-w T / F} S + w \sum_t x_t x_t^H, \qquad n \leftarrow e^{-w T / F} n + w T
 
-        Parameters
-        ----------
-        total : ndarray of complex64, shape (bins, M, M)
-            Sum of cross-spectra; consumed.
-        n_frames : int
-            How many frames it sums.
-        weight : float
-            In (0, 1].
-
-        References
-        ----------
-        An exponential mean, from the definition; unit-length snapshots by D. E. Tyler 1987: see
-        `worldstate.frontend.ego_noise.ego_noise`.
+        Shapes: total (bins, M, M).
         """
         kept = math.exp(-weight * n_frames / self._forgetting)
         total *= np.float32(weight)
@@ -64,16 +45,6 @@ class NoiseCovariance:
         r"""Covariance of one bin; the mean of its diagonal is one.
 
         .. math:: \hat R = S / n
-
-        Parameters
-        ----------
-        bin_index : int
-            From 0.
-
-        Returns
-        -------
-        ndarray of complex64, shape (M, M)
-            Hermitian.
 
         References
         ----------
@@ -90,11 +61,6 @@ class NoiseCovariance:
 class NoiseLevel:
     """Level of whitened noise over that of white noise, learned like the covariance.
 
-    Parameters
-    ----------
-    guard_hops : int
-        A hop counts so many hops later.
-
     Examples
     --------
     >>> level = NoiseLevel(guard_hops=0)
@@ -110,26 +76,8 @@ class NoiseLevel:
         r"""Take a hop's level with the weight of the gate; return the level learned, 1 before there is any.
 
         .. math:: c = \frac{\sum_i w_i l_i e^{-W_i / 10}}{\sum_i w_i e^{-W_i / 10}}
-
-        over the levels l with the weights w, W being the weight learned since.
-
-        Parameters
-        ----------
-        level : float
-            Mean over directions, 1 for white noise.
-        weight : float
-            In [0, 1]; 0 for a hop that is not learned.
-
-        Returns
-        -------
-        float
-            Mean with a memory of a second of learning.
-
-        References
-        ----------
-        H. M. Finn and R. S. Johnson 1968 (constant false-alarm rate): see
-        `worldstate.frontend.ego_noise.ego_noise.EgoNoise.levelled`.
         """
+        # over the levels l with the weights w, W being the weight learned since.
         ripe = self._guard.push(level, weight)
         if ripe is not None and ripe[1] > 0.0:
             learned, weight = ripe

@@ -36,11 +36,6 @@ _DEAD = 1e-9
 class Prewhitener:
     """Inverse roots of a noise covariance, applied to spectra, covariances and steering vectors alike.
 
-    Parameters
-    ----------
-    roots : ndarray of complex, shape (bins, M, M)
-        Hermitian; from `inverse_root`.
-
     Examples
     --------
     Noise that reaches both microphones in phase no longer hides a source between them:
@@ -52,7 +47,7 @@ class Prewhitener:
             [0., 1.]]])
     """
 
-    roots: ComplexArray
+    roots: ComplexArray  # shape (bins, M, M): Hermitian; from `inverse_root`
 
     @classmethod
     def of(cls, noise_covariance: ArrayLike, shrinkage: float = 0.03) -> "Prewhitener":
@@ -60,17 +55,7 @@ class Prewhitener:
 
         .. math:: \mathrm{roots} = \big[(1 - s) R / p + s I\big]^{-1/2}, \qquad p = \operatorname{tr} R / M
 
-        Parameters
-        ----------
-        noise_covariance : array_like, shape (bins, M, M)
-            Complex.
-        shrinkage : float
-            In [0, 1].
-
-        Returns
-        -------
-        Prewhitener
-            One root a bin.
+        Shapes: noise_covariance (bins, M, M).
 
         References
         ----------
@@ -83,24 +68,7 @@ class Prewhitener:
 
         .. math:: y = R^{-1/2} x
 
-        Parameters
-        ----------
-        spectra : array_like, shape (frames, bins, M)
-            Complex.
-
-        Returns
-        -------
-        ndarray of complex, same shape
-            root x.
-
-        Raises
-        ------
-        InvalidArgumentError
-            On another number of bins or microphones, or values that are not finite.
-
-        References
-        ----------
-        K. Nakamura et al. 2009: see `worldstate.frontend.ego_noise.prewhitening`.
+        Shapes: spectra (frames, bins, M).
         """
         X = finite_complex("spectra", spectra, (None, *self.roots.shape[:2]))
         # y_i = sum_j root_ij x_j, with x as rows: the transpose.
@@ -111,24 +79,7 @@ class Prewhitener:
 
         .. math:: R_y = R^{-1/2} R_x R^{-1/2}
 
-        Parameters
-        ----------
-        covariance : array_like, shape (bins, M, M)
-            Complex.
-
-        Returns
-        -------
-        ndarray of complex, same shape
-            root R root.
-
-        Raises
-        ------
-        InvalidArgumentError
-            On another shape or values that are not finite.
-
-        References
-        ----------
-        R. Roy and T. Kailath 1989, K. Nakamura et al. 2009: see `worldstate.frontend.ego_noise.prewhitening`.
+        Shapes: covariance (bins, M, M).
         """
         R = finite_complex("covariance", covariance, self.roots.shape)
         return np.asarray(self.roots @ R @ self.roots)
@@ -138,25 +89,7 @@ class Prewhitener:
 
         .. math:: b = \|a\|\, \frac{R^{-1/2} a}{\|R^{-1/2} a\|}
 
-        Parameters
-        ----------
-        steering : array_like, shape (bins, M, directions)
-            Complex.
-
-        Returns
-        -------
-        ndarray of complex, same shape
-            Columns of length sqrt(M).
-
-        Raises
-        ------
-        InvalidArgumentError
-            On another number of bins or microphones, or values that are not finite.
-
-        References
-        ----------
-        K. Nakamura et al. 2009: see `prewhitening`. The length is derived here: what
-        whitening takes from the sound it takes from a.
+        Shapes: steering (bins, M, directions).
         """
         A = finite_complex("steering", steering, (*self.roots.shape[:2], None))
         whitened = self.roots @ A
@@ -170,26 +103,7 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
 
     .. math:: R_s = (1 - s)\, \frac{R}{p} + s I, \qquad p = \frac{\operatorname{tr} R}{M}
 
-    so that no direction is amplified by more than 1 / sqrt(s), and s = 1 leaves everything as it is. The
-    level of R plays no part. Microphones without any noise are dead and give zeros; a bin in which all are
-    silent is left alone.
-
-    Parameters
-    ----------
-    noise_covariance : array_like, shape (bins, M, M)
-        Hermitian, positive semidefinite.
-    shrinkage : float
-        s in [0, 1]; 0 needs a covariance of full rank.
-
-    Returns
-    -------
-    ndarray of complex, shape (bins, M, M)
-        Single precision if the covariance is.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another shape, values that are not finite, or a number out of range.
+    Shapes: noise_covariance (bins, M, M).
 
     References
     ----------
@@ -203,6 +117,9 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
     array([[[0.816, 0.   ],
             [0.   , 1.414]]])
     """
+    # so that no direction is amplified by more than 1 / sqrt(s), and s = 1 leaves everything as it is. The
+    # level of R plays no part. Microphones without any noise are dead and give zeros; a bin in which all are
+    # silent is left alone.
     R = finite_complex("noise_covariance", noise_covariance, (None, None, None))
     if R.shape[1] != R.shape[2]:
         raise InvalidArgumentError(f"noise_covariance: expected shape (bins, M, M), got {R.shape}")
@@ -217,30 +134,15 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
     .. math:: s = \min\Big(1, \frac{(1 - 2/M) \operatorname{tr} R^2 + \operatorname{tr}^2 R}
               {(n + 1 - 2/M) (\operatorname{tr} R^2 - \operatorname{tr}^2 R / M)}\Big)
 
-    One where the eigenvalues spread no more than n frames of white noise would make them, so that nothing
-    is whitened that was white; next to nothing where a few directions dominate.
-
-    Parameters
-    ----------
-    R : ndarray of complex, shape (M, M)
-        Mean over the frames.
-    n_frames : float
-        Number of independent frames n >= 0.
-
-    Returns
-    -------
-    float
-        In [0, 1].
-
-    References
-    ----------
-    Y. Chen, A. Wiesel, Y. Eldar and A. Hero 2010: see `worldstate.frontend.ego_noise.prewhitening`.
+    Shapes: R (M, M).
 
     Examples
     --------
     >>> white_share(np.eye(4), 100), round(white_share(np.ones((4, 4)), 100), 3)
     (1.0, 0.02)
     """
+    # One where the eigenvalues spread no more than n frames of white noise would make them, so that nothing
+    # is whitened that was white; next to nothing where a few directions dominate.
     size = len(R)
     squares = float(np.square(R.real).sum() + np.square(R.imag).sum())
     trace = float(np.einsum("mm->", R).real) ** 2
@@ -255,17 +157,7 @@ def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
     .. math:: \big[(1 - s) R / p + s I\big]^{-1/2} =
               V \operatorname{diag}\big[(1 - s) \lambda / p + s\big]^{-1/2} V^H
 
-    Parameters
-    ----------
-    R : ndarray of complex, shape (M, M)
-        Hermitian.
-    s : float
-        Shrinkage, in [0, 1].
-
-    Returns
-    -------
-    ndarray of complex, shape (M, M)
-        Hermitian.
+    Shapes: R (M, M).
 
     References
     ----------

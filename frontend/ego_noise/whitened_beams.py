@@ -15,11 +15,6 @@ class WhitenedBeams:
     :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the living
     microphones: those with any noise).
 
-    Parameters
-    ----------
-    plain : Steering
-        Beams for spectra as they are.
-
     Examples
     --------
     >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -41,16 +36,7 @@ class WhitenedBeams:
         .. math:: w(\theta) = \sqrt M\, \frac{\overline{R^{-1/2}}\, \overline{a(\theta)}}
                   {\|R^{-1/2}\, a(\theta)\|}
 
-        Parameters
-        ----------
-        bin_index : int
-            From 0.
-        root : ndarray of complex64, shape (M, M)
-            Inverse root of the noise covariance.
-
-        References
-        ----------
-        K. Nakamura et al. 2009: see `worldstate.frontend.ego_noise.prewhitening`.
+        Shapes: root (M, M).
         """
         plain, ours = self.plain, self.steering
         weights = plain.weights[bin_index]

@@ -14,14 +14,6 @@ _SILENCE_HOPS = 10
 class ChannelActivity:
     """Hops in which a channel was of no use, over the last five seconds.
 
-    Bad until now since one moment means dead; bad in several stretches, or once and well again, intermittent.
-    A single bad hop is masked and forgotten.
-
-    Parameters
-    ----------
-    n_channels : int
-        Number of channels M.
-
     Examples
     --------
     >>> presence = ChannelActivity(3)
@@ -30,6 +22,9 @@ class ChannelActivity:
     >>> [(fault.channel, fault.fault.value, fault.value) for fault in presence.faults()]
     [(1, 'dead', 1.0), (2, 'intermittent', 0.5)]
     """
+
+    # Bad until now since one moment means dead; bad in several stretches, or once and well again,
+    # intermittent. A single bad hop is masked and forgotten.
 
     def __init__(self, n_channels: int) -> None:
         self._bad = np.zeros((_MEMORY_HOPS, n_channels), bool)
@@ -41,33 +36,14 @@ class ChannelActivity:
     def push(self, bad: BoolArray) -> BoolArray:
         """Take one flag per channel (M,); give it back.
 
-        Parameters
-        ----------
-        bad : ndarray of bool, shape (M,)
-            Channels in which the hop is silent or breaks off.
-
-        Returns
-        -------
-        ndarray of bool, shape (M,)
-            The same.
+        Shapes: bad (M,).
         """
         self._n_silent = 0
         return self._remember(bad)
 
     def all_silent(self) -> BoolArray:
-        """Take a hop in which all are silent, which for a second is held against nobody.
-
-        ``bad = (n >= 10)`` for all channels, n being the hops of silence in a row.
-
-        Returns
-        -------
-        ndarray of bool, shape (M,)
-            Which channels are held to be bad.
-
-        References
-        ----------
-        Derived here: a gap of the transport silences all channels for a moment, a dead array for good.
-        """
+        """Take a hop in which all are silent, which for a second is held against nobody."""
+        # ``bad = (n >= 10)`` for all channels, n being the hops of silence in a row.
         self._n_silent += 1
         silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
         return self._remember(silent) if silent.any() else silent
@@ -101,15 +77,6 @@ class ChannelActivity:
         .. math:: q_m = \frac1n \sum_{i=1}^{n} b_{i,m}, \qquad n \le 50
 
         with b the bad hops: dead where they are one stretch that lasts until now, else intermittent.
-
-        Returns
-        -------
-        list of ChannelFault
-            By channel.
-
-        References
-        ----------
-        Derived here: a share of time says how bad a channel is, in whatever order its hops came.
         """
         if not self._share.any():
             return []

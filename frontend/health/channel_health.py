@@ -157,19 +157,7 @@ class ArrayHealth:
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:
     """List one fault of several channels, (M,) each.
 
-    Parameters
-    ----------
-    fault : Fault
-        What was found.
-    found : ndarray of bool, shape (M,)
-        In which channels.
-    values : ndarray, shape (M,)
-        The number that shows it, of every channel.
-
-    Returns
-    -------
-    list of ChannelFault
-        One a channel that was found, ascending.
+    Shapes: found (M,), values (M,).
 
     Examples
     --------

@@ -35,15 +35,6 @@ _EVERY_HOPS = 10
 class ChannelMonitor:
     """Statistics of every channel and what they say; memory does not grow.
 
-    Parameters
-    ----------
-    array : MicrophoneArray
-        In the order of the channels.
-    frequencies_hz : ndarray, shape (K,)
-        Bins of the cross-spectra that `push` gets.
-    sample_rate_hz, speed_of_sound_m_s : float
-        Of the stream.
-
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0, 0], [0, -0.1, 0]])
@@ -82,32 +73,15 @@ class ChannelMonitor:
     ) -> ArrayHealth:
         r"""Take one hop, say which channels count in it and why.
 
-        A channel counts unless it has one of `MASKED_FAULTS` or is silent, breaks off or crackles in this
-        hop: with its mean squares E over those of the median living channel and its peak-to-peak s over the
-        usual one,
-
         .. math:: \langle E_{tm} / \tilde E_t \rangle_t < 10^{-3}, \qquad
                   \min_t E_{tm} / \tilde E_t < 10^{-5}, \qquad
                   s_m / \bar s_m > 4\, \mathrm{median}_j\, (s_j / \bar s_j).
 
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-        energies : ndarray, shape (frames, M)
-            Mean square of each channel in some band within the frames of the hop.
-        matrices : ndarray of complex64, shape (K, M, M)
-            Sums of Z_i conj(Z_j) over these frames, Z being whitened spectra.
-
-        Returns
-        -------
-        ArrayHealth
-            As of the end of this hop.
-
-        References
-        ----------
-        Derived here: all microphones hear the same sound, so that each is held against the median of the
-        others.
+        Shapes: samples (n, M), energies (frames, M), matrices (K, M, M).
         """
+        # A channel counts unless it has one of `MASKED_FAULTS` or is silent, breaks off or crackles in this
+        # hop: with its mean squares E over those of the median living channel and its peak-to-peak s over the
+        # usual one,
         lowest, highest = _extremes(samples)
         span = highest - lowest
         alive = span > 0.0

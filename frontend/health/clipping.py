@@ -15,15 +15,6 @@ _MIN_COUNT = 16
 class ClippingCounter:
     """Count samples at and just below the highest and the lowest value of every channel.
 
-    An unclipped sound meets its extreme once, and more often the values just below it; a clipped one stays at
-    it. Only hops that reach an extreme again are counted, so that a clean stream costs nothing; a new extreme
-    starts the count anew, because what was below it was no rail.
-
-    Parameters
-    ----------
-    n_channels : int
-        Number of channels M.
-
     Examples
     --------
     >>> sound = np.random.default_rng(0).standard_normal((4800, 2)).astype(np.float32)
@@ -34,6 +25,10 @@ class ClippingCounter:
     >>> rails.clipped_share().round(2)
     array([0.  , 0.06])
     """
+
+    # An unclipped sound meets its extreme once, and more often the values just below it; a clipped one
+    # stays at it. Only hops that reach an extreme again are counted, so that a clean stream costs nothing;
+    # a new extreme starts the count anew, because what was below it was no rail.
 
     def __init__(self, n_channels: int) -> None:
         self._n_samples = 0
@@ -47,19 +42,9 @@ class ClippingCounter:
         .. math:: n_{at} = \#\{x = x_{max}\}, \qquad
                   n_{below} = \#\{x_{max} - \tfrac1{20} s \le x < x_{max}\}
 
-        and likewise of -x, s being the span of the hop.
-
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-            One hop.
-        lowest, highest : ndarray of float32, shape (M,)
-            Their extremes.
-
-        References
-        ----------
-        Derived here: an unclipped density falls towards its extreme, a clipped one has an atom there.
+        Shapes: samples (n, M), lowest, highest (M,).
         """
+        # and likewise of -x, s being the span of the hop.
         self._n_samples += len(samples)
         span = highest - lowest
         self._side(0, np.float32(1.0), samples, highest, span)
@@ -92,15 +77,6 @@ class ClippingCounter:
         r"""Share of all samples that stand at a rail, (M,); 0 for channels without one.
 
         .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
-
-        Returns
-        -------
-        ndarray of float64, shape (M,)
-            0..1.
-
-        References
-        ----------
-        Derived here: what an extreme holds more often than the values below it are clipped samples.
         """
         clipped = np.where((self._at >= _MIN_COUNT) & (self._at > self._below), self._at, 0)
         return np.asarray(clipped.sum(axis=0) / max(self._n_samples, 1))

@@ -38,34 +38,22 @@ _TINY = np.finfo(np.float32).tiny
 class Dropout:
     """A place where the stream is broken.
 
-    Parameters
-    ----------
-    kind : str
-        "still": no channel changes; "splice": the sound jumps, samples are missing; "repeat": the samples
-        have been there before.
-    sample : int
-        Where, from the start of the stream.
-    n_samples : int or None
-        Length, that of a repeat to some ten samples; None for a splice, whose length leaves no trace.
-
     Examples
     --------
     >>> Dropout("still", 48_000, 512).kind
     'still'
     """
 
+    # "still": no channel changes; "splice": the sound jumps, samples are missing; "repeat": the samples
+    # have been there before.
     kind: GapKind
-    sample: int
+    sample: int  # Where, from the start of the stream
+    # Length, that of a repeat to some ten samples; None for a splice, whose length leaves no trace.
     n_samples: int | None
 
 
 class DropoutFinder:
     """Find gaps hop by hop.
-
-    Parameters
-    ----------
-    n_channels : int
-        Number of channels M.
 
     Examples
     --------
@@ -84,17 +72,7 @@ class DropoutFinder:
     def push(self, samples: Float32Array, alive: BoolArray) -> list[Dropout]:
         """Take the samples (n, M) of a hop and the channels that are not constant in it.
 
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-            One hop.
-        alive : ndarray of bool, shape (M,)
-            Channels that are not constant in it.
-
-        Returns
-        -------
-        list of Dropout
-            Those that end or show within this hop.
+        Shapes: samples (n, M), alive (M,).
         """
         start = self._n_seen - len(self._tail)
         sound = self._picked(samples, alive)
@@ -138,26 +116,11 @@ class StillRuns:
     def push(self, still: BoolArray, end: int) -> list[Dropout]:
         r"""Take one flag per sample, the last being sample `end` - 1; give the runs that end here.
 
-        A run is a gap from the length L that still samples by chance, a share q of all, hardly make:
-
         .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
 
-        Parameters
-        ----------
-        still : ndarray of bool, shape (n,)
-            Whether no channel changes at a sample.
-        end : int
-            Number of samples so far.
-
-        Returns
-        -------
-        list of Dropout
-            In order of time.
-
-        References
-        ----------
-        Derived here: L independent samples stand still with probability q^L.
+        Shapes: still (n,).
         """
+        # A run is a gap from the length L that still samples by chance, a share q of all, hardly make:
         if not (still.any() or self._length):
             self._heard = True
             self._n_moving += len(still)
@@ -188,27 +151,11 @@ class StillRuns:
 def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dropout]:
     r"""Find samples at which the sound of all channels at once is not what its last samples foretell.
 
-    With d the differences, e their prediction errors and J the jump of two samples,
-
     .. math:: e[n] = d[n] - \rho\, d[n-1], \quad \rho = \frac{\sum d[n]\, d[n-1]}{\sum d[n]^2}, \qquad
               J[n] = \Big\langle \min\Big(\frac{\max(e[n]^2, e[n+1]^2)}{\langle e^2 \rangle}, 25\Big)
               \Big\rangle_{channels},
 
-    a splice is where J is above 12, and above three times the fifth largest of the hop.
-
-    Parameters
-    ----------
-    change : ndarray of float32, shape (channels, n)
-        First differences, so that offsets do not matter; the first is that into sample `start`.
-    start : int
-        Of the stream.
-    still : ndarray of bool, shape (n,)
-        Where no channel changes; the edges of such runs are no splices.
-
-    Returns
-    -------
-    list of Dropout
-        In order of time.
+    Shapes: change (channels, n), still (n,).
 
     References
     ----------
@@ -222,6 +169,9 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
     >>> find_splices(change, 1, np.zeros(3899, bool))
     [Dropout(kind='splice', sample=2000, n_samples=None)]
     """
+    # With d the differences, e their prediction errors and J the jump of two samples,
+    #
+    # a splice is where J is above 12, and above three times the fifth largest of the hop.
     error = _prediction_error(change)
     np.square(error, out=error)
     error /= np.maximum(error.mean(axis=1, keepdims=True), _TINY)
@@ -249,10 +199,6 @@ def _prediction_error(change: Float32Array) -> Float32Array:
 class RepeatFinder:
     """Samples that were there before, found by hashes of single samples over several channels.
 
-    Sound never repeats to the last bit on eight channels. Only samples whose hash has five zeros in one place
-    are kept, so that the same samples are kept when they come again. Memory does not grow: two generations of
-    a second each.
-
     Examples
     --------
     >>> sound = np.random.default_rng(0).standard_normal((8, 9600)).astype(np.float32)
@@ -260,6 +206,10 @@ class RepeatFinder:
     >>> finder.push(sound, end=9600), finder.push(sound[:, -4800:], end=14_400)[0].kind
     ([], 'repeat')
     """
+
+    # Sound never repeats to the last bit on eight channels. Only samples whose hash has five zeros in one
+    # place are kept, so that the same samples are kept when they come again. Memory does not grow: two
+    # generations of a second each.
 
     def __init__(self) -> None:
         odd = np.random.default_rng(0).integers(1, 2**62, _PICKED, dtype=np.uint64)
@@ -278,17 +228,7 @@ class RepeatFinder:
 
         with the bits b of a sample, odd random factors a, and only those n at which five bits of h are zero.
 
-        Parameters
-        ----------
-        sound : ndarray of float32, shape (channels, n)
-            One hop of a few channels.
-        end : int
-            Number of samples so far.
-
-        Returns
-        -------
-        list of Dropout
-            At most one.
+        Shapes: sound (channels, n).
 
         References
         ----------

@@ -29,20 +29,6 @@ _OTHER_MARGIN = 0.1
 class GeometryCheck:
     """Judge the places of all channels once a second; a verdict needs two judgements in a row.
 
-    Parameters
-    ----------
-    array : MicrophoneArray
-        Where the microphones are believed to be.
-    frequencies_hz : ndarray, shape (K,)
-        Bins of the cross-spectra.
-    speed_of_sound_m_s : float
-        Speed of sound.
-
-    Attributes
-    ----------
-    coherence : float or NotUsable
-        Median of the usable channels' scores at their own places.
-
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1 * i, 0] for i in range(5)])
@@ -76,18 +62,7 @@ class GeometryCheck:
         .. math:: S_{ij} \leftarrow 0.95\, S_{ij} + \mathrm{Re} \sum_t Z_i \overline{Z_j}, \qquad
                   n \leftarrow 0.95\, n + T
 
-        Parameters
-        ----------
-        matrices : ndarray of complex64, shape (K, M, M)
-            Cross-spectra, sums over the frames of one hop.
-        n_frames : int
-            How many frames.
-        there : ndarray of bool, shape (M,)
-            Microphones that are neither dead nor intermittent.
-
-        References
-        ----------
-        An exponential mean over two seconds, from the definition.
+        Shapes: matrices (K, M, M), there (M,).
         """
         self._sum *= np.float32(_FORGET)
         self._sum += matrices.real
@@ -97,13 +72,7 @@ class GeometryCheck:
             self._judge(there)
 
     def faults(self) -> list[ChannelFault]:
-        """Say which channels are noisy, inverted or swapped.
-
-        Returns
-        -------
-        list of ChannelFault
-            By channel.
-        """
+        """Say which channels are noisy, inverted or swapped."""
         return self._faults
 
     def _judge(self, there: BoolArray) -> None:
@@ -151,20 +120,7 @@ def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
 
     .. math:: \hat\pi = \arg\max_\pi \sum_m S_{m, \pi(m)}, \qquad g_m = S_{m, \hat\pi(m)} - S_{mm}
 
-    over the candidates that fit elsewhere better; one is listed where g is large and whoever owns the place
-    leaves it.
-
-    Parameters
-    ----------
-    scores : ndarray, shape (M, M)
-        From `position_scores`.
-    candidates : ndarray of bool, shape (M,)
-        Channels that fit anywhere at all; they share their places among themselves.
-
-    Returns
-    -------
-    list of ChannelFault
-        Ascending; empty where all sit where they fit best.
+    Shapes: scores (M, M), candidates (M,).
 
     References
     ----------
@@ -176,6 +132,8 @@ def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
     >>> [(fault.channel, fault.looks_like) for fault in displaced(scores, np.ones(3, bool))]
     [(0, 1), (1, 0)]
     """
+    # over the candidates that fit elsewhere better; one is listed where g is large and whoever owns the place
+    # leaves it.
     # Whoever sits well stays, so that nobody is sent to the next best place.
     restless = scores.max(axis=1) - scores.diagonal() > _RESTLESS
     seated = np.flatnonzero(candidates & restless)

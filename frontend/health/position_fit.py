@@ -45,26 +45,7 @@ def position_weights(
     .. math:: w_{pj} = -\frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}, \qquad
               \Gamma_{ij} = \frac{\sin(k d_{ij})}{k d_{ij}}
 
-    Parameters
-    ----------
-    array : MicrophoneArray
-        Where the microphones are believed to be.
-    frequencies_hz : ndarray, shape (K,)
-        Centres of the bins.
-    usable : ndarray of bool, shape (M,)
-        Channels whose sound guesses that of others.
-    speed_of_sound_m_s : float
-        Speed of sound.
-
-    Returns
-    -------
-    ndarray of float32, shape (K, M, M)
-        Row p holds the weights for place p; zero on the diagonal.
-
-    References
-    ----------
-    C. Rasmussen and C. Williams 2006, section 5.4.2; R. Cook et al. 1955 (Gamma): see
-    `worldstate.frontend.health.position_fit`.
+    Shapes: frequencies_hz (K,), usable (M,).
 
     Examples
     --------
@@ -88,22 +69,7 @@ def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArra
     .. math:: S_{mp} = \frac{\sum_k \sum_{j \ne m} w_{k,pj} R_{k,jm}}
               {\sqrt{K \sum_k w_{k,p}^T R_k\, w_{k,p}}}
 
-    Parameters
-    ----------
-    coherence : ndarray of float32, shape (K, M, M)
-        Real part of the mean of Z_i conj(Z_j) over frames, Z being whitened spectra: the weights are real.
-    weights : ndarray of float32, shape (K, M, M)
-        From `position_weights`.
-
-    Returns
-    -------
-    ndarray of float64, shape (M, M)
-        S[m, p]: channel m at place p; 0 where nothing is guessed.
-
-    References
-    ----------
-    Derived here: the correlation of a whitened channel with the guess for a place, by C. Rasmussen and C.
-    Williams 2006 (see `position_weights`), its own share left out.
+    Shapes: coherence (K, M, M), weights (K, M, M).
 
     Examples
     --------

@@ -12,18 +12,6 @@ _HOPS = 30
 class RunningMean:
     """Exponential mean over hops, an ordinary mean until its time constant has passed.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Number of statistics and of channels M.
-
-    Attributes
-    ----------
-    mean : ndarray, of this shape
-        0 where nothing was added.
-    count : ndarray of int, shape (M,)
-        Hops added.
-
     Examples
     --------
     >>> slow = RunningMean((1, 2))
@@ -42,16 +30,7 @@ class RunningMean:
 
         .. math:: \mu \leftarrow \mu + \frac{x - \mu}{\min(n, 30)}
 
-        Parameters
-        ----------
-        values : array_like, shape (M, ...)
-            Of one hop.
-        good : ndarray of bool, shape (M,)
-            Channels whose values count.
-
-        References
-        ----------
-        From the definition: an ordinary mean that turns into an exponential one.
+        Shapes: values (M, ...), good (M,).
         """
         self.count += good
         weight = good / np.clip(self.count, 1, _HOPS)

@@ -27,22 +27,15 @@ _TOLERATED = 1e-5
 class RateEstimate:
     """A measured sample rate.
 
-    Parameters
-    ----------
-    rate_hz, std_hz : float
-        Estimate and standard deviation.
-    nominal_hz : float
-        What the stream calls itself.
-
     Examples
     --------
     >>> RateEstimate(47_998.0, 0.1, 48_000.0).is_wrong, RateEstimate(47_999.8, 0.1, 48_000.0).is_wrong
     (True, False)
     """
 
-    rate_hz: float
+    rate_hz: float  # Estimate and standard deviation
     std_hz: float
-    nominal_hz: float
+    nominal_hz: float  # What the stream calls itself
 
     @property
     def error(self) -> float:
@@ -62,29 +55,6 @@ def rate_from_duration(
     r"""Sample rate from the length of a recording by another clock, such as a camera's.
 
     .. math:: \hat f_s = n / T, \qquad \sigma_{\hat f} = \hat f_s\, \sigma_T / T
-
-    Parameters
-    ----------
-    n_samples : int
-        Samples per channel.
-    duration_s, duration_std_s : float
-        Length and its standard deviation, seconds.
-    nominal_hz : float
-        What the file says.
-
-    Returns
-    -------
-    RateEstimate
-        Hz, with its standard deviation.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a duration is not positive.
-
-    References
-    ----------
-    From the definition; the deviation to first order in the error of T.
 
     Examples
     --------

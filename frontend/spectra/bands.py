@@ -16,28 +16,6 @@ def band_edges(bins: range, n_bands: int) -> IntArray:
 
     with e_0 the first bin and e_B the end.
 
-    Parameters
-    ----------
-    bins : range
-        First bin (>= 1) and end.
-    n_bands : int
-        Number of bands, not more than there are bins.
-
-    Returns
-    -------
-    ndarray of int, shape (n_bands + 1,)
-        Band b covers bins edges[b] .. edges[b + 1] - 1.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are fewer bins than bands.
-
-    References
-    ----------
-    Derived here: the ratio is taken anew at every edge, so that bands which had to be a whole bin wide leave
-    an equal ratio for the rest.
-
     Examples
     --------
     50 Hz to 8 kHz in bins of 93.75 Hz:
@@ -60,16 +38,7 @@ def mean_square_per_bin(powers: Float32Array, nfft: int) -> FloatArray:
     .. math:: \overline{x^2}[k] = \frac{2 \langle |X[k]|^2 \rangle}{N \sum_n w[n]^2},
               \qquad \sum_n w^2 = 3 N / 8
 
-    Parameters
-    ----------
-    powers : ndarray, shape (frames, bins, M)
-        |X|^2 of Hann-windowed frames; at least one frame.
-    nfft : int
-        Frame length N.
-
-    Returns
-    -------
-    ndarray of float64, shape (bins,), in squared units of the samples
+    Shapes: powers (frames, bins, M).
 
     References
     ----------
@@ -90,22 +59,7 @@ def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> Flo
 
     .. math:: L_b = \ln \max\Big(\sum_{k = e_b}^{e_{b+1} - 1} \overline{x^2}[k],\; 10^{-20}\Big)
 
-    Parameters
-    ----------
-    mean_square : ndarray, shape (bins,)
-        Per bin, the first being bin number `first`.
-    edges : ndarray of int, shape (bands + 1,)
-        From `band_edges`.
-    first : int
-        Number of the first bin.
-
-    Returns
-    -------
-    ndarray of float64, shape (bands,), nats re one squared unit of the samples
-
-    References
-    ----------
-    From the definition.
+    Shapes: mean_square (bins,), edges (bands + 1,).
 
     Examples
     --------

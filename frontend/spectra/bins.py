@@ -8,29 +8,6 @@ from worldstate.ground.errors import InvalidArgumentError
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
     """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded.
 
-    Parameters
-    ----------
-    band_hz : (float, float)
-        Lower and upper frequency, Hz.
-    sample_rate_hz : float
-        Samples per second.
-    nfft : int
-        Frame length, samples.
-
-    Returns
-    -------
-    range
-        Indices into the one-sided spectrum.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the band is empty at this resolution or reaches beyond half the sample rate.
-
-    References
-    ----------
-    From the definition of the DFT; which bins count as in pyroomacoustics.
-
     Examples
     --------
     >>> band_bins((50, 1500), 47_998, 512), band_bins((300, 1800), 47_998, 512)
@@ -50,24 +27,6 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
 
 def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
     """Centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,).
-
-    Parameters
-    ----------
-    bins : range
-        Indices into the one-sided spectrum.
-    sample_rate_hz : float
-        Samples per second.
-    nfft : int
-        Frame length, samples.
-
-    Returns
-    -------
-    ndarray, shape (bins,)
-        Hz.
-
-    References
-    ----------
-    From the definition of the DFT.
 
     Examples
     --------

@@ -22,20 +22,6 @@ class Decimator:
     Only outputs whose L samples are all there are given; what is left over waits. In polyphase form: the
     samples as rows of D, one matrix product with the taps as columns of D, sums along its diagonals.
 
-    Parameters
-    ----------
-    sample_rate_hz : float
-        Of what comes in.
-    high_hz : float
-        Highest frequency that is needed, below half that rate.
-
-    Attributes
-    ----------
-    factor, n_taps : int
-        D and L; output m is centred on input sample m D + (L - 1) / 2.
-    rate_hz : float
-        Of what goes out.
-
     References
     ----------
     J. F. Kaiser, "Nonrecursive digital filter design using the I0-sinh window function", 1974.
@@ -67,19 +53,7 @@ class Decimator:
 
         .. math:: y[m] = \sum_n h[n]\, x[m D + n]
 
-        Parameters
-        ----------
-        samples : ndarray, shape (n,)
-            Any number of them.
-
-        Returns
-        -------
-        ndarray of float64
-            At the lower rate; empty where none is complete.
-
-        References
-        ----------
-        From the definition; h by J. F. Kaiser 1974: see `Decimator`.
+        Shapes: samples (n,).
         """
         waiting = np.concatenate([self._waiting, samples])
         n_out = max((len(waiting) - self.n_taps) // self.factor + 1, 0)

@@ -12,22 +12,6 @@ from worldstate.ground.typing import Float32Array
 def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
     """Sample at which hop k, `index`, ends: ``n_k = floor(k fs / r + 1/2)`` with r hops a second.
 
-    Parameters
-    ----------
-    index : int
-        From 1; 0 is the start of the stream.
-    sample_rate_hz, hop_rate_hz : float
-        Samples and hops per second.
-
-    Returns
-    -------
-    int
-        Number of samples up to there.
-
-    References
-    ----------
-    From the definition.
-
     Examples
     --------
     >>> [hop_end(k, 47_998, 10) for k in (0, 1, 2, 10)]
@@ -40,35 +24,19 @@ def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
 class Hop:
     """The samples of one hop.
 
-    Parameters
-    ----------
-    index : int
-        From 1.
-    end : int
-        Number of samples from the start of the stream to the end of this hop.
-    samples : ndarray of float32, shape (n, M)
-        Valid until the next hop is asked for.
-
     Examples
     --------
     >>> Hop(index=1, end=4800, samples=np.zeros((4800, 2), np.float32)).end
     4800
     """
 
-    index: int
-    end: int
-    samples: Float32Array
+    index: int  # From 1
+    end: int  # Number of samples from the start of the stream to the end of this hop
+    samples: Float32Array  # shape (n, M): Valid until the next hop is asked for
 
 
 class HopCutter:
     """Collect blocks of any length and give whole hops, in time proportional to the samples.
-
-    Parameters
-    ----------
-    n_channels : int
-        Number of channels M.
-    sample_rate_hz, hop_rate_hz : float
-        Samples and hops per second.
 
     Examples
     --------
@@ -88,15 +56,7 @@ class HopCutter:
     def cut(self, block: Float32Array) -> Iterator[Hop]:
         """Take a block (n, M), give the hops that it completes; read the iterator to its end.
 
-        Parameters
-        ----------
-        block : ndarray of float32, shape (n, M)
-            Any n.
-
-        Returns
-        -------
-        iterator of Hop
-            In order.
+        Shapes: block (n, M).
         """
         while len(block):
             taken = min(len(block), self._length - self._filled)

@@ -12,20 +12,6 @@ _POWER_FLOOR = np.float32(1e-30)
 def power(spectra: Complex64Array) -> Float32Array:
     """Squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, without a square root, same shape.
 
-    Parameters
-    ----------
-    spectra : ndarray of complex64, any shape
-        X.
-
-    Returns
-    -------
-    ndarray of float32, same shape
-        |X|^2.
-
-    References
-    ----------
-    From the definition.
-
     Examples
     --------
     >>> power(np.array([3 + 4j], np.complex64))
@@ -38,17 +24,6 @@ def power(spectra: Complex64Array) -> Float32Array:
 
 def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Complex64Array:
     r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
-
-    Parameters
-    ----------
-    spectra : ndarray of complex64, any shape
-    powers : ndarray of float32, same shape, optional
-        ``power(spectra)`` if it is at hand already.
-
-    Returns
-    -------
-    ndarray of complex64, same shape
-        Of modulus one or zero.
 
     References
     ----------

@@ -13,25 +13,6 @@ from worldstate.ground.typing import ComplexArray
 def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ComplexArray:
     """Return `value` as finite complex numbers of the given shape, keeping single precision as it is.
 
-    Parameters
-    ----------
-    name : str
-        What the message calls the argument.
-    value : array_like, any shape
-        Real or complex numbers.
-    shape : sequence of int or None
-        Expected shape; `None` leaves an axis free.
-
-    Returns
-    -------
-    ndarray of complex64 or complex128
-        complex64 where the input was single precision.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another shape, a type that is no number, NaN or infinity.
-
     Examples
     --------
     >>> finite_complex("spectra", [[1, 1j]], (None, 2)).shape

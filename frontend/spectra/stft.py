@@ -12,24 +12,6 @@ class StreamingStft:
     .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N},
               \qquad w[n] = \tfrac12 - \tfrac12 \cos(2 \pi n / N)
 
-    The first frame starts at the first sample; nothing is padded. Instead of a full FFT, every half frame
-    is multiplied once by the wanted rows of the DFT matrix. Two neighbouring halves make a frame, the
-    second with sign (-1)^k, and the Hann window is the three-tap filter (-1/4, 1/2, -1/4) across bins.
-
-    Parameters
-    ----------
-    n_channels : int
-        Number of channels M.
-    nfft : int
-        Frame length N, even.
-    bins : range
-        Wanted bins, step 1, within 0 .. N/2.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If N is odd or the bins are outside.
-
     Examples
     --------
     >>> stft = StreamingStft(n_channels=1, nfft=8, bins=range(1, 3))
@@ -38,6 +20,10 @@ class StreamingStft:
     ((0, 2, 1), array([[ 2., -1.],
                        [-2.,  1.]], dtype=float32))
     """
+
+    # The first frame starts at the first sample; nothing is padded. Instead of a full FFT, every half frame
+    # is multiplied once by the wanted rows of the DFT matrix. Two neighbouring halves make a frame, the
+    # second with sign (-1)^k, and the Hann window is the three-tap filter (-1/4, 1/2, -1/4) across bins.
 
     def __init__(self, n_channels: int, nfft: int, bins: range) -> None:
         if nfft < 4 or nfft % 2:
@@ -58,14 +44,7 @@ class StreamingStft:
 
         .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N}
 
-        Parameters
-        ----------
-        samples : ndarray of float32, shape (n, M)
-            Any n.
-
-        Returns
-        -------
-        ndarray of complex64, shape (frames, bins, M)
+        Shapes: samples (n, M).
 
         References
         ----------

@@ -12,23 +12,6 @@ _EPS = float(np.finfo(np.float32).eps)
 class WindowSum:
     """Sum of the last so many sets of positive semidefinite matrices, in single precision.
 
-    Adding the newest and subtracting the oldest costs two passes, but leaves behind the rounding of whatever
-    was loud, and a sound a hundred decibels below would drown in it. So the rounding is kept account of, by
-    the traces that came and went; where it has grown to a hundred-thousandth of what is there, the window is
-    summed again.
-
-    Parameters
-    ----------
-    length : int
-        Sets in the window.
-    n_bins, size : int
-        Matrices of a set, and their rows.
-
-    Attributes
-    ----------
-    total : ndarray of complex64, shape (bins, size, size)
-        Sum of the window.
-
     Examples
     --------
     >>> window = WindowSum(3, n_bins=1, size=1)
@@ -38,6 +21,11 @@ class WindowSum:
     >>> window.total.real
     array([[[7.]]], dtype=float32)
     """
+
+    # Adding the newest and subtracting the oldest costs two passes, but leaves behind the rounding of
+    # whatever was loud, and a sound a hundred decibels below would drown in it. So the rounding is kept
+    # account of, by the traces that came and went; where it has grown to a hundred-thousandth of what is
+    # there, the window is summed again.
 
     def __init__(self, length: int, n_bins: int, size: int) -> None:
         self._parts = np.zeros((length, n_bins, size, size), np.complex64)
@@ -50,15 +38,6 @@ class WindowSum:
         r"""Take the oldest set out and give its place, for the newest to be written to.
 
         .. math:: S \leftarrow S - A_{n - L}
-
-        Returns
-        -------
-        ndarray of complex64, shape of one set
-            To be written to in place.
-
-        References
-        ----------
-        From the definition of a running sum.
         """
         oldest = self._parts[self._slot]
         self._debt += _EPS * self._traces[self._slot]
@@ -72,10 +51,6 @@ class WindowSum:
                   S \leftarrow \sum_i A_i \text{ where } \epsilon \sum_j t_j > 10^{-5} \sum_i t_i
 
         with the traces t of what is there, i, and of all that came and went since it was last summed anew, j.
-
-        References
-        ----------
-        From the definition; derived here: each pass rounds by at most the machine's epsilon of what it adds.
         """
         newest = self._parts[self._slot]
         self.total += newest

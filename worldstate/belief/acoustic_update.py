@@ -22,10 +22,8 @@ def acoustic_update(
     weight: float,
     settings: FilterSettings,
 ) -> tuple[Track, ...]:
-    """Return the tracks after the acoustic bearing and approach rate.
-
-    Each measurement is inflated by 1/`weight`, as its window overlaps the last one.
-    """
+    """Return the tracks after the acoustic bearing and approach rate."""
+    # Each measurement is inflated by 1/`weight`, as its window overlaps the last one.
     if weight <= 0.0:
         return tracks
     return tuple(

@@ -19,11 +19,10 @@ _CHANGED_MIND = 20.0
 def match_visible(
     tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], settings: FilterSettings
 ) -> dict[int, int]:
-    """Return {track index: sighting index} by global nearest neighbour in azimuth, within the gate.
-
-    The cost is the squared Mahalanobis distance, plus a penalty where one is parked and the other moves, lest
-    a vehicle that drives past a parked one changes places with it. Only tracks that vision has take part.
-    """
+    """Return {track index: sighting index} by global nearest neighbour in azimuth, within the gate."""
+    # The cost is the squared Mahalanobis distance, plus a penalty where one is parked and the other moves,
+    # lest a vehicle that drives past a parked one changes places with it. Only tracks that vision has take
+    # part.
     candidates = [i for i, track in enumerate(tracks) if track.seen]
     if not candidates or not sightings:
         return {}
@@ -39,12 +38,10 @@ def match_visible(
 def match_hidden(
     tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], scene: SiteGeometry
 ) -> dict[int, int]:
-    """Return {track index: sighting index}: hidden entities that came into view.
-
-    A vehicle comes into view near the edge of what hid it. Of a new moving sighting there are two accounts:
-    it is a hidden entity, whose side may have been heard wrongly, or it is a vehicle that nobody heard. The
-    likelier one holds, best pair first.
-    """
+    """Return {track index: sighting index}: hidden entities that came into view."""
+    # A vehicle comes into view near the edge of what hid it. Of a new moving sighting there are two accounts:
+    # it is a hidden entity, whose side may have been heard wrongly, or it is a vehicle that nobody heard. The
+    # likelier one holds, best pair first.
     pairs = sorted(
         (-score, i, j)
         for i, track in enumerate(tracks)

@@ -35,20 +35,7 @@ class LaggedBelief:
 class BeliefLag:
     r"""Past beliefs, the oldest at least one window old.
 
-    A 1-s window every 0.1 s repeats nine tenths of its samples. Multiplied in at every hop, one second of
-    sound would be believed ten times over; raised to the power 0.1, a window would take a second to be heard.
-    So each window is counted in full, onto the belief of one window ago,
-
     .. math:: p_t \propto \Big(\int p(x_t \mid x_{t-W})\, p_{t-W}\, dx_{t-W}\Big)\, \ell(y_t),
-
-    which makes ten interleaved filters of windows that do not overlap, each an exact one.
-
-    Parameters
-    ----------
-    beliefs : tuple of (int, ExplanationBelief)
-        Time stamps, ns, in order, and the posterior at each.
-    heard : tuple of SourceEvidence
-        The last word of each source, sorted by its name.
 
     Examples
     --------
@@ -58,8 +45,14 @@ class BeliefLag:
     0
     """
 
-    beliefs: tuple[tuple[int, ExplanationBelief], ...]
-    heard: tuple[SourceEvidence, ...] = ()
+    # A 1-s window every 0.1 s repeats nine tenths of its samples. Multiplied in at every hop, one second of
+    # sound would be believed ten times over; raised to the power 0.1, a window would take a second to be
+    # heard. So each window is counted in full, onto the belief of one window ago,
+    #
+    # which makes ten interleaved filters of windows that do not overlap, each an exact one.
+
+    beliefs: tuple[tuple[int, ExplanationBelief], ...]  # Time stamps, ns, in order, and the posterior at each
+    heard: tuple[SourceEvidence, ...] = ()  # The last word of each source, sorted by its name
 
     def base(self, source: str, stamp_ns: int, window_ns: int) -> LaggedBelief:
         """Return the newest belief that is a window old, or the oldest there is."""

@@ -34,14 +34,7 @@ def birth_death(
 ) -> BirthDeath:
     """Return the world with hidden entities born, refreshed and dropped, one at most per side.
 
-    Parameters
-    ----------
-    tracks, explanation, births
-        The world before; `births` counts per side.
-    alarmed : sequence of bool, shape (K,)
-        Whether an advisory names the side: a cue without an entity to point at would be of no use.
-    rearmed : sequence of bool, shape (K,)
-        Whether the side may bring forth an entity again after a hand-over.
+    Shapes: alarmed (K,), rearmed (K,).
     """
     settings, kept, counts = scene.settings, list(tracks), list(births)
     begun = []

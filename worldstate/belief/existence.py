@@ -8,18 +8,6 @@ def after_empty_look(existence: float, miss_rate: float) -> float:
 
     .. math:: r \leftarrow \frac{r (1 - p_D)}{1 - r\, p_D}, \qquad 1 - p_D = \beta.
 
-    Parameters
-    ----------
-    existence : float
-        r before, in [0, 1].
-    miss_rate : float
-        beta, in [0, 1].
-
-    Returns
-    -------
-    float
-        r after.
-
     Examples
     --------
     >>> round(after_empty_look(0.788, 0.1), 3)
@@ -34,18 +22,6 @@ def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> f
 
     .. math:: r \leftarrow \frac{r\, p_D}{r\, p_D + (1 - r)\, c}
 
-    Parameters
-    ----------
-    existence : float
-        r before, in [0, 1].
-    miss_rate, clutter_rate : float
-        beta and c, in [0, 1].
-
-    Returns
-    -------
-    float
-        r after.
-
     Examples
     --------
     >>> round(after_sighting(0.5, 0.04, 0.01), 3)
@@ -57,18 +33,6 @@ def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> f
 
 def after_time(existence: float, step_s: float, mean_life_s: float) -> float:
     """Return the existence after a time in which nobody looked.
-
-    Parameters
-    ----------
-    existence : float
-        r before, in [0, 1].
-    step_s, mean_life_s : float
-        Time that passed, and after which a share 1/e is left, seconds.
-
-    Returns
-    -------
-    float
-        r after.
 
     Examples
     --------

@@ -23,13 +23,6 @@ class ExplanationBelief:
 
     predict is the Chapman-Kolmogorov step :math:`p \leftarrow p\, e^{Q\,dt}`, update is eq. (post).
 
-    Parameters
-    ----------
-    directions : tuple of str
-        The K approach sides.
-    log_probabilities : tuple of float
-        In the order of `chain`, length 2K + 2, nats.
-
     Examples
     --------
     >>> start = ExplanationBelief.settled(("left", "right"), (0.05, 0.3, 0.1, 0.05, 0.05, 0.3))
@@ -37,8 +30,8 @@ class ExplanationBelief:
     (0.176, 0.235, 0.588)
     """
 
-    directions: tuple[str, ...]
-    log_probabilities: tuple[float, ...]
+    directions: tuple[str, ...]  # The K approach sides
+    log_probabilities: tuple[float, ...]  # In the order of `chain`, length 2K + 2, nats
 
     @classmethod
     def settled(cls, directions: tuple[str, ...], rates_hz: RatesHz) -> "ExplanationBelief":
@@ -96,12 +89,7 @@ class ExplanationBelief:
     ) -> "ExplanationBelief":
         """Return the belief after one look.
 
-        Parameters
-        ----------
-        evidence : SignatureEvidence
-            Log-likelihoods of the signature.
-        log_co_evidence : array, shape (K + 2,)
-            log p(V | hidden_1 .. hidden_K, visible, none); -inf where impossible.
+        Shapes: log_co_evidence (K + 2,).
         """
         k = len(self.directions)
         parts = np.array(self.log_probabilities[k:-1])
@@ -113,10 +101,8 @@ class ExplanationBelief:
         return replace(self, log_probabilities=tuple(np.maximum(spread, LOG_FLOOR).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
-        """Return the belief once vision has the vehicle of a direction: its mass is in view, accounted for.
-
-        `residual` is the share that stays hidden: the sighting may have been of another vehicle.
-        """
+        """Return the belief once vision has the vehicle of a direction: its mass is in view, accounted for."""
+        # `residual` is the share that stays hidden: the sighting may have been of another vehicle.
         p, k = self.probabilities, len(self.directions)
         moved = p[direction] * (1.0 - residual)
         p[direction] -= moved

@@ -25,18 +25,6 @@ LONGEST_STEP_S = 1000.0
 def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
     r"""Return Q, shape (2K + 2, 2K + 2), 1/s: row i holds the rates out of state i and sums to zero.
 
-    Parameters
-    ----------
-    rates_hz : tuple
-        Transition rates between the explanations, 1/s.
-    directions : int
-        K.
-
-    Returns
-    -------
-    ndarray, shape (2K + 2, 2K + 2)
-        1/s.
-
     Examples
     --------
     >>> generator((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 1)
@@ -64,20 +52,6 @@ def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
 def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
     r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only.
 
-    Parameters
-    ----------
-    rates_hz : tuple
-        As for `generator`.
-    directions : int
-        K.
-    step_ns : int
-        dt, nanoseconds.
-
-    Returns
-    -------
-    ndarray, shape (2K + 2, 2K + 2)
-        Not to be written to.
-
     Examples
     --------
     >>> transition((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2, 100_000_000).sum(axis=1).round(12)
@@ -93,18 +67,6 @@ def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
 @lru_cache(maxsize=64)
 def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
     """Return where the chain settles from "none", shape (2K + 2,).
-
-    Parameters
-    ----------
-    rates_hz : tuple
-        As for `generator`.
-    directions : int
-        K.
-
-    Returns
-    -------
-    ndarray, shape (2K + 2,)
-        Sums to one.
 
     Examples
     --------

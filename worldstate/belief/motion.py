@@ -21,13 +21,6 @@ _CLOSEST_SHARE = 0.5
 class MotionBelief:
     """Gaussian over (theta, theta_dot, rho, log r); see `polar`.
 
-    Parameters
-    ----------
-    mean : array, shape (4,)
-        theta wrapped into (-pi, pi].
-    covariance : array, shape (4, 4)
-        Symmetric positive definite.
-
     Examples
     --------
     >>> belief = MotionBelief.around((0.9, 0.0, -0.2, 3.2), (0.35, 0.1, 0.2, 0.6))
@@ -36,8 +29,8 @@ class MotionBelief:
     (0.674, 0.174)
     """
 
-    mean: FloatArray
-    covariance: FloatArray
+    mean: FloatArray  # shape (4,): theta wrapped into (-pi, pi]
+    covariance: FloatArray  # shape (4, 4): Symmetric positive definite
 
     @classmethod
     def around(

@@ -33,17 +33,7 @@ _LEAST_Q = 1e-3
 def propagate(state: FloatArray, step_s: float) -> FloatArray:
     """Return the state (theta, theta_dot, rho, log r) after `step_s`, shape (4,); theta is not wrapped.
 
-    Parameters
-    ----------
-    state : ndarray, shape (4,)
-        theta in rad, theta_dot in rad/s, rho in 1/s, log of r in metres.
-    step_s : float
-        Seconds.
-
-    Returns
-    -------
-    ndarray, shape (4,)
-        In the same units.
+    Shapes: state (4,).
 
     Examples
     --------
@@ -61,17 +51,7 @@ def propagate(state: FloatArray, step_s: float) -> FloatArray:
 def jacobian(state: FloatArray, step_s: float) -> FloatArray:
     """Return d propagate / d state, shape (4, 4).
 
-    Parameters
-    ----------
-    state : ndarray, shape (4,)
-        As for `propagate`.
-    step_s : float
-        Seconds.
-
-    Returns
-    -------
-    ndarray, shape (4, 4)
-        Rows: what is derived; columns: by what.
+    Shapes: state (4,).
 
     Examples
     --------
@@ -99,20 +79,6 @@ def jacobian(state: FloatArray, step_s: float) -> FloatArray:
 
 def process_noise(acceleration_psd: float, range_m: float, step_s: float) -> FloatArray:
     r"""Return Q, shape (4, 4), of a white acceleration: at range r it turns and closes by a/r.
-
-    Parameters
-    ----------
-    acceleration_psd : float
-        Spectral density per axis, m^2/s^3.
-    range_m : float
-        Range that accelerations are divided by, m.
-    step_s : float
-        Time step, s.
-
-    Returns
-    -------
-    ndarray, shape (4, 4)
-        Symmetric.
 
     Examples
     --------

@@ -13,24 +13,15 @@ from .settings import FilterSettings
 class SideGeometry:
     """One approach side.
 
-    Parameters
-    ----------
-    label : str
-        Direction label of the signature model.
-    edge_azimuth_rad : float
-        Edge of the occluder.
-    azimuth_rad, std_rad : float
-        Where vehicles are while it hides them.
-
     Examples
     --------
     >>> round(SideGeometry("left", 0.56, 0.96, 0.35).distance_rad(-0.2), 2)
     0.76
     """
 
-    label: str
-    edge_azimuth_rad: float
-    azimuth_rad: float
+    label: str  # Direction label of the signature model
+    edge_azimuth_rad: float  # Edge of the occluder
+    azimuth_rad: float  # Where vehicles are while it hides them
     std_rad: float
 
     def distance_rad(self, azimuth_rad: float) -> float:
@@ -48,21 +39,11 @@ class SideGeometry:
 
 @dataclass(frozen=True, slots=True)
 class SiteGeometry:
-    """What stays the same from step to step.
+    """What stays the same from step to step."""
 
-    Parameters
-    ----------
-    sides : tuple of SideGeometry
-        Approach sides, in the order of the signature's directions.
-    view_half_angle_rad : float
-        Half the field of view of the co-evidence channel, centred on the x axis.
-    settings : FilterSettings
-        Noise levels, gates, births and deaths.
-    """
-
-    sides: tuple[SideGeometry, ...]
-    view_half_angle_rad: float
-    settings: FilterSettings
+    sides: tuple[SideGeometry, ...]  # Approach sides, in the order of the signature's directions
+    view_half_angle_rad: float  # Half the field of view of the co-evidence channel, centred on the x axis
+    settings: FilterSettings  # Noise levels, gates, births and deaths
 
     def prior(self, side: int) -> MotionBelief:
         """Return what is known of a vehicle hidden on a side."""

@@ -19,73 +19,28 @@ _IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """What is believed of one entity.
+    """What is believed of one entity."""
 
-    Parameters
-    ----------
-    id : str
-        UUID for life.
-    side : int
-        Index of the approach side that it is hidden on, came from, or first appeared nearest to.
-    seen : bool
-        Whether vision has it; before that its existence is read from the explanation belief.
-    existence : float
-        Existence probability.
-    motion : MotionBelief
-        Azimuth, rates, log range.
-    labels : tuple of (str, float)
-        Class probabilities, sorted by label.
-    moving : bool
-        False for what vision holds for parked.
-    sources : tuple of str
-        Modalities that contributed, sorted.
-    created_ns, updated_ns : int
-        Birth and last measurement that moved it.
-    last_seen_ns : int or None
-        Last sighting.
-    answer : {"visible", "absent", "unqueried"}
-        Last answer of the co-evidence channel about it.
-    miss_rate : float or None
-        beta of that answer.
-    approach_heard : bool
-        Whether its approach rate was ever measured.
-    was_hidden : bool
-        Whether it was ever heard before it was seen, or lost from view and heard again.
-    """
-
-    id: str
-    side: int
-    seen: bool
-    existence: float
-    motion: MotionBelief
-    labels: tuple[tuple[str, float], ...]
-    moving: bool
-    sources: tuple[str, ...]
-    created_ns: int
+    id: str  # UUID for life
+    side: int  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
+    seen: bool  # Whether vision has it; before that its existence is read from the explanation belief
+    existence: float  # Existence probability
+    motion: MotionBelief  # Azimuth, rates, log range
+    labels: tuple[tuple[str, float], ...]  # Class probabilities, sorted by label
+    moving: bool  # False for what vision holds for parked
+    sources: tuple[str, ...]  # Modalities that contributed, sorted
+    created_ns: int  # Birth and last measurement that moved it
     updated_ns: int
-    last_seen_ns: int | None = None
-    answer: str = "unqueried"
-    miss_rate: float | None = None
-    approach_heard: bool = False
+    last_seen_ns: int | None = None  # Last sighting
+    answer: str = "unqueried"  # Last answer of the co-evidence channel about it
+    miss_rate: float | None = None  # beta of that answer
+    approach_heard: bool = False  # Whether its approach rate was ever measured
+    # Whether it was ever heard before it was seen, or lost from view and heard again.
     was_hidden: bool = False
 
 
 def entity_id(stream: str, kind: str, number: int) -> str:
     """Return the UUID of the n-th entity of a kind in a stream: no randomness, so the same run names alike.
-
-    Parameters
-    ----------
-    stream : str
-        Name of the stream.
-    kind : str
-        Hidden or visible.
-    number : int
-        n.
-
-    Returns
-    -------
-    str
-        In the usual notation.
 
     Examples
     --------
@@ -96,10 +51,9 @@ def entity_id(stream: str, kind: str, number: int) -> str:
 
 
 def predict_track(track: Track, hidden_share: float, step_s: float, scene: SiteGeometry) -> Track:
-    """Return the track after a time step.
-
-    `hidden_share` is P(hidden | exists): as far as it is hidden, its azimuth stays where hidden vehicles are.
-    """
+    """Return the track after a time step."""
+    # `hidden_share` is P(hidden | exists): as far as it is hidden, its azimuth stays where hidden vehicles
+    # are.
     settings = scene.settings
     acceleration = settings.acceleration_psd if track.moving else _PARKED_ACCELERATION
     motion = predict(track.motion, step_s, acceleration)
@@ -113,18 +67,6 @@ def predict_track(track: Track, hidden_share: float, step_s: float, scene: SiteG
 
 def relabelled(labels: tuple[tuple[str, float], ...], sighting: Sighting) -> tuple[tuple[str, float], ...]:
     """Return class probabilities drawn a step towards what a detector just said.
-
-    Parameters
-    ----------
-    labels : tuple of (str, float)
-        Class names with their probabilities.
-    sighting : Sighting
-        What a detector said.
-
-    Returns
-    -------
-    tuple of (str, float)
-        Sum to one.
 
     Examples
     --------

@@ -26,18 +26,7 @@ SCHEMA_VERSION = "2.0.0"
 
 
 def memory_to_dict(memory: Memory) -> dict[str, Any]:
-    """Return all that the filter carries.
-
-    Parameters
-    ----------
-    memory : Memory
-        Of a filter.
-
-    Returns
-    -------
-    dict
-        For `json.dumps`.
-    """
+    """Return all that the filter carries."""
     return {
         "stamp_ns": memory.stamp_ns,
         "log_explanations": list(memory.explanation.log_probabilities),
@@ -56,27 +45,7 @@ def memory_to_dict(memory: Memory) -> dict[str, Any]:
 
 
 def memory_from_record(record: Record, directions: tuple[str, ...], policy: CueingPolicy) -> Memory:
-    """Return what `memory_to_dict` wrote.
-
-    Parameters
-    ----------
-    record : Record
-        Of the checkpoint.
-    directions : tuple of str
-        Sides.
-    policy : CueingPolicy
-        Of the filter.
-
-    Returns
-    -------
-    Memory
-        The filter goes on from it to the bit.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a value is missing, of the wrong type or out of range; the message says where.
-    """
+    """Return what `memory_to_dict` wrote."""
     k = len(directions)
     return Memory(
         stamp_ns=record.integer("stamp_ns"),
@@ -99,35 +68,13 @@ def memory_from_record(record: Record, directions: tuple[str, ...], policy: Cuei
 
 
 def settings_to_dict(settings: FilterSettings) -> dict[str, Any]:
-    """Return the settings; a tuple becomes a list.
-
-    Parameters
-    ----------
-    settings : FilterSettings
-        Of a filter.
-
-    Returns
-    -------
-    dict
-        For `json.dumps`.
-    """
+    """Return the settings; a tuple becomes a list."""
     values = {field.name: getattr(settings, field.name) for field in fields(settings)}
     return values | {"hidden_std": list(settings.hidden_std)}
 
 
 def settings_from_record(record: Record) -> FilterSettings:
-    """Return what `settings_to_dict` wrote; errors are those of `memory_from_record`.
-
-    Parameters
-    ----------
-    record : Record
-        Of the checkpoint.
-
-    Returns
-    -------
-    FilterSettings
-        Checked.
-    """
+    """Return what `settings_to_dict` wrote; errors are those of `memory_from_record`."""
     spread = record.vector("hidden_std")
     names = [field.name for field in fields(FilterSettings) if field.name not in ("hidden_std", "stream")]
     numbers = {name: record.number(name) for name in names}
@@ -135,23 +82,7 @@ def settings_from_record(record: Record) -> FilterSettings:
 
 
 def policy_from_record(record: Record) -> CueingPolicy:
-    """Return the policy that its `to_dict` wrote.
-
-    Parameters
-    ----------
-    record : Record
-        Of the checkpoint.
-
-    Returns
-    -------
-    CueingPolicy
-        Ready to use.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a value is missing or out of range.
-    """
+    """Return the policy that its `to_dict` wrote."""
     try:
         return CueingPolicy.from_dict(record.raw)
     except (KeyError, TypeError, ValueError, OverflowError) as error:

@@ -13,50 +13,22 @@ from worldstate.state import Context, Priors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Memory:
-    """All of it; the rest of a filter is configuration.
+    """All of it; the rest of a filter is configuration."""
 
-    Parameters
-    ----------
-    stamp_ns : int
-        Time of the belief.
-    explanation : ExplanationBelief
-        Which explanation holds.
-    trail : BeliefLag
-        Its past of one window.
-    rule : SustainedRule
-        Run of the statistic above its threshold.
-    births : tuple of int
-        Hidden entities that each side has brought forth.
-    handover_ns : tuple of int or None
-        Last hand-over on each side.
-    tracks : tuple of Track
-        Entities.
-    seq : int
-        Measurements so far.
-    sighted : int
-        Entities that vision brought in by itself.
-    last_ns : tuple of (str, int)
-        Last time stamp of each source.
-    predicted : Priors or None
-        Explanation priors of the last update; None before the first.
-    instant : Posterior or None
-        Posterior of the last window alone, at the policy's reference prior; None before the first.
-    threshold : AdaptiveThreshold
-        How far the threshold has moved, where the policy lets it.
-    """
-
-    stamp_ns: int
-    explanation: ExplanationBelief
-    trail: BeliefLag
-    rule: SustainedRule
-    births: tuple[int, ...]
-    handover_ns: tuple[int | None, ...]
-    tracks: tuple[Track, ...] = ()
-    seq: int = 0
-    sighted: int = 0
-    last_ns: tuple[tuple[str, int], ...] = ()
-    predicted: Priors | None = None
+    stamp_ns: int  # Time of the belief
+    explanation: ExplanationBelief  # Which explanation holds
+    trail: BeliefLag  # Its past of one window
+    rule: SustainedRule  # Run of the statistic above its threshold
+    births: tuple[int, ...]  # Hidden entities that each side has brought forth
+    handover_ns: tuple[int | None, ...]  # Last hand-over on each side
+    tracks: tuple[Track, ...] = ()  # Entities
+    seq: int = 0  # Measurements so far
+    sighted: int = 0  # Entities that vision brought in by itself
+    last_ns: tuple[tuple[str, int], ...] = ()  # Last time stamp of each source
+    predicted: Priors | None = None  # Explanation priors of the last update; None before the first
+    # Posterior of the last window alone, at the policy's reference prior; None before the first.
     instant: Posterior | None = None
+    # How far the threshold has moved, where the policy lets it.
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
 
 

@@ -98,10 +98,8 @@ def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, 
 def _with_hand_overs(
     signature: SignatureEvidence, handover_ns: tuple[int | None, ...], begin_ns: int
 ) -> SignatureEvidence:
-    """Return the signature, a source in view explaining what it sounded like while it still hid.
-
-    The window that begins at `begin_ns` holds sound from before a hand-over within it.
-    """
+    """Return the signature, a source in view explaining what it sounded like while it still hid."""
+    # The window that begins at `begin_ns` holds sound from before a hand-over within it.
     pairs = zip(signature.hidden, handover_ns, strict=True)
     before = [hidden for hidden, stamp_ns in pairs if stamp_ns is not None and stamp_ns > begin_ns]
     return replace(signature, visible=max([signature.visible, *before]))

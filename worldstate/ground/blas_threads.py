@@ -10,17 +10,6 @@ from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 def one_blas_thread() -> AbstractContextManager[Any]:
     """Keep BLAS on the calling thread while inside; afterwards as it was.
 
-    The front-end multiplies thousands of small matrices a second. A second BLAS thread gains nothing there,
-    and where other programs keep the processor busy every product would wait for it to be scheduled
-    (measured on two busy cores: four times the processor time). It also keeps results the same bit for bit
-    on any number of cores. The limit is the process's: products that other threads of the host begin
-    meanwhile, about a millisecond in a hundred, run on one thread too. It costs 16 microseconds.
-
-    Returns
-    -------
-    context manager
-        Restores the number of threads when it is left.
-
     Examples
     --------
     >>> import numpy as np
@@ -28,6 +17,11 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     ...     np.ones((2, 2)) @ np.ones(2)
     array([2., 2.])
     """
+    # The front-end multiplies thousands of small matrices a second. A second BLAS thread gains nothing there,
+    # and where other programs keep the processor busy every product would wait for it to be scheduled
+    # (measured on two busy cores: four times the processor time). It also keeps results the same bit for bit
+    # on any number of cores. The limit is the process's: products that other threads of the host begin
+    # meanwhile, about a millisecond in a hundred, run on one thread too. It costs 16 microseconds.
     return _controller().limit(limits=1)  # type: ignore[no-any-return]
 
 

@@ -16,25 +16,6 @@ from .errors import InvalidArgumentError
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:
     """Return `value` as finite float64 of the given shape; `None` leaves an axis free.
 
-    Parameters
-    ----------
-    name : str
-        What the message calls the argument.
-    value : array_like, any shape
-        Numbers.
-    shape : sequence of int or None
-        Expected shape.
-
-    Returns
-    -------
-    ndarray of float64
-        The same object where it already was one.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On another shape, a type that is no number, NaN or infinity.
-
     Examples
     --------
     >>> finite_array("position_m", [1, 2, 3], (3,))
@@ -53,18 +34,6 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
 def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None]) -> None:
     """Refuse a shape that does not fit; `None` in `expected` leaves an axis free.
 
-    Parameters
-    ----------
-    name : str
-        What the message calls the argument.
-    got, expected : sequence of int
-        Shapes; None in the expected one leaves an axis free.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the shapes do not agree.
-
     Examples
     --------
     >>> check_shape("block", (4800, 56), (None, 56))
@@ -79,27 +48,6 @@ def in_range(
     name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False
 ) -> float:
     """Return `value` as a float if it lies in the range, ends included unless said otherwise.
-
-    Parameters
-    ----------
-    name : str
-        What the message calls the argument.
-    value : float
-        The number.
-    low, high : float
-        Ends of the range.
-    open_low, open_high : bool
-        Whether that end is left out.
-
-    Returns
-    -------
-    float
-        The number.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is no number, not finite, or outside.
 
     Examples
     --------

@@ -12,22 +12,12 @@ Result = TypeVar("Result")
 def in_processes(work: Callable[[Item], Result], items: Sequence[Item], jobs: int) -> Iterator[Result]:
     """Yield ``work(item)`` for every item, in the order of the items.
 
-    Processes are spawned, not forked: threads of a numerical library do not survive a fork.
-
-    Parameters
-    ----------
-    work : callable
-        A function of a module, or a partial of one, where there is more than one process.
-    items : sequence
-        What it is called with.
-    jobs : int
-        Processes; with one, or one item, everything runs in this one.
-
     Examples
     --------
     >>> list(in_processes(abs, [-2, 1], jobs=1))
     [2, 1]
     """
+    # Processes are spawned, not forked: threads of a numerical library do not survive a fork.
     if jobs == 1 or len(items) <= 1:
         yield from map(work, items)
         return

@@ -16,18 +16,13 @@ MOST_ITEMS = 100_000
 class Record:
     """A decoded JSON object with the place that it stands in, for messages.
 
-    Unknown keys are ignored; a key that is not there reads as null.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If `value` is no JSON object.
-
     Examples
     --------
     >>> Record({"risk": 0.5, "other": 1}, "cue").number("risk")
     0.5
     """
+
+    # Unknown keys are ignored; a key that is not there reads as null.
 
     __slots__ = ("_value", "where")
 
@@ -47,144 +42,72 @@ class Record:
         return None if self._value.get(key) is None else read(key)
 
     def text(self, key: str) -> str:
-        """Return a string.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a string."""
         value = self._value.get(key)
         if not isinstance(value, str):
             raise self._refusal(key, "text", value)
         return value
 
     def flag(self, key: str) -> bool:
-        """Return a boolean.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a boolean."""
         value = self._value.get(key)
         if not isinstance(value, bool):
             raise self._refusal(key, "true or false", value)
         return value
 
     def integer(self, key: str) -> int:
-        """Return a whole number that fits 64 bits.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a whole number that fits 64 bits."""
         value = self._value.get(key)
         if not isinstance(value, int) or isinstance(value, bool) or abs(value) >= 1 << 63:
             raise self._refusal(key, "a whole number of 64 bits", value)
         return value
 
     def number(self, key: str) -> float:
-        """Return a finite number.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a finite number."""
         return self._finite(key, self._value.get(key))
 
     def probability(self, key: str) -> float:
-        """Return a number in [0, 1].
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a number in [0, 1]."""
         value = self.number(key)
         if not 0.0 <= value <= 1.0:
             raise self._refusal(key, "a number in [0, 1]", value)
         return value
 
     def one_of(self, key: str, allowed: tuple[str, ...]) -> str:
-        """Return a string out of a closed set.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none of these.
-        """
+        """Return a string out of a closed set."""
         value = self.text(key)
         if value not in allowed:
             raise self._refusal(key, f"one of {', '.join(allowed)}", value)
         return value
 
     def record(self, key: str) -> "Record":
-        """Return an object.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return an object."""
         return Record(self._value.get(key), f"{self.where}.{key}")
 
     def records(self, key: str) -> "list[Record]":
-        """Return a list of objects.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a list of objects."""
         return [Record(item, f"{self.where}.{key}[{i}]") for i, item in enumerate(self._items(key))]
 
     def texts(self, key: str) -> tuple[str, ...]:
-        """Return a list of strings.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a list of strings."""
         items = self._items(key)
         if not all(isinstance(item, str) for item in items):
             raise self._refusal(key, "a list of text", items)
         return tuple(items)
 
     def numbers(self, key: str) -> tuple[float, ...]:
-        """Return a list of finite numbers.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a list of finite numbers."""
         return tuple(self._finite(key, item) for item in self._items(key))
 
     def vector(self, key: str) -> tuple[float, float, float]:
-        """Return three finite numbers.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If they are not three.
-        """
+        """Return three finite numbers."""
         items = self.numbers(key)
         if len(items) != 3:
             raise self._refusal(key, "three numbers", items)
         return items[0], items[1], items[2]
 
     def integers(self, key: str) -> tuple[int, ...]:
-        """Return a list of whole numbers.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If it is none.
-        """
+        """Return a list of whole numbers."""
         items = self._items(key)
         if not all(isinstance(item, int) and not isinstance(item, bool) for item in items):
             raise self._refusal(key, "a list of whole numbers", items)
@@ -213,23 +136,6 @@ class Record:
 def decode_json(text: str, where: str) -> object:
     """Decode strict JSON: no NaN, no infinity, bounded size and depth.
 
-    Parameters
-    ----------
-    text : str
-        JSON.
-    where : str
-        What the message calls it.
-
-    Returns
-    -------
-    object
-        Decoded.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is none.
-
     Examples
     --------
     >>> decode_json('{"a": 1}', "snapshot")
@@ -245,18 +151,6 @@ def decode_json(text: str, where: str) -> object:
 
 def check_schema(record: Record, name: str, version: str) -> None:
     """Accept the named schema in any version of the same major number.
-
-    Parameters
-    ----------
-    record : Record
-        With an object "schema".
-    name, version : str
-        What is understood.
-
-    Raises
-    ------
-    SchemaVersionError
-        On another schema or major version.
 
     Examples
     --------

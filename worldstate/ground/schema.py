@@ -12,16 +12,6 @@ MOST_ITEMS = 100_000
 def schema_stamp(name: str, version: str) -> dict[str, Any]:
     """Return the entry that names schema and version.
 
-    Parameters
-    ----------
-    name, version : str
-        Of the schema.
-
-    Returns
-    -------
-    dict
-        To be merged into the values.
-
     Examples
     --------
     >>> schema_stamp("worldstate.MissRateTable", "1.0.0")
@@ -32,27 +22,6 @@ def schema_stamp(name: str, version: str) -> dict[str, Any]:
 
 def check_schema(data: object, name: str, version: str, source: object) -> Mapping[str, Any]:
     """Return `data` as a mapping if it says that it is of this schema and major version.
-
-    Parameters
-    ----------
-    data : object
-        What was read, for example from JSON.
-    name, version : str
-        What the caller writes itself.
-    source : object
-        Where `data` comes from; errors begin with it.
-
-    Returns
-    -------
-    mapping
-        The same data.
-
-    Raises
-    ------
-    InputFileError
-        If it is no mapping or of another schema.
-    SchemaVersionError
-        If its major version is another one.
 
     Examples
     --------
@@ -73,23 +42,6 @@ def check_schema(data: object, name: str, version: str, source: object) -> Mappi
 def read_number(value: object, name: str) -> float:
     """Return a finite number; text and booleans are none.
 
-    Parameters
-    ----------
-    value : object
-        Decoded JSON.
-    name : str
-        What the message calls it.
-
-    Returns
-    -------
-    float
-        Finite.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is none.
-
     Examples
     --------
     >>> read_number(3, "slope")
@@ -104,23 +56,6 @@ def read_number(value: object, name: str) -> float:
 def read_numbers(value: object, name: str) -> tuple[float, ...]:
     """Return a list of finite numbers.
 
-    Parameters
-    ----------
-    value : object
-        Decoded JSON.
-    name : str
-        What the message calls it.
-
-    Returns
-    -------
-    tuple of float
-        All finite.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is none, or longer than 100,000.
-
     Examples
     --------
     >>> read_numbers([1, 2.5], "risks")
@@ -131,23 +66,6 @@ def read_numbers(value: object, name: str) -> tuple[float, ...]:
 
 def read_rows(value: object, name: str) -> tuple[tuple[float, ...], ...]:
     """Return a list of lists of finite numbers.
-
-    Parameters
-    ----------
-    value : object
-        Decoded JSON.
-    name : str
-        What the message calls it.
-
-    Returns
-    -------
-    tuple of tuple of float
-        All finite.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is none, or longer than 100,000.
 
     Examples
     --------

@@ -41,11 +41,6 @@ class Patch:
 class View:
     """A pinhole camera with a few rays a pixel.
 
-    Parameters
-    ----------
-    camera : PinholeCamera
-        Size of the image, angle of view, place and direction.
-
     Examples
     --------
     >>> view = View(PinholeCamera(width_px=64, height_px=40))
@@ -53,7 +48,7 @@ class View:
     ((80, 128), (80, 128, 3))
     """
 
-    camera: PinholeCamera
+    camera: PinholeCamera  # Size of the image, angle of view, place and direction
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -109,37 +104,19 @@ def _whole(values: FloatArray, limit: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A rectangle across one axis, painted.
+    """A rectangle across one axis, painted."""
 
-    Parameters
-    ----------
-    axis : int
-        0, 1 or 2: the coordinate that is constant.
-    at_m : float
-        Its value.
-    limits_m : tuple of two (float, float)
-        Ranges of the two others, in the order of the axes.
-    paint : callable
-        Colour by those two coordinates.
-    """
-
-    axis: int
-    at_m: float
+    axis: int  # 0, 1 or 2: the coordinate that is constant
+    at_m: float  # Its value
+    # Ranges of the two others, in the order of the axes.
     limits_m: tuple[tuple[float, float], tuple[float, float]]
-    paint: Paint
+    paint: Paint  # Colour by those two coordinates
 
 
 def cast_panels(
     view: View, patch: Patch, panels: list[Panel], sky: Paint
 ) -> tuple[Float32Array, Float32Array]:
-    """Paint a patch of rays with the nearest panel that each meets, or the sky.
-
-    Returns
-    -------
-    (image, depth)
-        Shapes (rows, columns, 3) and (rows, columns): colours, and metres along the optical axis, infinite
-        where only the sky is. The sky is painted by direction: left and up per unit ahead.
-    """
+    """Paint a patch of rays with the nearest panel that each meets, or the sky."""
     rays, eye = view.rays(patch), view.camera.position_m
     image = sky(rays[..., 1] / rays[..., 0], rays[..., 2] / rays[..., 0])
     depth = np.full(rays.shape[:2], np.inf, np.float32)
@@ -161,20 +138,7 @@ def cast_solid(
 ) -> tuple[Float32Array, IndexArray]:
     r"""Meet a convex solid :math:`\{p : n_k \cdot p \le o_k\}`.
 
-    Parameters
-    ----------
-    rays : ndarray, shape (rows, columns, 3)
-        Directions.
-    eye_m : ndarray, shape (3,)
-        Where they start, outside the solid.
-    normals, offsets : ndarray, shapes (K, 3) and (K,)
-        Its faces.
-
-    Returns
-    -------
-    (reach, face)
-        Shape (rows, columns) each: length in units of the ray, infinite where it is missed, and the face that
-        is met.
+    Shapes: rays (rows, columns, 3), eye_m (3,), normals, offsets (K, 3), returns (rows, columns).
 
     Examples
     --------

@@ -25,21 +25,11 @@ BRICKS = ((134.0, 92.0, 76.0), (150.0, 120.0, 96.0), (116.0, 88.0, 80.0), (160.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetView:
-    """What does not move, painted once.
+    """What does not move, painted once."""
 
-    Parameters
-    ----------
-    view : View
-        The camera.
-    image : ndarray of uint8, shape (rows, columns, 3)
-        One colour a ray.
-    depth : ndarray of float32, shape (rows, columns)
-        Metres along the optical axis.
-    """
-
-    view: View
-    image: ImageArray
-    depth: Float32Array
+    view: View  # The camera
+    image: ImageArray  # shape (rows, columns, 3): One colour a ray
+    depth: Float32Array  # shape (rows, columns): Metres along the optical axis
 
     def pixels(self) -> Float32Array:
         """Return the image itself, shape (height, width, 3)."""
@@ -49,15 +39,7 @@ class StreetView:
 
 
 def look_at(site: Site, view: View) -> StreetView:
-    """Paint a site; it has the same face in every recording.
-
-    Parameters
-    ----------
-    site : Site
-        The junction.
-    view : View
-        The camera.
-    """
+    """Paint a site; it has the same face in every recording."""
     panels = street_panels(site)
     rows, columns = view.shape
     image, depth = np.empty((rows, columns, 3), np.uint8), np.empty((rows, columns), np.float32)

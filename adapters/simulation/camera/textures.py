@@ -100,27 +100,13 @@ def _courses(a: Float32Array, b: Float32Array, length_m: float, height_m: float,
 
 @dataclass(frozen=True, slots=True)
 class Facade:
-    """A house front: brick, windows in every storey, doors at the ground.
+    """A house front: brick, windows in every storey, doors at the ground."""
 
-    Parameters
-    ----------
-    colour : tuple of float
-        Of the brick.
-    bay_m : float
-        Distance between windows.
-    foot_m : float
-        Coordinate of the ground.
-    brightness : float
-        Of the light that falls on it.
-    seed : int
-        Which house.
-    """
-
-    colour: Colour
-    bay_m: float
-    foot_m: float
-    brightness: float
-    seed: int
+    colour: Colour  # Of the brick
+    bay_m: float  # Distance between windows
+    foot_m: float  # Coordinate of the ground
+    brightness: float  # Of the light that falls on it
+    seed: int  # Which house
 
     def paint(self, a: Float32Array, b: Float32Array) -> Float32Array:
         """Colours at places along the wall and up."""

@@ -61,22 +61,12 @@ _CABIN = {
 
 @dataclass(frozen=True, slots=True)
 class Car:
-    """A car across the street.
+    """A car across the street."""
 
-    Parameters
-    ----------
-    lane_x_m, front_y_m : float
-        Middle of its lane and its front bumper, in `base_link`.
-    heading : int
-        +1 towards +y, -1 towards -y.
-    colour : tuple of float
-        Of the paint.
-    """
-
-    lane_x_m: float
+    lane_x_m: float  # Middle of its lane and its front bumper, in `base_link`
     front_y_m: float
-    heading: int
-    colour: Colour
+    heading: int  # +1 towards +y, -1 towards -y
+    colour: Colour  # Of the paint
 
     def corners_m(self) -> FloatArray:
         """Corners of the cuboid that holds the car and its shadow, in `base_link`, shape (8, 3)."""
@@ -104,10 +94,8 @@ def add_car(street: StreetView, car: Car, image: Float32Array) -> None:
 
 
 def with_parked_car(street: StreetView, car: Car) -> StreetView:
-    """Return the street with a car that belongs to it.
-
-    It hides nothing that drives: narrow streets have lanes that parked cars reach into.
-    """
+    """Return the street with a car that belongs to it."""
+    # It hides nothing that drives: narrow streets have lanes that parked cars reach into.
     patch = street.view.around(car.corners_m())
     if patch is None:
         return street

@@ -39,24 +39,13 @@ UNKNOWN_PLACE = 99
 
 @dataclass(frozen=True, slots=True)
 class LogRow:
-    """One line of `DataLog.csv`.
+    """One line of `DataLog.csv`."""
 
-    Parameters
-    ----------
-    recording_id : str
-        ``X_LL_NNNN``: class number (1 left, 2 none, 3 right), location number, running number.
-    environment : str
-        Site name.
-    approach : str
-        "left", "none" or "right".
-    t0_frame : int
-        Camera frame of line-of-sight entry.
-    """
-
+    # ``X_LL_NNNN``: class number (1 left, 2 none, 3 right), location number, running number.
     recording_id: str
-    environment: str
-    approach: str
-    t0_frame: int
+    environment: str  # Site name
+    approach: str  # "left", "none" or "right"
+    t0_frame: int  # Camera frame of line-of-sight entry
 
     @property
     def folder(self) -> Path:
@@ -166,18 +155,6 @@ def write_recording(
 
 def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     """Write `DataLog.csv`, which lists the recordings of a data set.
-
-    Parameters
-    ----------
-    root : str or Path
-        Existing folder of the data set.
-    rows : sequence of LogRow
-        One per recording, as `write_recording` returns them.
-
-    Raises
-    ------
-    InputFileError
-        If the folder does not exist.
 
     Examples
     --------

@@ -35,26 +35,6 @@ def camera_frames(
 ) -> Iterator[ImageArray]:
     """Yield what the camera sees, ten frames a second.
 
-    The street is the site's own; buildings hide the vehicle until its front passes the line of sight past
-    their corner, which is the recording's T0. Light is even and the camera stands still, so that all that
-    changes is the vehicle, its shadow and the sensor's noise.
-
-    Parameters
-    ----------
-    settings : SimulationSettings
-        Of the recording.
-    recording : SimulatedRecording
-        From `simulate_recording` of these settings.
-    rng : numpy.random.Generator
-        Draws colours of cars and the sensor's noise.
-    camera : PinholeCamera, optional
-        OVAD's by default; another size gives smaller frames.
-
-    Yields
-    ------
-    ndarray of uint8, shape (height, width, 3)
-        Blue first.
-
     Examples
     --------
     >>> from worldstate.adapters.simulation import simulate_recording, site
@@ -65,6 +45,9 @@ def camera_frames(
     >>> len(frames), frames[0].shape, frames[0].dtype
     (6, (60, 96, 3), dtype('uint8'))
     """
+    # The street is the site's own; buildings hide the vehicle until its front passes the line of sight past
+    # their corner, which is the recording's T0. Light is even and the camera stands still, so that all that
+    # changes is the vehicle, its shadow and the sensor's noise.
     view = View(camera or PinholeCamera())
     paint, parked_paint = (PAINTS[i] for i in rng.integers(len(PAINTS), size=2))
     street = look_at(settings.site, view)
@@ -87,23 +70,7 @@ def camera_frames(
 def write_video(path: str | Path, frames: Iterable[ImageArray], frame_rate_hz: float = FRAME_RATE_HZ) -> None:
     """Write frames of one size as MPEG-4, whole or not at all.
 
-    Parameters
-    ----------
-    path : str or Path
-        Name that ends in ``.mp4``, in an existing folder.
-    frames : iterable of ndarray of uint8, shape (height, width, 3)
-        At least one, blue first.
-    frame_rate_hz : float
-        Frames a second.
-
-    Raises
-    ------
-    MissingExtraError
-        If OpenCV is not installed.
-    InputFileError
-        If the folder is missing or the file cannot be written.
-    InvalidArgumentError
-        If there is no frame.
+    Shapes: frames (height, width, 3).
     """
     cv2 = opencv()
     waiting = iter(frames)
@@ -129,15 +96,7 @@ def parked_lane_m(site: Site) -> float:
 
 
 def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
-    """Read back from its boxes where the parked car stands along the street; None where there is none.
-
-    Parameters
-    ----------
-    detections : iterable of tuple of SimulatedDetection
-        Per frame; the parked car comes first in each.
-    site : Site
-        The junction.
-    """
+    """Read back from its boxes where the parked car stands along the street; None where there is none."""
     boxes = np.array([frame[0].box_px for frame in detections if frame])
     still = boxes[(np.abs(boxes - boxes[:1]) < STILL_PX).all(axis=1)] if len(boxes) else boxes
     if not len(still):

@@ -22,13 +22,12 @@ def describe(
     seen: list[Trajectory],
     camera: PinholeCamera,
 ) -> dict[str, Any]:
-    """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON.
-
-    Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`, `azimuth_rad`
-    (of the front axle, left positive), `range_m`, `line_of_sight`, `time_to_visible_s` (negative afterwards).
-    `frames` are those of the vehicle that `approach` names, `others` those of the rest. Without a vehicle
-    there are no frames and `entry_s` is null. `ego` has the ego's way along its street, 0 where it stops.
-    """
+    """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON."""
+    # Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`,
+    # `azimuth_rad` (of the front axle, left positive), `range_m`, `line_of_sight`, `time_to_visible_s`
+    # (negative afterwards). `frames` are those of the vehicle that `approach` names, `others` those of the
+    # rest. Without a vehicle there are no frames and `entry_s` is null. `ego` has the ego's way along its
+    # street, 0 where it stops.
     ego_x = settings.ego.x_m(frames_s)
     entries = [vehicle.entry_s for vehicle in settings.traffic]
     frames = [

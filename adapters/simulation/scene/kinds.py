@@ -19,40 +19,24 @@ FLAT: Octaves = (0.0,) * 8
 class VehicleKind:
     """One kind of road user.
 
-    Parameters
-    ----------
-    name, label : str
-        Our name, and the detector's class.
-    length_m, width_m, height_m : float
-        Of its body.
-    axles_m : tuple of float
-        Axles behind the front; the engine is at the first.
-    rolling_a_db, rolling_b_db : tuple of 8 float
-        Sound power level of the tyres per octave, L = A + B log10(v / 70 km/h), dB re 1 pW.
-    propulsion_a_db, propulsion_b_db : tuple of 8 float
-        That of the engine, L = A + B (v - 70) / 70.
-    engine_m : float
-        Height of the engine as a source; tyres are at `TYRE_M`.
-    harmonic_share : float
-        Share of the engine's power in multiples of its firing frequency.
-
     References
     ----------
     Directive (EU) 2015/996 as amended by (EU) 2021/1226, table F-1.
     """
 
-    name: str
+    name: str  # Our name, and the detector's class
     label: str
-    length_m: float
+    length_m: float  # Of its body
     width_m: float
     height_m: float
-    axles_m: tuple[float, ...]
+    axles_m: tuple[float, ...]  # Axles behind the front; the engine is at the first
+    # Sound power level of the tyres per octave, L = A + B log10(v / 70 km/h), dB re 1 pW.
     rolling_a_db: Octaves
     rolling_b_db: Octaves
-    propulsion_a_db: Octaves
+    propulsion_a_db: Octaves  # That of the engine, L = A + B (v - 70) / 70
     propulsion_b_db: Octaves
-    engine_m: float = 0.3
-    harmonic_share: float = 0.5
+    engine_m: float = 0.3  # Height of the engine as a source; tyres are at `TYRE_M`
+    harmonic_share: float = 0.5  # Share of the engine's power in multiples of its firing frequency
 
 
 TYRE_M = 0.05
@@ -138,11 +122,6 @@ KINDS = {kind.name: kind for kind in (LIGHT, MEDIUM, HEAVY, ELECTRIC, BICYCLE, T
 
 def vehicle_kind(name: str) -> VehicleKind:
     """Return a kind by its name.
-
-    Raises
-    ------
-    InvalidArgumentError
-        For an unknown name.
 
     Examples
     --------

@@ -21,23 +21,13 @@ MAX_CORNERS = 16
 class OccludingBody:
     """A convex outline on the ground.
 
-    Parameters
-    ----------
-    corners_m : tuple of (float, float)
-        x ahead and y left of every corner, 2 (a thin screen) to 16.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are too few or too many, or a number is not finite.
-
     Examples
     --------
     >>> box(6.0, 12.0, -1.25, 1.25).corners_m[0]
     (6.0, -1.25)
     """
 
-    corners_m: tuple[tuple[float, float], ...]
+    corners_m: tuple[tuple[float, float], ...]  # x ahead and y left of every corner, 2 (a thin screen) to 16
 
     def __post_init__(self) -> None:
         corners = finite_array("corners_m", self.corners_m, (None, 2))
@@ -75,14 +65,13 @@ def detours(
 ) -> tuple[FloatArray, NDArray[np.int_]]:
     """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each.
 
-    The detour is negative where the line is clear; it passes through 0 where the line touches the body.
-
     Examples
     --------
     >>> x, y = np.full(3, 20.0), np.array([0.0, 1.7, 6.0])
     >>> detours(box(6, 12, -1, 1), x, y, (0.0, 0.0))[0].round(2)
     array([ 0.12,  0.03, -0.07])
     """
+    # The detour is negative where the line is clear; it passes through 0 where the line touches the body.
     offset, along = _offsets(occluder, x_m, y_m, end_m)
     via = np.array([_via(x, y, x_m, y_m, end_m) for x, y in occluder.corners_m])
     extra = np.maximum(via - np.hypot(x_m - end_m[0], y_m - end_m[1]), 0.0)

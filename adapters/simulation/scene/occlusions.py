@@ -16,21 +16,11 @@ OPEN_M = 30.0
 
 @dataclass(frozen=True, slots=True)
 class OccludedScene:
-    """A scene in the open and the way of the vehicle that it hides.
+    """A scene in the open and the way of the vehicle that it hides."""
 
-    Parameters
-    ----------
-    site : Site
-        No walls; its bodies hide the vehicle.
-    route_m : tuple of (float, float)
-        Points of the vehicle's way.
-    approach : str
-        Side on which it comes into sight.
-    """
-
-    site: Site
-    route_m: tuple[tuple[float, float], ...]
-    approach: str
+    site: Site  # No walls; its bodies hide the vehicle
+    route_m: tuple[tuple[float, float], ...]  # Points of the vehicle's way
+    approach: str  # Side on which it comes into sight
 
 
 def lead_vehicle() -> OccludedScene:

@@ -13,15 +13,7 @@ REFERENCE_PA = 20e-6
 def octave_masks(frequencies_hz: FloatArray) -> FloatArray:
     """Amplitude weights of the octave bands, a partition of unity over frequency.
 
-    Parameters
-    ----------
-    frequencies_hz : ndarray, shape (F,)
-        Frequencies >= 0. The lowest band reaches down to 0, the highest up to the end.
-
-    Returns
-    -------
-    ndarray, shape (8, F)
-        Weights in [0, 1]; each column sums to one.
+    Shapes: frequencies_hz (F,).
 
     Examples
     --------
@@ -49,18 +41,7 @@ def smooth_step(x: FloatArray) -> FloatArray:
 def split_octaves(signal: Float32Array, sample_rate_hz: float, oversampling: int = 1) -> Float32Array:
     """Split a signal into octave bands without phase shift; the bands sum to the signal.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (n,)
-        Samples; the ends are joined, so begin and end in a fade or in what does not matter.
-    sample_rate_hz : float
-        Rate of `signal`, Hz.
-    oversampling : int
-        Factor by which the output is interpolated, band-limited.
-
-    Returns
-    -------
-    ndarray, shape (8, n * oversampling)
+    Shapes: signal (n,).
 
     Examples
     --------
@@ -93,16 +74,7 @@ def resample_whole(signal: Float32Array, oversampling: int) -> Float32Array:
 def level_curve(octave_levels_db: FloatArray, frequencies_hz: FloatArray) -> FloatArray:
     """Power spectral density in Pa^2/Hz of octave-band levels (dB re 20 uPa), log-interpolated.
 
-    Parameters
-    ----------
-    octave_levels_db : ndarray, shape (8,)
-        Sound pressure level in each octave band.
-    frequencies_hz : ndarray, shape (F,)
-        Outside the bands the end values hold.
-
-    Returns
-    -------
-    ndarray, shape (F,)
+    Shapes: octave_levels_db (8,), frequencies_hz (F,).
 
     Examples
     --------

@@ -16,18 +16,10 @@ ARC_STEPS = 24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
-    """A polyline, parametrised by the distance driven; 0 is where line of sight begins.
+    """A polyline, parametrised by the distance driven; 0 is where line of sight begins."""
 
-    Parameters
-    ----------
-    driven_m : ndarray, shape (N,)
-        Increasing.
-    points_m : ndarray, shape (N, 2)
-        Positions there, x ahead and y left.
-    """
-
-    driven_m: FloatArray
-    points_m: FloatArray
+    driven_m: FloatArray  # shape (N,): Increasing
+    points_m: FloatArray  # shape (N, 2): Positions there, x ahead and y left
 
     def at(self, driven_m: float | FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x and y after some distance, shape of `driven_m`."""
@@ -57,19 +49,13 @@ def along(points_m: ArrayLike, entry_m: float = 0.0) -> Route:
 def turn_in(lane_x_m: float, entry_y_m: float) -> tuple[Route, float]:
     """Return the route of a vehicle that turns into the ego's street, and how far it can drive.
 
-    It keeps to its right and stops before the ego.
-
-    Parameters
-    ----------
-    lane_x_m, entry_y_m : float
-        Lane, and where line of sight begins; the sign says from which side it comes.
-
     Examples
     --------
     >>> route, end = turn_in(8.0, 4.7)
     >>> [round(float(v), 2) for v in route.at(end)]
     [3.0, 1.2]
     """
+    # It keeps to its right and stops before the ego.
     side = 1.0 if entry_y_m > 0 else -1.0
     begin_y = LANE_FROM_MIDDLE_M + side * TURN_RADIUS_M
     angle = np.linspace(0.0, 0.5 * np.pi, ARC_STEPS)

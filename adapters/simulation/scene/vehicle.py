@@ -33,35 +33,16 @@ SILENCE_DB = 0.0  # an engine whose every octave is below emits nothing that mat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Motion along a route; for a vehicle that passes, along the crossing street (y) at a fixed lane (x).
+    """Motion along a route; for a vehicle that passes, along the crossing street (y) at a fixed lane (x)."""
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (T,)
-        Increasing, evenly spaced.
-    front_y_m : ndarray, shape (T,)
-        Lateral position of the front bumper.
-    speed_mps : ndarray, shape (T,)
-        Speed, >= 0.
-    lane_x_m : float
-        Middle of the lane on which it comes, m ahead of the origin.
-    heading : int
-        +1 towards +y (comes from the right), -1 towards -y (comes from the left).
-    kind : VehicleKind
-        What drives there.
-    route : Route, optional
-        Where it goes if not straight along its lane.
-    driven_m : ndarray, shape (T,), optional
-        Distance of the front along the route.
-    """
-
-    time_s: FloatArray
-    front_y_m: FloatArray
-    speed_mps: FloatArray
-    lane_x_m: float
-    heading: int
-    kind: VehicleKind = LIGHT
-    route: Route | None = None
+    time_s: FloatArray  # shape (T,): Increasing, evenly spaced
+    front_y_m: FloatArray  # shape (T,): Lateral position of the front bumper
+    speed_mps: FloatArray  # shape (T,): Speed, >= 0
+    lane_x_m: float  # Middle of the lane on which it comes, m ahead of the origin
+    heading: int  # +1 towards +y (comes from the right), -1 towards -y (comes from the left)
+    kind: VehicleKind = LIGHT  # What drives there
+    route: Route | None = None  # Where it goes if not straight along its lane
+    # shape (T,): Distance of the front along the route.
     driven_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def axle_y_m(self, axle: int = 0) -> FloatArray:
@@ -104,20 +85,7 @@ def drive(
 ) -> Trajectory:
     """Pass `entry_y_m` at `entry_s`, braking at a constant rate during the two seconds before.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (T,)
-        Evenly spaced times.
-    entry_s, entry_y_m : float
-        Where the front is when; the sign of `entry_y_m` says from which side it comes (left positive).
-    lane_x_m : float
-        Middle of the lane.
-    speed_mps : float
-        Speed before braking.
-    braking_mps2 : float
-        Deceleration >= 0; the vehicle never falls below a quarter of its speed.
-    kind : VehicleKind
-        What drives there.
+    Shapes: time_s (T,).
 
     Examples
     --------
@@ -136,17 +104,6 @@ def drive(
 
 def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = np.inf) -> Trajectory:
     """Drive along another route as `passing` drives along its lane, slowly where the route has an end.
-
-    Parameters
-    ----------
-    passing : Trajectory
-        Gives the distance driven over time.
-    entry_y_m : float
-        Where `passing` is when it has driven 0 m.
-    route : Route
-        Where to drive.
-    end_m : float
-        Distance at which the vehicle stops; where it has an end, it takes it no faster than a turn allows.
 
     Examples
     --------
@@ -208,21 +165,11 @@ def _octaves(levels_db: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceSignal:
-    """One of the places of a vehicle that sound.
+    """One of the places of a vehicle that sound."""
 
-    Parameters
-    ----------
-    signal : ndarray, shape (n,)
-        Pressure at 1 m, Pa.
-    behind_m : float
-        How far behind the front.
-    height_m : float
-        Above the road.
-    """
-
-    signal: Float32Array
-    behind_m: float
-    height_m: float
+    signal: Float32Array  # shape (n,): Pressure at 1 m, Pa
+    behind_m: float  # How far behind the front
+    height_m: float  # Above the road
 
 
 def emit(
@@ -232,29 +179,9 @@ def emit(
     level_offset_db: float,
     rng: np.random.Generator,
 ) -> list[SourceSignal]:
-    """Draw what every axle's tyres and the engine emit.
-
-    The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
-    view a wide source; engine noise, broadband and harmonics, comes from the first axle and from higher up.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Its speeds set the levels; its first time is that of the first sample.
-    samples : int
-        Number of samples n.
-    sample_rate_hz : float
-        Rate in Hz.
-    level_offset_db : float
-        This vehicle against its kind's mean.
-    rng : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    list of SourceSignal
-        Tyres per axle, and the engine where the kind has one.
-    """
+    """Draw what every axle's tyres and the engine emit."""
+    # The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
+    # view a wide source; engine noise, broadband and harmonics, comes from the first axle and from higher up.
     kind = trajectory.kind
     time = trajectory.time_s[0] + np.arange(samples) / sample_rate_hz
     rolling = _pressure(rolling_level_db(trajectory.speed_mps, kind) + level_offset_db)

@@ -23,18 +23,6 @@ def absorption_db_per_m(
               \frac{0.01275\, e^{-2239.1 / T}}{f_{rO} + f^2 / f_{rO}} +
               \frac{0.1068\, e^{-3352 / T}}{f_{rN} + f^2 / f_{rN}}\Big)\Big], \qquad \tau = T / T_{20}
 
-    Parameters
-    ----------
-    frequency_hz : array_like
-        Frequencies.
-    kelvin, humidity_percent : float
-        Temperature and relative humidity.
-
-    Returns
-    -------
-    ndarray
-        dB per metre.
-
     References
     ----------
     ISO 9613-1:1993, equations (3) to (5) and annex B.
@@ -78,12 +66,7 @@ def ground_gain(length_m: FloatArray, source_m: float, receiver_m: float) -> Flo
     with the mean over the octave's band. The source levels already stand over hard ground, which doubles the
     energy; what is left is the interference: +3 dB where both ways agree, 0 dB far above.
 
-    Parameters
-    ----------
-    length_m : ndarray, shape (T,)
-        Length of the path.
-    source_m, receiver_m : float
-        Heights above the road.
+    Shapes: length_m (T,).
 
     Examples
     --------

@@ -30,22 +30,7 @@ def add_background(
 ) -> None:
     """Add everything that a street without a vehicle sounds like.
 
-    Parameters
-    ----------
-    out : ndarray, shape (M, n)
-        Pa, added to in place.
-    static : StaticSources
-        Where the plane waves go.
-    site : Site
-        Its name decides from where the ambient sound comes.
-    preset : Preset
-        Levels.
-    positions_m : ndarray, shape (M, 3)
-        Microphones.
-    sample_rate_hz : float
-        Rate in Hz.
-    rng : numpy.random.Generator
-        Source of randomness.
+    Shapes: out (M, n), positions_m (M, 3).
     """
     offsets = positions_m - positions_m.mean(axis=0)
     level_db = np.array(preset.ambient_octaves_db) + preset.ambient_spread_db * rng.standard_normal()
@@ -59,10 +44,8 @@ def add_background(
 
 
 def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Azimuths of the ambient waves and their shares of the power, shape (Q,) each.
-
-    A site has loud directions of its own; a recording shifts them a little.
-    """
+    """Azimuths of the ambient waves and their shares of the power, shape (Q,) each."""
+    # A site has loud directions of its own; a recording shifts them a little.
     azimuth = 2.0 * np.pi * (np.arange(preset.ambient_waves) + rng.random()) / preset.ambient_waves
     fixed = site_generator(site.name, "ambient")
     centres = fixed.uniform(-np.pi, np.pi, LOBES) + 0.1 * rng.standard_normal(LOBES)
@@ -82,18 +65,7 @@ def unit_vectors(azimuth_rad: FloatArray, rng: np.random.Generator) -> FloatArra
 def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator, channels: int) -> Float32Array:
     """Gaussian noise with a given power spectral density.
 
-    Parameters
-    ----------
-    density : ndarray, shape (n // 2 + 1,)
-        Pa^2 per cycle per sample at the bins of a transform of ``n = next_fast_len(samples)``.
-    samples, channels : int
-        Size of the result.
-    rng : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    ndarray, shape (channels, samples)
+    Shapes: density (n // 2 + 1,).
     """
     n = next_fast_len(samples, real=True)
     shape = np.sqrt(density * n / 4.0).astype(np.float32)
@@ -130,20 +102,6 @@ def _ambient_waves(
 
 def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
     """Draw when distant vehicles are loudest: a Poisson process that knows nothing of the recording's ends.
-
-    Parameters
-    ----------
-    preset : Preset
-        Its rate.
-    duration_s : float
-        Of the recording.
-    rng : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    ndarray
-        Seconds from the start; as far before it and behind the end as a vehicle is heard.
 
     Examples
     --------

@@ -19,21 +19,11 @@ RAMP = np.arange(KNOT_SAMPLES, dtype=np.float32) / np.float32(KNOT_SAMPLES)
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """An oversampled emitted signal and when it begins.
+    """An oversampled emitted signal and when it begins."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        float32.
-    start_s : float
-        Emission time of the first value.
-    rate_hz : float
-        Rate of the table, `OVERSAMPLING` times the sample rate.
-    """
-
-    values: Float32Array
-    start_s: float
-    rate_hz: float
+    values: Float32Array  # shape (n,): float32
+    start_s: float  # Emission time of the first value
+    rate_hz: float  # Rate of the table, `OVERSAMPLING` times the sample rate
 
 
 def emission_times(
@@ -44,19 +34,7 @@ def emission_times(
 ) -> FloatArray:
     """Solve t = t_e + r(t_e) / c for the emission times t_e of given receive times.
 
-    Parameters
-    ----------
-    receive_s : ndarray, shape (K,)
-        Receive times.
-    emit_s, travel_m : ndarray, shape (T,)
-        Path length at increasing emission times; the source must be slower than sound.
-    speed_mps : float
-        Speed of sound.
-
-    Returns
-    -------
-    ndarray, shape (K,)
-        NaN where the answer lies outside `emit_s`.
+    Shapes: receive_s (K,), emit_s, travel_m (T,).
 
     Examples
     --------
@@ -69,16 +47,7 @@ def emission_times(
 def add_delayed(out: Float32Array, table: Table, emit_s: FloatArray, gain: FloatArray) -> None:
     """Add a delayed signal to `out`, block by block between knots.
 
-    Parameters
-    ----------
-    out : ndarray, shape (K * KNOT_SAMPLES,)
-        float32, added to in place.
-    table : Table
-        What was emitted.
-    emit_s : ndarray, shape (K + 1,)
-        Emission times at the knots; NaN where nothing arrives.
-    gain : ndarray, shape (K + 1,)
-        Amplitude factor at the knots.
+    Shapes: out (K * KNOT_SAMPLES,), emit_s (K + 1,), gain (K + 1,).
     """
     at = (emit_s - table.start_s) * table.rate_hz
     low, high = at[:-1], at[1:]

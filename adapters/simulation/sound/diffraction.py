@@ -13,23 +13,6 @@ def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: 
 
     .. math:: A = 5 + 20\log_{10}\frac{\sqrt{2\pi N}}{\tanh\sqrt{2\pi N}}, \qquad N = 2\delta f / c
 
-    In the light (N < 0) tanh turns into tan and the attenuation falls to 0 dB at N about -0.2, so it is
-    continuous through the shadow boundary, where it is 5 dB.
-
-    Parameters
-    ----------
-    detour_m : array_like
-        Path round the edge minus straight path, m; negative where the receiver sees the source.
-    frequency_hz : array_like
-        Broadcast against `detour_m`.
-    cap_db : float
-        Largest attenuation: scattering and turbulence fill the deepest shadow.
-
-    Returns
-    -------
-    ndarray
-        Attenuation in dB, 0..cap_db.
-
     References
     ----------
     U. J. Kurze and G. S. Anderson, "Sound attenuation by barriers", Applied Acoustics 4 (1971), eq. (13).
@@ -39,6 +22,8 @@ def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: 
     >>> screen_attenuation_db(np.array([0.0, 1.0, -1.0]), np.array(1000.0)).round(1)
     array([ 5. , 20.6,  0. ])
     """
+    # In the light (N < 0) tanh turns into tan and the attenuation falls to 0 dB at N about -0.2, so it is
+    # continuous through the shadow boundary, where it is 5 dB.
     fresnel = 2.0 * np.asarray(detour_m) * np.asarray(frequency_hz) / SPEED_OF_SOUND_MPS
     root = np.sqrt(2.0 * np.pi * np.maximum(np.abs(fresnel), 1e-9))
     shadow = 20.0 * np.log10(root / np.tanh(root))

@@ -63,33 +63,16 @@ FASTEST_MPS = 70.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EgoSound:
-    """What the moving ego adds to every microphone.
+    """What the moving ego adds to every microphone."""
 
-    Parameters
-    ----------
-    pressure_pa : ndarray of float32, shape (n, M)
-    firing_hz : ndarray, shape (n,)
-        Firing frequency of the engine, whose multiples are its lines.
-    """
-
-    pressure_pa: Float32Array
-    firing_hz: FloatArray
+    pressure_pa: Float32Array  # shape (n, M)
+    firing_hz: FloatArray  # shape (n,): Firing frequency of the engine, whose multiples are its lines
 
 
 def ego_noise(
     positions_m: ArrayLike, speed_mps: ArrayLike, sample_rate_hz: float, rng: np.random.Generator
 ) -> Float32Array:
     """Render the noise of the ego vehicle at its own microphones: `ego_sound` without the engine's speed.
-
-    Parameters
-    ----------
-    positions_m, speed_mps, sample_rate_hz, rng
-        See `ego_sound`.
-
-    Returns
-    -------
-    ndarray of float32, shape (n, M)
-        Pa.
 
     Examples
     --------
@@ -109,30 +92,7 @@ def ego_sound(
     .. math:: n_m(t) = w_m(t) + \sum_q \sum_{i \in \{0, 1\}} \frac{\rho^i\, g_{q,i}}{d_{q,i,m}}\,
               s_q\Big(t - \frac{d_{q,i,m}}{c}\Big)
 
-    over the sources q (four tyres, engine, exhaust, two pillars) and their road images i, with the path
-    length d over the roof's edge, the screen attenuation g per octave, and wind w. Tyres and engine emit the
-    sound power of CNOSSOS-EU, category 1, the airflow that of a dipole (sixth power of the speed), wind
-    grows with the dynamic pressure.
-
-    Parameters
-    ----------
-    positions_m : array_like, shape (M, 3)
-        Microphones in `base_link`, z above the road; x = 0 at the array.
-    speed_mps : array_like, shape (n,)
-        Speed of the ego at every sample, 0 to 70 m/s; n decides the length.
-    sample_rate_hz : float
-        Rate, 8 to 192 kHz.
-    rng : numpy.random.Generator
-        Source of randomness; the same state gives the same sound.
-
-    Returns
-    -------
-    EgoSound
-
-    Raises
-    ------
-    InvalidArgumentError
-        On a wrong shape, no samples or a number out of range.
+    Shapes: positions_m (M, 3), speed_mps (n,).
 
     References
     ----------
@@ -147,6 +107,10 @@ def ego_sound(
     >>> sound.pressure_pa.shape, round(float(sound.firing_hz.mean()))
     ((8000, 2), 64)
     """
+    # over the sources q (four tyres, engine, exhaust, two pillars) and their road images i, with the path
+    # length d over the roof's edge, the screen attenuation g per octave, and wind w. Tyres and engine emit
+    # the sound power of CNOSSOS-EU, category 1, the airflow that of a dipole (sixth power of the speed),
+    # wind grows with the dynamic pressure.
     positions, speed = _checked(positions_m, speed_mps)
     rate = in_range("sample_rate_hz", sample_rate_hz, 8_000.0, 192_000.0)
     # Everything ran before the recording began; what is on its way then is heard at its beginning.

@@ -13,21 +13,11 @@ from .delay import KNOT_SAMPLES, OVERSAMPLING, Table
 
 @dataclass(frozen=True, slots=True)
 class Emission:
-    """What a source sends out, split into octave bands between emission knots.
+    """What a source sends out, split into octave bands between emission knots."""
 
-    Parameters
-    ----------
-    bands : ndarray, shape (K, 8, KNOT_SAMPLES * OVERSAMPLING)
-        Pressure at 1 m, Pa, oversampled.
-    start_s : float
-        Emission time of the first value.
-    sample_rate_hz : float
-        Rate before oversampling.
-    """
-
-    bands: Float32Array
-    start_s: float
-    sample_rate_hz: float
+    bands: Float32Array  # shape (K, 8, KNOT_SAMPLES * OVERSAMPLING): Pressure at 1 m, Pa, oversampled
+    start_s: float  # Emission time of the first value
+    sample_rate_hz: float  # Rate before oversampling
 
     @classmethod
     def of(cls, signal: Float32Array, start_s: float, sample_rate_hz: float) -> "Emission":
@@ -42,13 +32,7 @@ class Emission:
         return self.start_s + np.arange(len(self.bands) + 1) * KNOT_SAMPLES / self.sample_rate_hz
 
     def table(self, gain: FloatArray) -> tuple[Table, slice] | None:
-        """Add up the bands, weighted by gains (K + 1, 8) at the knots, over the span where any is not 0.
-
-        Returns
-        -------
-        (Table, slice) or None
-            The signal and the knots that it covers; None where every gain is 0.
-        """
+        """Add up the bands, weighted by gains (K + 1, 8) at the knots, over the span where any is not 0."""
         loud = np.flatnonzero(gain.max(axis=1) > 0.0)
         if not len(loud):
             return None
@@ -63,24 +47,13 @@ class Emission:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingSource:
-    """A sound and where it comes from.
+    """A sound and where it comes from."""
 
-    Parameters
-    ----------
-    emission : Emission
-        Its sound.
-    x_m : float or ndarray, shape (T,)
-        How far ahead it is, at the knots of `emission` if it is not on a lane.
-    y_m : ndarray, shape (T,)
-        Its lateral position there.
-    height_m : float
-        Above the road.
-    """
-
-    emission: Emission
+    emission: Emission  # Its sound
+    # shape (T,): How far ahead it is, at the knots of `emission` if it is not on a lane.
     x_m: float | FloatArray
-    y_m: FloatArray
-    height_m: float = SOURCE_HEIGHT_M
+    y_m: FloatArray  # shape (T,): Its lateral position there
+    height_m: float = SOURCE_HEIGHT_M  # Above the road
 
     @property
     def ahead_m(self) -> FloatArray:

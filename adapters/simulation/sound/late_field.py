@@ -35,20 +35,6 @@ def sphere(count: int) -> FloatArray:
 def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]:
     """Directions from which late sound reaches the array in a street, and their shares of the energy.
 
-    Between walls and under an open sky late sound is near the horizon; it comes in by the mouth and from
-    what stands there, so that a site has late directions of its own, ahead.
-
-    Parameters
-    ----------
-    site : Site
-        Its name decides the directions.
-    lobe_share : float
-        Share of the energy in the site's own directions; the rest comes evenly from all around.
-
-    Returns
-    -------
-    (ndarray, ndarray), shapes (DIRECTIONS, 3) and (DIRECTIONS,)
-
     Examples
     --------
     >>> from worldstate.adapters.simulation.scene.junction import site
@@ -56,6 +42,8 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
     >>> directions.shape, round(float(shares.sum()), 6)
     ((48, 3), 1.0)
     """
+    # Between walls and under an open sky late sound is near the horizon; it comes in by the mouth and from
+    # what stands there, so that a site has late directions of its own, ahead.
     rng = site_generator(site.name, "late")
     azimuth = 2.0 * np.pi * (np.arange(DIRECTIONS) + rng.random()) / DIRECTIONS
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, DIRECTIONS))
@@ -79,27 +67,9 @@ def add_late_field(
 ) -> None:
     r"""Add a diffuse tail of a dry signal.
 
-    From a full sphere two microphones d apart hear it with coherence sinc(2 f d / c).
-
-    Parameters
-    ----------
-    static : StaticSources
-        Where the waves go.
-    dry : ndarray, shape (pre + samples,)
-        What feeds the field; it begins ``pre`` samples before the first heard one.
-    samples : int
-        How many are heard.
-    decay_s : float
-        Reverberation time (60 dB).
-    positions_m : ndarray, shape (M, 3)
-        Microphones.
-    sample_rate_hz : float
-        Rate in Hz.
-    rng : numpy.random.Generator
-        Source of randomness.
-    field : (ndarray, ndarray), optional
-        Directions (Q, 3) and their shares of the energy (Q,); a full sphere if not given.
+    Shapes: dry (pre + samples,), positions_m (M, 3), field (ndarray, ndarray).
     """
+    # From a full sphere two microphones d apart hear it with coherence sinc(2 f d / c).
     directions, shares = (
         (sphere(DIRECTIONS), np.full(DIRECTIONS, 1.0 / DIRECTIONS)) if field is None else field
     )

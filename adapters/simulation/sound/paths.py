@@ -26,24 +26,13 @@ LEFT, RIGHT = 0, 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceImage:
-    """Mirror image of the source after `opposite` and `near` reflections in the crossing street.
+    """Mirror image of the source after `opposite` and `near` reflections in the crossing street."""
 
-    Parameters
-    ----------
-    x_m : float or ndarray, shape (T,)
-        Where the image stands ahead of the origin, unfolded.
-    gain : float
-        Product of the reflection factors.
-    near_planes_m : tuple of float
-        Unfolded positions of the near facade that the line crosses; that facade has a gap at the mouth.
-    order : int
-        Number of reflections.
-    """
-
-    x_m: float | FloatArray
-    gain: float
+    x_m: float | FloatArray  # shape (T,): Where the image stands ahead of the origin, unfolded
+    gain: float  # Product of the reflection factors
+    # Unfolded positions of the near facade that the line crosses; that facade has a gap at the mouth.
     near_planes_m: tuple[float, ...] = ()
-    order: int = 0
+    order: int = 0  # Number of reflections
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,36 +57,17 @@ class ReceiverImage:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """One way, at a series of emission times.
+    """One way, at a series of emission times."""
 
-    Parameters
-    ----------
-    source : SourceImage
-        Image the line starts from.
-    receiver : ReceiverImage
-        Image it ends at.
-    lit : ndarray, shape (T,)
-        1 where the line is straight, 0 where it bends round the corner, smooth in between.
-    edge : ndarray, shape (T,)
-        The corner with the shorter way round, LEFT or RIGHT.
-    bent_m : ndarray, shape (T,)
-        Length round that corner to the array's centre.
-    gain : ndarray, shape (T, 8)
-        Amplitude per octave band without spherical spreading.
-    before_m : ndarray, shape (T,)
-        Part of the way round that lies before the corner, seen from above.
-    edge_y_m : ndarray, shape (T,)
-        Where that corner is.
-    """
-
-    source: SourceImage
-    receiver: ReceiverImage
+    source: SourceImage  # Image the line starts from
+    receiver: ReceiverImage  # Image it ends at
+    # shape (T,): 1 where the line is straight, 0 where it bends round the corner, smooth in between.
     lit: FloatArray
-    edge: NDArray[np.int8]
-    bent_m: FloatArray
-    gain: FloatArray
-    before_m: FloatArray
-    edge_y_m: FloatArray
+    edge: NDArray[np.int8]  # shape (T,): The corner with the shorter way round, LEFT or RIGHT
+    bent_m: FloatArray  # shape (T,): Length round that corner to the array's centre
+    gain: FloatArray  # shape (T, 8): Amplitude per octave band without spherical spreading
+    before_m: FloatArray  # shape (T,): Part of the way round that lies before the corner, seen from above
+    edge_y_m: FloatArray  # shape (T,): Where that corner is
 
 
 def source_images(site: Site, lane_x_m: float | FloatArray) -> list[SourceImage]:
@@ -158,27 +128,7 @@ def trace_paths(
 ) -> list[Path]:
     """All paths from a source that moves in the crossing street to the array's centre at (receiver_x_m, 0).
 
-    Parameters
-    ----------
-    site : Site
-        The junction.
-    lane_x_m : float or ndarray, shape (T,)
-        How far ahead the source is.
-    source_y_m : ndarray, shape (T,)
-        Lateral positions of the source.
-    height_m : float
-        Height of the receiver above the source.
-    cap_db : float
-        Largest screen attenuation.
-    receiver_x_m : float or ndarray, shape (T,)
-        Where the array's centre is when it hears what was emitted; behind the mouth.
-    specular : ndarray, shape (8,), optional
-        Share of the amplitude per octave that a wall reflects as a mirror; one if not given.
-
-    Returns
-    -------
-    list of Path
-        One per pair of source and receiver image.
+    Shapes: lane_x_m (T,), source_y_m (T,), receiver_x_m (T,), specular (8,).
     """
     mirror = np.ones(len(OCTAVES_HZ)) if specular is None else specular
     pairs = product(source_images(site, lane_x_m), receiver_images(site))
@@ -190,25 +140,14 @@ def trace_paths(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Passage:
-    """A line from a source in the crossing street through the mouth, at a series of times, shape (T,) each.
+    """A line from a source in the crossing street through the mouth, at a series of times, shape (T,) each."""
 
-    Parameters
-    ----------
-    clearance_m : ndarray
-        How far inside the mouth the line crosses it; negative where a corner is in the way.
-    edge : ndarray of int8
-        The corner with the shorter way round, LEFT or RIGHT.
-    straight_m, bent_m : ndarray
-        Length of the line, and of the way round that corner.
-    aim_y_m : ndarray
-        Where the line, or the way round the corner, passes the mouth.
-    """
-
+    # How far inside the mouth the line crosses it; negative where a corner is in the way.
     clearance_m: FloatArray
-    edge: NDArray[np.int8]
-    straight_m: FloatArray
+    edge: NDArray[np.int8]  # The corner with the shorter way round, LEFT or RIGHT
+    straight_m: FloatArray  # Length of the line, and of the way round that corner
     bent_m: FloatArray
-    aim_y_m: FloatArray
+    aim_y_m: FloatArray  # Where the line, or the way round the corner, passes the mouth
 
     @property
     def lit(self) -> FloatArray:

@@ -36,24 +36,7 @@ def add_sources(
 ) -> None:
     """Add moving sources, by every path, to all microphones.
 
-    Parameters
-    ----------
-    out : ndarray, shape (M, K * KNOT_SAMPLES)
-        Pa, float32, added to in place.
-    static : StaticSources
-        Where goes what places that stand still send to microphones that stand still.
-    sources : sequence of MovingSource
-        Places of one vehicle: what bends round a corner is added up there before it goes on.
-    site : Site
-        The junction.
-    receiver : Receiver
-        Microphones and receive times.
-    cap_db : float
-        Largest screen attenuation.
-    specular : ndarray, shape (8,), optional
-        Share of the amplitude per octave that a wall reflects as a mirror; one if not given.
-    outdoors : bool
-        Whether air absorbs and the road reflects.
+    Shapes: out (M, K * KNOT_SAMPLES), specular (8,).
     """
     if site.occluders:
         for source in sources:

@@ -18,24 +18,12 @@ ARRIVAL_ROUNDS = 4
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """Microphones, how they move, and the times at which they listen.
+    """Microphones, how they move, and the times at which they listen."""
 
-    Parameters
-    ----------
-    positions_m : ndarray, shape (M, 3)
-        In `base_link`, z above the road.
-    skew_s : ndarray, shape (M,)
-        Phase mismatch of every channel as a delay.
-    knots_s : ndarray, shape (K + 1,)
-        Receive times of the knots; K * KNOT_SAMPLES samples are heard.
-    ego : EgoMotion
-        How `base_link` moves along x.
-    """
-
-    positions_m: FloatArray
-    skew_s: FloatArray
-    knots_s: FloatArray
-    ego: EgoMotion = field(default_factory=EgoMotion)
+    positions_m: FloatArray  # shape (M, 3): In `base_link`, z above the road
+    skew_s: FloatArray  # shape (M,): Phase mismatch of every channel as a delay
+    knots_s: FloatArray  # shape (K + 1,): Receive times of the knots; K * KNOT_SAMPLES samples are heard
+    ego: EgoMotion = field(default_factory=EgoMotion)  # How `base_link` moves along x
 
     @property
     def samples(self) -> int:
@@ -61,17 +49,7 @@ class Receiver:
     ) -> tuple[FloatArray, FloatArray]:
         r"""Solve a = t + r(x(a)) / c for what is emitted at t and heard at a by an ego at x.
 
-        Parameters
-        ----------
-        emit_s : ndarray, shape (T,)
-            Emission times.
-        length_m : callable
-            Length of the path to an ego at x (T,), shape (T,).
-
-        Returns
-        -------
-        (ndarray, ndarray), shape (T,) each
-            Length of the path, and where the ego is when it hears.
+        Shapes: emit_s (T,), length_m (T,).
         """
         x = self.ego.x_m(emit_s)
         length = length_m(x)

@@ -35,24 +35,13 @@ IMAGE_ORDERS = 2  # reflections in the crossing street before a patch is met
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    r"""Pieces of wall, all of one kind.
+    r"""Pieces of wall, all of one kind."""
 
-    Parameters
-    ----------
-    positions_m : ndarray, shape (P, 3)
-        Middles, z above the road.
-    normals : ndarray, shape (P, 2)
-        Towards the street.
-    strengths_m : ndarray, shape (P,)
-        :math:`\sqrt{w A \rho^2 / \pi}`, the length that scatters at grazing angles of 0.
-    beyond_mouth : bool
-        Whether they stand in the crossing street.
-    """
-
-    positions_m: FloatArray
-    normals: FloatArray
+    positions_m: FloatArray  # shape (P, 3): Middles, z above the road
+    normals: FloatArray  # shape (P, 2): Towards the street
+    # shape (P,): :math:`\sqrt{w A \rho^2 / \pi}`, the length that scatters at grazing angles of 0.
     strengths_m: FloatArray
-    beyond_mouth: bool
+    beyond_mouth: bool  # Whether they stand in the crossing street
 
 
 def scattering(preset: Preset) -> FloatArray:
@@ -116,17 +105,11 @@ def _strengths(count: int, reflection: float, rng: np.random.Generator) -> Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FirstLeg:
-    """From the source to one patch, at a series of emission times.
+    """From the source to one patch, at a series of emission times."""
 
-    Parameters
-    ----------
-    length_m : ndarray, shape (T,)
-        Way to the patch.
-    gain : ndarray, shape (T, 8)
-        Amplitude factor per octave without spherical spreading; the last leg's angle is not in it.
-    """
-
-    length_m: FloatArray
+    length_m: FloatArray  # shape (T,): Way to the patch
+    # shape (T, 8): Amplitude factor per octave without spherical spreading; the last leg's angle is not in
+    # it.
     gain: FloatArray
 
 

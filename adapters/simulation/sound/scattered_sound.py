@@ -22,17 +22,7 @@ def add_scattered(
     receiver: Receiver,
     preset: Preset,
 ) -> None:
-    """Add what rough walls send on of one moving source, from where they stand, to all microphones.
-
-    Parameters
-    ----------
-    out, static, site, receiver
-        As for `add_sources`.
-    source : MovingSource
-        The whole vehicle as one.
-    preset : Preset
-        Scattering coefficient and largest screen attenuation.
-    """
+    """Add what rough walls send on of one moving source, from where they stand, to all microphones."""
     amplitude = np.sqrt(scattering(preset))
     if not amplitude.any() or site.occluders:
         return

@@ -16,31 +16,20 @@ BLEND_M = 0.02  # detour over which a line that touches a body turns into the wa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreenedLeg:
-    """Sound that goes by one point, or straight, at a series of emission times.
+    """Sound that goes by one point, or straight, at a series of emission times."""
 
-    Parameters
-    ----------
-    before_m : ndarray, shape (T,)
-        Way from the source to that point, seen from above; 0 for the straight line.
-    via_x_m, via_y_m : ndarray, shape (T,)
-        That point, or the source itself.
-    gain : ndarray, shape (T, 8)
-        Amplitude per octave; 0 where this is not the way.
-    """
-
+    # shape (T,): Way from the source to that point, seen from above; 0 for the straight line.
     before_m: FloatArray
-    via_x_m: FloatArray
+    via_x_m: FloatArray  # shape (T,): That point, or the source itself
     via_y_m: FloatArray
-    gain: FloatArray
+    gain: FloatArray  # shape (T, 8): Amplitude per octave; 0 where this is not the way
 
 
 def screened_legs(
     occluders: Sequence[OccludingBody], x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArray, cap_db: float
 ) -> list[ScreenedLeg]:
-    """Return the straight way and the way round every corner of the body that is most in the way.
-
-    Only that body counts at any time; behind it the others change little.
-    """
+    """Return the straight way and the way round every corner of the body that is most in the way."""
+    # Only that body counts at any time; behind it the others change little.
     found = [detours(one, x_m, y_m, (ego_x_m, 0.0)) for one in occluders]
     worst = np.argmax([detour for detour, _ in found], axis=0)
     detour = np.max([one for one, _ in found], axis=0)

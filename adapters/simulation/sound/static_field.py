@@ -23,12 +23,7 @@ PENDING = 160  # as many sources wait, with their signals, to be rendered togeth
 def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArray:
     """Delay of plane waves at every microphone against the array's centre, shape (Q, M), s.
 
-    Parameters
-    ----------
-    directions : ndarray, shape (Q, 3)
-        Unit vectors towards the sources.
-    offsets_m : ndarray, shape (M, 3)
-        Microphones from the array's centre.
+    Shapes: directions (Q, 3), offsets_m (M, 3).
 
     Examples
     --------
@@ -40,13 +35,6 @@ def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArr
 
 class StaticSources:
     """Sources that wait to be rendered together.
-
-    Parameters
-    ----------
-    out : ndarray, shape (M, n)
-        Added to in place.
-    sample_rate_hz : float
-        Rate in Hz.
 
     Examples
     --------
@@ -92,18 +80,7 @@ def add_static(
 ) -> None:
     """Add delayed copies of `signals` to every microphone.
 
-    Parameters
-    ----------
-    out : ndarray, shape (M, n)
-        Added to in place.
-    signals : ndarray, shape (Q, n)
-        Source signals as they are at the array's centre.
-    delays_s : ndarray, shape (Q, M)
-        Relative delays; small against a block (0.08 s at 48 kHz).
-    sample_rate_hz : float
-        Rate in Hz.
-    gains : ndarray, shape (Q, M), optional
-        Amplitude factors; one if not given.
+    Shapes: out (M, n), signals (Q, n), delays_s (Q, M), gains (Q, M).
     """
     frequencies = np.fft.rfftfreq(BLOCK, 1.0 / sample_rate_hz)
     steering = np.exp(-2j * np.pi * frequencies[:, None, None] * delays_s).astype(np.complex64)

@@ -21,17 +21,7 @@ COLOURS = {
 
 
 def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Path) -> None:
-    """Draw the microphones across their two widest axes, coloured by fault, channels counted from 1.
-
-    Parameters
-    ----------
-    array : MicrophoneArray
-        One microphone a channel.
-    health : RecordingHealth
-        From `HealthLog.summary`.
-    path : Path
-        Image file; written whole or not at all.
-    """
+    """Draw the microphones across their two widest axes, coloured by fault, channels counted from 1."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

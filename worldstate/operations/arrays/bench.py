@@ -57,42 +57,22 @@ SETTINGS = {
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What `run_bench` measured; all times in milliseconds per 0.1-s hop.
+    """What `run_bench` measured; all times in milliseconds per 0.1-s hop."""
 
-    Parameters
-    ----------
-    blas : tuple of str
-        Kernel and version of every BLAS in the process.
-    threads : int
-        Threads that BLAS was pinned to.
-    rounds : int
-        Rounds that medians were taken over.
-    load : float
-        Load average of the machine over the last minute, at the end.
-    settings : mapping of str to str
-        What is computed, frame by frame: the stages, and each comparison.
-    stages : mapping of str to (float, float)
-        Median and 99th percentile of each stage; of the whole front-end by default (`front_end`); of all that
-        it can do (`everything`: with MUSIC, bands, looming and tone), also without channel watching and
-        in noise without any source.
-    total_ms, p99_ms : float
-        STFT, phase transform, SRP181 of new frames and running second, and published feature together.
-    peers : mapping of str to float
-        Median of each peer that is installed; empty where none is.
-    ratios : mapping of str to float
-        Cost of the peer over ours on the same work: see `settings`.
-    """
-
-    blas: tuple[str, ...]
-    threads: int
-    rounds: int
-    load: float
-    settings: Mapping[str, str]
+    blas: tuple[str, ...]  # Kernel and version of every BLAS in the process
+    threads: int  # Threads that BLAS was pinned to
+    rounds: int  # Rounds that medians were taken over
+    load: float  # Load average of the machine over the last minute, at the end
+    settings: Mapping[str, str]  # What is computed, frame by frame: the stages, and each comparison
+    # Median and 99th percentile of each stage; of the whole front-end by default (`front_end`); of all that
+    # it can do (`everything`: with MUSIC, bands, looming and tone), also without channel watching and in
+    # noise without any source.
     stages: Mapping[str, tuple[float, float]]
+    # STFT, phase transform, SRP181 of new frames and running second, and published feature together.
     total_ms: float
     p99_ms: float
-    peers: Mapping[str, float]
-    ratios: Mapping[str, float]
+    peers: Mapping[str, float]  # Median of each peer that is installed; empty where none is
+    ratios: Mapping[str, float]  # Cost of the peer over ours on the same work: see `settings`
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""

@@ -29,16 +29,7 @@ def peer_times(
 ) -> dict[str, Milliseconds]:
     """Return milliseconds per hop of each peer, keys beginning with ``peer_``; empty where none is installed.
 
-    Parameters
-    ----------
-    sound : ndarray, shape (n, M)
-        The file.
-    frames : ndarray, shape (frames, bins, M)
-        Spectra of a tenth of a second, all bins, those our own SRP is timed on.
-    sample_rate_hz : int
-        Of `sound`.
-    azimuths_rad : ndarray, shape (D,)
-        Search grid.
+    Shapes: sound (n, M), frames (frames, bins, M), azimuths_rad (D,).
     """
     if find_spec("pyroomacoustics") is None:
         return {}

@@ -49,15 +49,7 @@ def srp_beams() -> Steering:
 def stage_times(hops: list[Float32Array]) -> dict[str, Milliseconds]:
     """Time every stage on every hop, in turn, as the stream does them.
 
-    Parameters
-    ----------
-    hops : list of ndarray of float32, shape (n, 56)
-        A tenth of a second each.
-
-    Returns
-    -------
-    dict of str to list of float
-        Milliseconds per hop: `GOAL`, `MORE`, and ``goal``, the sum of the former.
+    Shapes: hops (n, 56).
     """
     stages = _Stages()
     times: dict[str, Milliseconds] = {name: [] for name in (*GOAL, *MORE, "goal")}

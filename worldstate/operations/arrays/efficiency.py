@@ -36,21 +36,11 @@ SPREAD_RAD = float(GRID_RAD[1] - GRID_RAD[0])
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One estimation problem that can be tried at any SNR.
+    """One estimation problem that can be tried at any SNR."""
 
-    Parameters
-    ----------
-    name : str
-        For the legend.
-    bound : callable
-        Cramer-Rao bound at an SNR (power ratio), squared units of the error.
-    error : callable
-        One estimate less its truth, at an SNR, from a generator.
-    """
-
-    name: str
-    bound: Callable[[float], float]
-    error: Callable[[float, Generator], float]
+    name: str  # For the legend
+    bound: Callable[[float], float]  # Cramer-Rao bound at an SNR (power ratio), squared units of the error
+    error: Callable[[float, Generator], float]  # One estimate less its truth, at an SNR, from a generator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,33 +155,6 @@ def measure_toward_endfire(
 ) -> Efficiency:
     """Try the bearing at several azimuths: the lateral corollary, achieved.
 
-    Parameters
-    ----------
-    array : MicrophoneArray
-        Microphones.
-    azimuths_rad : sequence of float
-        Of the source, from the array's broadside.
-    snr_db : float
-        Per microphone and snapshot, dB.
-    trials : int
-        Estimates at each azimuth, >= 2.
-    rng : numpy.random.Generator
-        Draws noise and truths.
-    frequency_hz, snapshots
-        As for `bearing_trial`.
-    on_point : callable
-        Called after each azimuth, for progress.
-
-    Returns
-    -------
-    Efficiency
-        Over the azimuth in radians.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `measure_over_snr` and `bearing_crb_rad2`.
-
     Examples
     --------
     >>> from worldstate.frontend.array.microphone_array import roof_array_56
@@ -214,17 +177,6 @@ def measure_toward_endfire(
 
 def tone_trial(*, complex_signal: bool) -> Trial:
     r"""Frequency of a single tone by `estimate_tone`, against the bound of Rife and Boorstyn, Hz.
-
-    Parameters
-    ----------
-    complex_signal : bool
-        Complex: :math:`\eta = A^2 / \sigma^2`, sigma^2 the variance of either part of the noise. Real:
-        :math:`\eta = A^2 / 2\sigma^2`.
-
-    Returns
-    -------
-    Trial
-        256 samples, frequency and phase uniform.
 
     Examples
     --------
@@ -249,11 +201,6 @@ def tone_trial(*, complex_signal: bool) -> Trial:
 
 def delay_trial() -> Trial:
     """Delay between two microphones by GCC-PHAT, against eq. (crbtau), seconds.
-
-    Returns
-    -------
-    Trial
-        60 frames of 300-1800 Hz; the SNR at either microphone, coherence (SNR / (1 + SNR))^2.
 
     Examples
     --------
@@ -285,28 +232,6 @@ def bearing_trial(
     snapshots: int = 20,
 ) -> Trial:
     """Azimuth by SRP-PHAT on the front-end's grid of one degree, against eq. (crbtheta), radians.
-
-    Parameters
-    ----------
-    array : MicrophoneArray
-        Microphones.
-    azimuth_rad : float
-        Middle of the truths, which are uniform over one step of the grid; from `broadside_rad` of the array.
-    frequency_hz : float
-        Of the plane wave.
-    snapshots : int
-        N.
-
-    Returns
-    -------
-    Trial
-        The SNR per microphone and snapshot. Far below the threshold the error is bounded by the grid, and
-        may be less than the bound.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `bearing_crb_rad2`.
 
     Examples
     --------

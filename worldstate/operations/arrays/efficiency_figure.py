@@ -20,20 +20,7 @@ PROMISED_DB = 1.5
 
 
 def write_efficiency_figure(measured: Sequence[Efficiency], path: Path) -> None:
-    """Draw mean squared error over bound, dB against dB, and write it by the ending of `path`.
-
-    Parameters
-    ----------
-    measured : sequence of Efficiency
-        From `measure_over_snr`.
-    path : Path
-        Image file; written whole or not at all.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Draw mean squared error over bound, dB against dB, and write it by the ending of `path`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 4.4), layout="constrained")
@@ -50,24 +37,7 @@ def write_efficiency_figure(measured: Sequence[Efficiency], path: Path) -> None:
 
 
 def write_endfire_figure(measured: Efficiency, array: MicrophoneArray, title: str, path: Path) -> None:
-    """Draw the corollary: bearings fade toward endfire, and what does not depend on the bearing stays.
-
-    Parameters
-    ----------
-    measured : Efficiency
-        From `measure_toward_endfire`.
-    array : MicrophoneArray
-        The same.
-    title : str
-        Frequency, SNR and snapshots.
-    path : Path
-        Image file; written whole or not at all.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Draw the corollary: bearings fade toward endfire, and what does not depend on the bearing stays."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")

@@ -10,13 +10,7 @@ from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, l
 
 
 def find_inputs(path: Path) -> list[Path]:
-    """Return the recordings of a data set, or the file or recording folder itself.
-
-    Raises
-    ------
-    InputFileError
-        If nothing stands there, or a data set's log is damaged.
-    """
+    """Return the recordings of a data set, or the file or recording folder itself."""
     if not path.exists():
         raise InputFileError(path, "expected a data set, a recording folder or a sound file")
     if path.is_dir() and (path / LOG_NAME).is_file():
@@ -25,15 +19,7 @@ def find_inputs(path: Path) -> list[Path]:
 
 
 def read_input(path: Path, *, array: Path | None = None, model: Path | None = None) -> list[HopStream]:
-    """Listen to a recording or read streams; a sound file counts as hazard-free.
-
-    Raises
-    ------
-    InputFileError
-        If a file is missing or damaged.
-    InvalidArgumentError
-        If the recording is shorter than a second.
-    """
+    """Listen to a recording or read streams; a sound file counts as hazard-free."""
     if path.suffix == ".npz":
         return load_streams(path)
     source = open_source(path, array=array, model=model, alpha=None)

@@ -102,29 +102,16 @@ class CueingSettings:
 
 @dataclass(frozen=True, slots=True)
 class BudgetReport:
-    """What one budget came to.
+    """What one budget came to."""
 
-    Parameters
-    ----------
-    alpha, miss_rate : float
-        The budget, and the beta of the statistic.
-    gamma : float
-        The threshold.
-    counted : FalseAlarmRate
-        Its false alarms on the recordings that it was set on.
-    held_out_rate : float or None
-        Share of windows in alarm by recording-level folds: set on the others, counted on each. None with a
-        single recording.
-    held_out_per_hour : float or None
-        False alarms per hour by the same folds.
-    """
-
-    alpha: float
+    alpha: float  # The budget, and the beta of the statistic
     miss_rate: float
-    gamma: float
-    counted: FalseAlarmRate
+    gamma: float  # The threshold
+    counted: FalseAlarmRate  # Its false alarms on the recordings that it was set on
+    # Share of windows in alarm by recording-level folds: set on the others, counted on each. None with a
+    # single recording.
     held_out_rate: float | None
-    held_out_per_hour: float | None
+    held_out_per_hour: float | None  # False alarms per hour by the same folds
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON-able values."""

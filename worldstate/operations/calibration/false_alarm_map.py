@@ -16,19 +16,6 @@ from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, rising
 class FalseAlarmRate:
     """False alarms of one threshold on hazard-free recordings.
 
-    Parameters
-    ----------
-    gamma : float
-        The threshold.
-    window_rate : float
-        Share of windows in sustained alarm.
-    onsets : int
-        Rising edges.
-    hours : float
-        Scored hazard-free time.
-    low_per_hour, high_per_hour : float
-        Exact 95 % interval of the rate, the onsets taken for a Poisson count.
-
     Examples
     --------
     >>> rate = FalseAlarmRate(0.9, 0.02, 11, 0.103, 53.3, 191.1)
@@ -36,11 +23,11 @@ class FalseAlarmRate:
     (107, 9.7)
     """
 
-    gamma: float
-    window_rate: float
-    onsets: int
-    hours: float
-    low_per_hour: float
+    gamma: float  # The threshold
+    window_rate: float  # Share of windows in sustained alarm
+    onsets: int  # Rising edges
+    hours: float  # Scored hazard-free time
+    low_per_hour: float  # Exact 95 % interval of the rate, the onsets taken for a Poisson count
     high_per_hour: float
 
     @property
@@ -59,25 +46,9 @@ def false_alarm_rate(
 ) -> FalseAlarmRate:
     r"""Count the false alarms of a threshold.
 
-    With n onsets in T hours the interval is Garwood's,
-
     .. math:: [\chi^2_{.025}(2n),\ \chi^2_{.975}(2n + 2)] / 2T.
 
-    Parameters
-    ----------
-    hazard_free : sequence of array_like, each of shape (windows,)
-        Statistics of recordings, each in the order of time.
-    gamma : float
-        Threshold.
-    sustain_hops : int
-        k of the sustained rule.
-    hop_s : float
-        Time between windows, seconds.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no window or a number is out of range.
+    Shapes: hazard_free (windows,).
 
     Examples
     --------
@@ -85,6 +56,7 @@ def false_alarm_rate(
     >>> rate.onsets, rate.hours, rate.window_rate
     (900, 0.1, 0.5)
     """
+    # With n onsets in T hours the interval is Garwood's,
     from scipy.stats import chi2
 
     period_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True)
@@ -105,21 +77,6 @@ def threshold_for_rate(
 ) -> FalseAlarmRate:
     """Return the smallest threshold from which on no larger one exceeds a rate: the map read backwards.
 
-    Onsets are no monotone function of the threshold, as two alarms merge where it falls; every threshold
-    above the returned one keeps the rate too.
-
-    Parameters
-    ----------
-    hazard_free, sustain_hops, hop_s
-        As for `false_alarm_rate`.
-    rate_per_hour : float
-        Budget in alarms per hour, >= 0. One below the quantum is met by no alarm at all.
-
-    Raises
-    ------
-    InvalidArgumentError
-        As `false_alarm_rate`.
-
     Examples
     --------
     >>> streams = [np.random.default_rng(0).random(36_000)]
@@ -127,6 +84,8 @@ def threshold_for_rate(
     >>> found.onsets, round(found.gamma, 3)
     (5, 1.0)
     """
+    # Onsets are no monotone function of the threshold, as two alarms merge where it falls; every threshold
+    # above the returned one keeps the rate too.
     budget = in_range("rate_per_hour", rate_per_hour, 0.0, np.inf)
     held = [sustained_statistic(finite_array("hazard_free", s, (None,)), sustain_hops) for s in hazard_free]
     levels, count = _onset_levels(held)
@@ -138,11 +97,9 @@ def threshold_for_rate(
 
 
 def _onset_levels(held: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct levels, falling, and the number of onsets with the threshold at each.
-
-    Window t is an onset for thresholds in (its predecessor, itself]: one more at its own level, one less at
-    its predecessor's.
-    """
+    """Distinct levels, falling, and the number of onsets with the threshold at each."""
+    # Window t is an onset for thresholds in (its predecessor, itself]: one more at its own level, one less at
+    # its predecessor's.
     begin = np.concatenate([*held, np.empty(0)])
     before = np.concatenate([np.concatenate([[-np.inf], s])[: s.size] for s in held] + [np.empty(0)])
     rises = begin > before

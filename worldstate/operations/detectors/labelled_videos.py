@@ -9,22 +9,8 @@ from worldstate.ground.errors import InputFileError
 
 
 def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:
-    """Return videos with the files of their reference boxes, None for a video that stands alone.
-
-    Of a data set the recordings with a vehicle count that have both.
-
-    Parameters
-    ----------
-    path : Path
-        Video, recording folder or data set.
-    most : int, optional
-        Of a data set take the first so many.
-
-    Raises
-    ------
-    InputFileError
-        If nothing stands there, or no recording has a video and detections.
-    """
+    """Return videos with the files of their reference boxes, None for a video that stands alone."""
+    # Of a data set the recordings with a vehicle count that have both.
     if path.is_file():
         return [(path, None)]
     if not path.is_dir():

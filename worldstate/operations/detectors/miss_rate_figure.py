@@ -10,13 +10,7 @@ from worldstate.adapters.files.atomic import atomic_path
 
 
 def write_absence_figure(rates: MissRates, path: Path) -> None:
-    """Draw `rates` and write the figure as PNG, SVG or PDF, by the ending of `path`.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Draw `rates` and write the figure as PNG, SVG or PDF, by the ending of `path`."""
     from matplotlib.figure import Figure
 
     names = list(rates.families)

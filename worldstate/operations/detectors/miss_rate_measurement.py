@@ -87,21 +87,11 @@ class AbsenceSettings:
 
 @dataclass(frozen=True, slots=True)
 class LabelledVideo:
-    """A video with what is known to be in it.
+    """A video with what is known to be in it."""
 
-    Parameters
-    ----------
-    video : Video
-        Clean frames.
-    reference : DetectionLog
-        What is there, one entry a frame.
-    camera : PinholeCamera
-        That took it.
-    """
-
-    video: Video
-    reference: DetectionLog
-    camera: PinholeCamera
+    video: Video  # Clean frames
+    reference: DetectionLog  # What is there, one entry a frame
+    camera: PinholeCamera  # That took it
 
 
 def measure_absence(
@@ -266,10 +256,8 @@ def _health(scenes: Sequence[LabelledVideo], rng: np.random.Generator) -> Camera
 
 
 def reference_by(detector: Detector, video: Video) -> DetectionLog:
-    """Return what a detector reports on the clean frames, to serve as the reference where there is no other.
-
-    Its miss rate on clean frames is then zero by definition: only the degraded ones tell anything.
-    """
+    """Return what a detector reports on the clean frames, to serve as the reference where there is no other."""
+    # Its miss rate on clean frames is then zero by definition: only the degraded ones tell anything.
     found = [detector.detect(frame) for frame in video.frames()]
     return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
 

@@ -11,25 +11,6 @@ from worldstate.ground.typing import IntArray
 def recording_folds(labels: Sequence[str], folds: int, rng: np.random.Generator) -> IntArray:
     """Deal recordings to folds at random, each label in its turn.
 
-    Parameters
-    ----------
-    labels : sequence of str, length n
-        One a recording.
-    folds : int
-        At least 1.
-    rng : numpy.random.Generator
-        Deals.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-        Fold of each recording.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no fold.
-
     Examples
     --------
     >>> dealt = recording_folds(["left", "none", "left", "none"], 2, np.random.default_rng(0))

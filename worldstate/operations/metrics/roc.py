@@ -45,12 +45,7 @@ def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
 def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:
     """Return the area of each group that has both labels, in the order of their names.
 
-    Parameters
-    ----------
-    scores, positive : array_like, shape (n,)
-        As for `auroc`.
-    groups : array_like of str, shape (n,)
-        For example the junction of each window.
+    Shapes: scores, positive (n,), groups (n,).
 
     Examples
     --------
@@ -64,11 +59,6 @@ def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) ->
 
 def macro(by_group: Mapping[str, float]) -> float:
     """Return the mean over groups.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no group.
 
     Examples
     --------

@@ -21,21 +21,14 @@ SECONDS_PER_HOUR = 3600.0
 class ApproachOutcome:
     """How the advisories of one occluded approach stand to its T0.
 
-    Parameters
-    ----------
-    lead_time_s : float or None
-        T0 minus the first onset within 5 s before it; None for a missed approach.
-    false_advisories_before : int
-        Onsets earlier than that.
-
     Examples
     --------
     >>> ApproachOutcome(lead_time_s=1.7, false_advisories_before=0).detected
     True
     """
 
-    lead_time_s: float | None
-    false_advisories_before: int
+    lead_time_s: float | None  # T0 minus the first onset within 5 s before it; None for a missed approach
+    false_advisories_before: int  # Onsets earlier than that
 
     @property
     def detected(self) -> bool:
@@ -73,17 +66,7 @@ def detection(onsets_s: Sequence[float], t0_s: float) -> ApproachOutcome:
 def false_alarms_per_hour(alarms: Sequence[ArrayLike], hop_s: float = 0.1) -> float:
     """Return rising edges per hour of scored time over hazard-free recordings.
 
-    Parameters
-    ----------
-    alarms : sequence of array_like of bool, each of shape (hops,)
-        One entry a recording, a decision every hop from the first full second on.
-    hop_s : float
-        Time between decisions, seconds.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the hop is not positive or an alarm is not finite. No scored time at all gives NaN.
+    Shapes: alarms (hops,).
 
     Examples
     --------

@@ -32,18 +32,6 @@ FEWEST = 10
 class BearingChecks:
     """Bearings with the prominence they were read with, and their errors where a box was there.
 
-    Parameters
-    ----------
-    prominence : ndarray, shape (n,)
-        Peak-to-median ratios, >= 1.
-    error_rad : ndarray, shape (n,)
-        Bearing minus azimuth of the nearest moving box; NaN where none was in view.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the shapes do not agree.
-
     Examples
     --------
     >>> checks = BearingChecks(np.array([1.1, 1.2, 2.0, 3.0]), np.array([np.nan, 0.3, 0.02, 0.01]))
@@ -51,7 +39,8 @@ class BearingChecks:
     (3, array([1.  , 0.67, 0.33]))
     """
 
-    prominence: FloatArray
+    prominence: FloatArray  # shape (n,): Peak-to-median ratios, >= 1
+    # shape (n,): Bearing minus azimuth of the nearest moving box; NaN where none was in view.
     error_rad: FloatArray
 
     def __post_init__(self) -> None:
@@ -63,27 +52,14 @@ class BearingChecks:
         return np.isfinite(self.error_rad)
 
     def curve(self) -> GatingCurve | NotUsable:
-        """Trade coverage for accuracy.
-
-        Returns
-        -------
-        GatingCurve or NotUsable
-            Not usable where nothing was ever in view.
-        """
+        """Trade coverage for accuracy."""
         seen = self.in_view
         if not seen.any():
             return NotUsable("no bearing with a moving box in view")
         return gating_curve(self.prominence[seen], self.error_rad[seen])
 
     def figures(self) -> dict[str, float | None]:
-        """Return counts and medians; None where there is nothing to count.
-
-        Returns
-        -------
-        dict
-            Medians of the error, degrees, on all bearings and on the most prominent 16 % of them, the
-            prominence that these begin at, and the median prominence with and without a box in view.
-        """
+        """Return counts and medians; None where there is nothing to count."""
         curve = self.curve()
         error = threshold = gated = None
         if not isinstance(curve, NotUsable):
@@ -102,16 +78,6 @@ class BearingChecks:
 
 def joined(parts: Iterable[BearingChecks]) -> BearingChecks:
     """Put the bearings of several recordings together.
-
-    Parameters
-    ----------
-    parts : iterable of BearingChecks
-        At least one.
-
-    Returns
-    -------
-    BearingChecks
-        In the same order.
 
     Examples
     --------
@@ -133,24 +99,6 @@ def check_bearings(
 ) -> BearingChecks:
     """Compare the bearings of a run with what the camera saw moving when they were heard.
 
-    Parameters
-    ----------
-    time_s, age_s, bearing_rad, prominence : sequence of float, length n
-        Of each hop: its end, how long before it the middle of the bearing's interval was, the bearing, and
-        the prominence that it was read with.
-    moving_rad : sequence of sequence of float, length n
-        Azimuths of the moving boxes at the end of each hop.
-
-    Returns
-    -------
-    BearingChecks
-        One row a hop, against the hop whose end is nearest to the middle of its interval.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the lengths do not agree.
-
     Examples
     --------
     >>> boxes, heard = [[0.3], [0.2], [0.1, -1.0]], [0.3, 0.31, 0.18]
@@ -166,22 +114,7 @@ def check_bearings(
 
 
 def write_gating_figure(checks: BearingChecks, path: Path, title: str = "") -> None:
-    """Draw the curve and what prominence says of presence, and write both by the ending of `path`.
-
-    Parameters
-    ----------
-    checks : BearingChecks
-        Of one recording or of many.
-    path : Path
-        Image file; written whole or not at all.
-    title : str
-        Heading.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Draw the curve and what prominence says of presence, and write both by the ending of `path`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
@@ -194,15 +127,7 @@ def write_gating_figure(checks: BearingChecks, path: Path, title: str = "") -> N
 
 
 def draw_gating(axes: "Axes", checks: BearingChecks) -> None:
-    """Draw the median error against the share of bearings kept, the paper's two points beside it.
-
-    Parameters
-    ----------
-    axes : matplotlib Axes
-        Drawn on.
-    checks : BearingChecks
-        Nothing but the paper's points is drawn where nothing was in view.
-    """
+    """Draw the median error against the share of bearings kept, the paper's two points beside it."""
     curve = checks.curve()
     if not isinstance(curve, NotUsable):
         n = int(checks.in_view.sum())

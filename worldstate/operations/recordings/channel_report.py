@@ -16,33 +16,18 @@ _LISTED_GAPS = 100
 class ChannelVerdict:
     """One fault of one channel over a recording.
 
-    Parameters
-    ----------
-    channel : int
-        From 0.
-    fault : Fault
-        What is wrong.
-    share : float
-        Of the hops in which it was seen.
-    first_s : float
-        End of the first of these hops, seconds.
-    value : float
-        How wrong, when last seen: see `worldstate.frontend.health.channel_health.ChannelFault`.
-    looks_like : int or None
-        Swapped: the channel whose place it fits.
-
     Examples
     --------
     >>> ChannelVerdict(2, Fault.DEAD, 1.0, 1.0, 1.0).masked
     True
     """
 
-    channel: int
-    fault: Fault
-    share: float
-    first_s: float
-    value: float
-    looks_like: int | None = None
+    channel: int  # From 0
+    fault: Fault  # What is wrong
+    share: float  # Of the hops in which it was seen
+    first_s: float  # End of the first of these hops, seconds
+    value: float  # How wrong, when last seen: see `worldstate.frontend.health.channel_health.ChannelFault`
+    looks_like: int | None = None  # Swapped: the channel whose place it fits
 
     @property
     def masked(self) -> bool:
@@ -54,33 +39,18 @@ class ChannelVerdict:
 class RecordingHealth:
     """Everything that was wrong with a recording.
 
-    Parameters
-    ----------
-    verdicts : tuple of ChannelVerdict
-        By channel; empty where nothing was wrong.
-    gaps : tuple of Dropout
-        The first hundred.
-    n_gaps : int
-        All of them.
-    n_hops : int
-        Hops listened to.
-    coherence : float or NotUsable
-        At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`.
-    sample_rate : RateEstimate or NotUsable
-        By another clock.
-
     Examples
     --------
     >>> HealthLog().summary().is_healthy
     True
     """
 
-    verdicts: tuple[ChannelVerdict, ...]
-    gaps: tuple[Dropout, ...]
-    n_gaps: int
-    n_hops: int
-    coherence: float | NotUsable
-    sample_rate: RateEstimate | NotUsable
+    verdicts: tuple[ChannelVerdict, ...]  # By channel; empty where nothing was wrong
+    gaps: tuple[Dropout, ...]  # The first hundred
+    n_gaps: int  # All of them
+    n_hops: int  # Hops listened to
+    coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
+    sample_rate: RateEstimate | NotUsable  # By another clock
 
     @property
     def is_healthy(self) -> bool:

@@ -123,22 +123,7 @@ def hop_stream(
     t0_s: float | None = None,
     there: Sequence[bool] | None = None,
 ) -> HopStream:
-    """Record what an adapter measured.
-
-    Parameters
-    ----------
-    measurements : iterable of Measurement
-        One recording in the order of time.
-    name, label, t0_s
-        As for `HopStream`.
-    there : sequence of bool, optional
-        As for `HopStream`; what was reported itself where not given.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is no measurement, or another number of flags.
-    """
+    """Record what an adapter measured."""
     rows = list(measurements)
     if not rows:
         raise InvalidArgumentError(f"{name}: expected at least one hop, so at least one second of sound")
@@ -160,13 +145,7 @@ def hop_stream(
 
 
 def save_streams(path: str | Path, streams: Iterable[HopStream]) -> None:
-    """Write streams as npz without objects, whole or not at all.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Write streams as npz without objects, whole or not at all."""
     kept = list(streams)
     arrays = {name: np.concatenate([getattr(stream, name) for stream in kept]) for name in _ARRAYS}
     save_npz(
@@ -184,11 +163,6 @@ def save_streams(path: str | Path, streams: Iterable[HopStream]) -> None:
 
 def load_streams(path: str | Path) -> list[HopStream]:
     """Read what `save_streams` wrote.
-
-    Raises
-    ------
-    InputFileError
-        If the file is missing, too large, damaged or of another version.
 
     Examples
     --------

@@ -18,29 +18,18 @@ LARGEST_SCORE = 3.0
 class StatisticSwitches:
     """What of eq. (post) the statistic uses.
 
-    Parameters
-    ----------
-    use_absence : bool
-        False drops the answer of the channel that was asked: the signature alone, beta = 1.
-    fixed_miss_rate : float, optional
-        Absence with this beta at every hop, whatever was answered: the statistic that thresholds are set on.
-    approach_weight : float
-        Nats by which the log-odds rise with each standard deviation of the approach rate above zero; where it
-        is not usable it is marginalised.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
     Examples
     --------
     >>> StatisticSwitches(approach_weight=0.5).use_absence
     True
     """
 
+    # False drops the answer of the channel that was asked: the signature alone, beta = 1.
     use_absence: bool = True
+    # Absence with this beta at every hop, whatever was answered: the statistic that thresholds are set on.
     fixed_miss_rate: float | None = None
+    # Nats by which the log-odds rise with each standard deviation of the approach rate above zero; where it
+    # is not usable it is marginalised.
     approach_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -61,19 +50,7 @@ def stream_statistic(
     with the approach rate rho in standard deviations, held within three. Without the last term it is
     `abduction.posterior.statistic`.
 
-    Parameters
-    ----------
-    stream : HopStream
-        One recording.
-    reference_prior : sequence of float, shape (K + 2,)
-        Of hidden_1 .. hidden_K, visible, none; positive.
-    switches : StatisticSwitches, optional
-        All on, no approach term, where not given.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the prior does not fit the stream.
+    Shapes: reference_prior (K + 2,).
 
     Examples
     --------
@@ -98,13 +75,12 @@ def presence_statistic(
 ) -> FloatArray:
     """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,).
 
-    Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
-
     Examples
     --------
     >>> presence_statistic(HopStream.blank("a", 1), (0.25,) * 4)
     array([0.75])
     """
+    # Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
     joint = _log_joint(stream, reference_prior, switches or StatisticSwitches())
     something = np.logaddexp.reduce(joint[:, :-1], axis=1)
     return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))

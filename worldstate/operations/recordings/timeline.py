@@ -20,20 +20,12 @@ _GAP_S = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EntityTrail:
-    """Where one entity was believed to be, at the hops in which it more likely existed than not.
+    """Where one entity was believed to be, at the hops in which it more likely existed than not."""
 
-    Parameters
-    ----------
-    time_s, azimuth_rad, std_rad : array (m,)
-        Ends of the windows, azimuth, standard deviation.
-    hidden : array (m,) of bool
-        Whether it was behind an occluder.
-    """
-
-    time_s: FloatArray
+    time_s: FloatArray  # Ends of the windows, azimuth, standard deviation
     azimuth_rad: FloatArray
     std_rad: FloatArray
-    hidden: BoolArray
+    hidden: BoolArray  # Whether it was behind an occluder
 
     def broken(self) -> "EntityTrail":
         """Return the trail with a row of NaN in every gap, so that no line is drawn across."""

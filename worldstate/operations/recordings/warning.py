@@ -10,47 +10,26 @@ from .advisories import LONGEST_LEAD_S, detection
 
 @dataclass(frozen=True, slots=True)
 class WarningSummary:
-    """How the advisory stood to line-of-sight entry in one recording.
+    """How the advisory stood to line-of-sight entry in one recording."""
 
-    Parameters
-    ----------
-    t0_s : float or None
-        Line-of-sight entry, seconds from the start; None where unknown or nothing approaches.
-    first_advisory_s : float or None
-        First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
-    lead_time_s : float or None
-        ``t0_s - first_advisory_s`` where that onset came before line-of-sight entry.
-    false_advisories_before : int
-        Onsets more than 5 s before `t0_s`; without a `t0_s` every onset.
-    advisory_onsets_s : tuple of float
-        All rising edges of the advisory.
-    hidden_entity_id : str or None
-        The entity that the last advisory before `t0_s` spoke of; without a `t0_s`, or where none led, that of
-        the first advisory counted.
-    visible_entity_id : str or None
-        The first moving entity that came into view.
-    """
-
+    # Line-of-sight entry, seconds from the start; None where unknown or nothing approaches.
     t0_s: float | None
+    # First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
     first_advisory_s: float | None
-    lead_time_s: float | None
-    false_advisories_before: int
-    advisory_onsets_s: tuple[float, ...]
+    lead_time_s: float | None  # ``t0_s - first_advisory_s`` where that onset came before line-of-sight entry
+    false_advisories_before: int  # Onsets more than 5 s before `t0_s`; without a `t0_s` every onset
+    advisory_onsets_s: tuple[float, ...]  # All rising edges of the advisory
+    # The entity that the last advisory before `t0_s` spoke of; without a `t0_s`, or where none led, that of
+    # the first advisory counted.
     hidden_entity_id: str | None
-    visible_entity_id: str | None
+    visible_entity_id: str | None  # The first moving entity that came into view
 
 
 @dataclass(slots=True)
 class WarningMeter:
-    """Counts advisories while states go by, and keeps none of them.
+    """Counts advisories while states go by, and keeps none of them."""
 
-    Parameters
-    ----------
-    t0_s : float or None
-        Line-of-sight entry on the clock of the states, seconds.
-    """
-
-    t0_s: float | None
+    t0_s: float | None  # Line-of-sight entry on the clock of the states, seconds
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None

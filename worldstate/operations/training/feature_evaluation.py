@@ -26,25 +26,13 @@ MakeClassifier = Callable[[np.random.Generator], Classifier]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictions:
-    """What was predicted of every window of one table, each once.
+    """What was predicted of every window of one table, each once."""
 
-    Parameters
-    ----------
-    folds : ndarray of str, shape (n,)
-        Fold in which each window was held out.
-    probabilities : ndarray, shape (n, 4)
-        Posteriors of front, left, none, right.
-    score, risk : ndarray, shape (n,)
-        Statistic and calibrated risk.
-    decision : ndarray of bool, shape (n,)
-        Whether the statistic reached the threshold.
-    """
-
-    folds: TextArray
-    probabilities: FloatArray
-    score: FloatArray
+    folds: TextArray  # shape (n,): Fold in which each window was held out
+    probabilities: FloatArray  # shape (n, 4): Posteriors of front, left, none, right
+    score: FloatArray  # shape (n,): Statistic and calibrated risk
     risk: FloatArray
-    decision: BoolArray
+    decision: BoolArray  # shape (n,): Whether the statistic reached the threshold
 
     @classmethod
     def blank(cls, folds: TextArray) -> "Predictions":
@@ -126,27 +114,7 @@ def transfer(
     fit_map: FitMap = fit_isotonic,
     match_prevalence: bool = False,
 ) -> dict[float, Predictions]:
-    """Predict every window of one table by what was learned on another.
-
-    Parameters
-    ----------
-    train, test : FeatureTable
-        Windows to learn from, threshold and map included, and windows to predict.
-    inner_splits, make, rng, alpha, fit_map
-        As for `cross_validate`.
-    match_prevalence : bool
-        Shift the risks at each junction until hazards are as frequent as in training; see `matched_risk`.
-
-    Returns
-    -------
-    dict of float to Predictions
-        For each beta, as one fold named ``transfer``.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the two share a recording.
-    """
+    """Predict every window of one table by what was learned on another."""
     shared = np.intersect1d(train.recording_keys, test.recording_keys)
     if shared.size:
         raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")

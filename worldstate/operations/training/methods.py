@@ -21,44 +21,25 @@ Passes = list[dict[float, Predictions]]
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One way from windows to risk.
+    """One way from windows to risk."""
 
-    Parameters
-    ----------
-    prepare : callable
-        From the table as read to the table that the classifier sees.
-    make : callable
-        Makes an untrained classifier.
-    fit_map : callable
-        Fits the risk map.
-    two_levels : bool
-        Whether the threshold stands between junctions left out and recordings left out, where the protocol
-        leaves out junctions; else threshold and map come from folds like the outer ones.
-    match_prevalence : bool
-        Whether risks are shifted, under ``transfer``, until hazards are as frequent as in training.
-    """
-
+    # From the table as read to the table that the classifier sees.
     prepare: Callable[[FeatureTable], FeatureTable]
-    make: MakeClassifier
-    fit_map: FitMap
+    make: MakeClassifier  # Makes an untrained classifier
+    fit_map: FitMap  # Fits the risk map
+    # Whether the threshold stands between junctions left out and recordings left out, where the protocol
+    # leaves out junctions; else threshold and map come from folds like the outer ones.
     two_levels: bool
+    # Whether risks are shifted, under ``transfer``, until hazards are as frequent as in training.
     match_prevalence: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of the comparison: a method and the statistic that is read from it.
+    """One row of the comparison: a method and the statistic that is read from it."""
 
-    Parameters
-    ----------
-    method : str
-        Name in `METHODS`.
-    miss_rate : float
-        beta of the statistic.
-    """
-
-    method: str
-    miss_rate: float
+    method: str  # Name in `METHODS`
+    miss_rate: float  # beta of the statistic
 
 
 def evaluate_pass(
@@ -70,28 +51,7 @@ def evaluate_pass(
     alpha: float,
     train: FeatureTable | None = None,
 ) -> dict[float, Predictions]:
-    """Run one seed of one method.
-
-    Parameters
-    ----------
-    method : Method
-        What to run.
-    table : FeatureTable
-        Windows to predict, as read.
-    protocol : str
-        ``cv``, ``lojo`` or ``transfer``.
-    seed : int
-        Draws folds and whatever the classifier draws.
-    alpha : float
-        Budget.
-    train : FeatureTable, optional
-        Windows to learn from under ``transfer``.
-
-    Returns
-    -------
-    dict of float to Predictions
-        For each beta.
-    """
+    """Run one seed of one method."""
     rng, split = np.random.default_rng(seed), split_for(protocol)
     prepared = method.prepare(table)
     inner = _inner_splits(method, protocol)
@@ -138,11 +98,9 @@ def loudest_direction(rng: np.random.Generator) -> Classifier:
 
 
 def distant_site(rng: np.random.Generator) -> Classifier:
-    """Make the classifier for a site unlike all of training: the quiet reference alone, hardly held back.
-
-    Level, which the ridge favours, is what a moving ego's own noise covers; the pattern above the quietest
-    windows is left. Chosen among some thirty for each moving junction on the other two: thrice the same.
-    """
+    """Make the classifier for a site unlike all of training: the quiet reference alone, hardly held back."""
+    # Level, which the ridge favours, is what a moving ego's own noise covers; the pattern above the quietest
+    # windows is left. Chosen among some thirty for each moving junction on the other two: thrice the same.
     return SiteEnsembleClassifier((Recipe("quiet", 1e-5),))
 
 

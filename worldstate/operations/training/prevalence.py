@@ -22,19 +22,7 @@ def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> Floa
     with the mean over the junction's other recordings. No label is looked at, but the share of hazards among
     the windows is taken to be what it was in training: true of a curated set, false of a street by the hour.
 
-    Parameters
-    ----------
-    risk : array_like, shape (n,)
-        In [0, 1].
-    table : FeatureTable
-        Windows that they are of.
-    mean_risk : float
-        Mean risk of training windows out of fold, in (0, 1).
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a risk is out of range or a junction has one recording only.
+    Shapes: risk (n,).
 
     Examples
     --------

@@ -13,26 +13,7 @@ from worldstate.ground.typing import BoolArray
 def with_site_references(table: FeatureTable, chosen: BoolArray | None = None) -> FeatureTable:
     """Append to each window the reference of its junction.
 
-    No label is looked at, unless the caller chooses windows by their label: a commissioning drive is
-    ``chosen=table.hazard_free``.
-
-    Parameters
-    ----------
-    table : FeatureTable
-        Windows, shape (n, 60).
-    chosen : ndarray of bool, shape (n,), optional
-        Windows that references may be taken from; all, unless given.
-
-    Returns
-    -------
-    FeatureTable
-        The same windows, shape (n, 240): window, then mean, median and quiet reference over all chosen
-        windows of the junction's other recordings.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a junction has no other recording to take a reference from.
+    Shapes: table (n, 60), chosen (n,), returns (n, 240).
 
     Examples
     --------
@@ -41,6 +22,8 @@ def with_site_references(table: FeatureTable, chosen: BoolArray | None = None) -
     >>> with_site_references(table).features.shape
     (3, 240)
     """
+    # No label is looked at, unless the caller chooses windows by their label: a commissioning drive is
+    # ``chosen=table.hazard_free``.
     levels = log_levels(table.features)
     allowed = np.ones(len(table), dtype=np.bool_) if chosen is None else chosen
     keys = table.recording_keys

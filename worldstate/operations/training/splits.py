@@ -35,27 +35,7 @@ def recording_labels(table: FeatureTable) -> dict[str, str]:
 
 
 def folds_by_recording(table: FeatureTable, rng: np.random.Generator, n_folds: int = N_FOLDS) -> TextArray:
-    """Deal recordings to folds so that each holds its share of every label at every junction.
-
-    Parameters
-    ----------
-    table : FeatureTable
-        Windows.
-    rng : numpy.random.Generator
-        Shuffles the recordings.
-    n_folds : int
-        At least 2.
-
-    Returns
-    -------
-    ndarray of str, shape (n,)
-        Fold of each window, "0" to "4".
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are fewer recordings than folds.
-    """
+    """Deal recordings to folds so that each holds its share of every label at every junction."""
     labels = recording_labels(table)
     if len(labels) < n_folds:
         raise InvalidArgumentError(f"expected at least {n_folds} recordings to split, got {len(labels)}")
@@ -69,13 +49,7 @@ def folds_by_recording(table: FeatureTable, rng: np.random.Generator, n_folds: i
 
 
 def junction_folds(table: FeatureTable, rng: np.random.Generator | None = None) -> TextArray:
-    """Return the junction of each window: leave one junction out; nothing is drawn.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is only one junction.
-    """
+    """Return the junction of each window: leave one junction out; nothing is drawn."""
     if len(np.unique(table.environments)) < 2:
         raise InvalidArgumentError("expected at least two junctions to leave one out")
     return table.environments

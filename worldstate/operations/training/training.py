@@ -132,17 +132,7 @@ def seen_by(table: FeatureTable, method: TrainingMethod) -> FeatureTable:
 
 
 def fit_signature(inputs: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> AnySignature:
-    """Fit the classifier of a method.
-
-    Parameters
-    ----------
-    inputs : FeatureTable
-        From `seen_by`.
-    method : {"baseline", "worldstate"}
-        The published classifier or the ensemble.
-    rng : numpy.random.Generator
-        Draws the folds of the published classifier; the ensemble draws nothing.
-    """
+    """Fit the classifier of a method."""
     if method == "worldstate":
         return SiteEnsembleClassifier().fit(inputs.features, inputs.labels).model_
     return PublishedClassifier(rng).fit(inputs.features, inputs.labels).model_

@@ -24,21 +24,11 @@ MISS_RATES = (PUBLISHED_MISS_RATE, ABSENT_MISS_RATE)
 
 @dataclass(frozen=True, slots=True)
 class WindowCalibration:
-    """What was learned on calibration windows and is applied unchanged to others.
+    """What was learned on calibration windows and is applied unchanged to others."""
 
-    Parameters
-    ----------
-    miss_rate : float
-        beta at which the statistic is formed.
-    gamma : float
-        Threshold.
-    risk_map : RiskMap
-        From statistic to risk.
-    """
-
-    miss_rate: float
-    gamma: float
-    risk_map: RiskMap
+    miss_rate: float  # beta at which the statistic is formed
+    gamma: float  # Threshold
+    risk_map: RiskMap  # From statistic to risk
 
     def apply(self, probabilities: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return statistic, risk and decision of each window from posteriors, shape (n, 4)."""
@@ -57,26 +47,7 @@ def calibrate_windows(
 ) -> WindowCalibration:
     """Set threshold and risk map on posteriors of windows that the classifier was not trained on.
 
-    The threshold is set for single windows. A sustained rule alarms on a part of those only, and so keeps
-    the budget too.
-
-    Parameters
-    ----------
-    probabilities : ndarray, shape (n, 4)
-        Posteriors of front, left, none, right.
-    hazards, hazard_free : ndarray of bool, shape (n,)
-        Labels; windows that are neither are left out.
-    alpha : float
-        Budget.
-    miss_rate : float
-        beta of the statistic.
-    fit_map : callable
-        Fits the map from statistics and labels: `fit_isotonic`, or `fit_platt` where windows are few.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If hazard or hazard-free windows are missing, or alpha is out of range.
+    Shapes: probabilities (n, 4), hazards, hazard_free (n,).
 
     Examples
     --------
@@ -86,6 +57,8 @@ def calibrate_windows(
     >>> calibration.apply(posteriors)[2]
     array([ True, False, False])
     """
+    # The threshold is set for single windows. A sustained rule alarms on a part of those only, and so keeps
+    # the budget too.
     if not hazards.any() or not hazard_free.any():
         raise InvalidArgumentError("calibration: expected windows with and without a hazard")
     score = hazard_statistic(probabilities, miss_rate)
@@ -100,22 +73,6 @@ def calibrate_windows(
 def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
     """Return one calibration of several of the same statistic, from the most careful to the boldest.
 
-    A classifier at a junction that it never saw stands between two that can be measured on its training set:
-    one that saw fewer junctions and not this one (leave one junction out), and one that saw this one too
-    (leave recordings out). The first is too careful, the second too bold, so the threshold is taken half-way
-    between them, in log-odds. The risk map is that of the boldest: statistics of windows that are compared
-    with their site mean the same elsewhere, those of a classifier from too few junctions do not.
-
-    Parameters
-    ----------
-    levels : sequence of WindowCalibration
-        At least one.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is none.
-
     Examples
     --------
     >>> from worldstate.abduction.cueing.risk_map import PlattMap
@@ -125,6 +82,12 @@ def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
     >>> round(middle.gamma, 3), middle.risk_map
     (0.75, PlattMap(slope=-1.0, offset=0.0))
     """
+    # A classifier at a junction that it never saw stands between two that can be measured on its training
+    # set: one that saw fewer junctions and not this one (leave one junction out), and one that saw this one
+    # too (leave recordings out). The first is too careful, the second too bold, so the threshold is taken
+    # half-way between them, in log-odds. The risk map is that of the boldest: statistics of windows that
+    # are compared with their site mean the same elsewhere, those of a classifier from too few junctions do
+    # not.
     if not levels:
         raise InvalidArgumentError("levels: expected at least one calibration")
     if len(levels) == 1:

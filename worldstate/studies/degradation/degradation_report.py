@@ -19,15 +19,8 @@ _FIGURES = ("false_alarms_per_hour", "false_awareness_per_hour", "false_awarenes
 
 
 def sweep_report(rows: Sequence[SweepRow]) -> dict[str, object]:
-    """Return the rows and what the claim rests on: the worst of each column over the camera's states.
-
-    A ratio of false alarms to those of the clean camera is null where the clean camera has none.
-
-    Parameters
-    ----------
-    rows : sequence of SweepRow
-        From `degradation_sweep`, the clean state among them.
-    """
+    """Return the rows and what the claim rests on: the worst of each column over the camera's states."""
+    # A ratio of false alarms to those of the clean camera is null where the clean camera has none.
     staged = [row for row in rows if row.state != OFF]
     clean = next(row for row in staged if row.state == CLEAN)
     ratios = {f"largest_ratio_of_{name}": _largest_ratio(staged, clean, name) for name in _FIGURES}
@@ -57,13 +50,7 @@ def sweep_table(rows: Sequence[SweepRow]) -> str:
 
 
 def write_sweep_figure(rows: Sequence[SweepRow], path: Path) -> None:
-    """Draw awareness and vision alone over the share of misses, and false alarms, by the ending of `path`.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Draw awareness and vision alone over the share of misses, and false alarms, by the ending of `path`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.5, 3.4), layout="constrained")

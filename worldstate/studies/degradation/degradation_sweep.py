@@ -62,48 +62,24 @@ class SweepSettings:
 
 @dataclass(frozen=True, slots=True)
 class SweepRow:
-    """One state of the camera; None where the recordings hold nothing to form it from.
+    """One state of the camera; None where the recordings hold nothing to form it from."""
 
-    Parameters
-    ----------
-    state : str
-        Its name.
-    degradation : float
-        Mean d that was estimated.
-    miss_rate : float or None
-        Mean beta of the channel where it was asked after T0.
-    vision_only : float
-        Share of the hops after T0, vehicle in view, in which it is detected, as 1 - beta counts it.
-    any_detection : float
-        Share of them in which anything that moves is detected.
-    awareness : float
-        Share of them in which it is detected or P(hidden) + P(visible) is above its threshold.
-    awareness_interval : tuple of float
-        Its middle 95 % over recordings drawn again.
-    unseen_awareness : float or None
-        Awareness in the hops in which it is not detected: what the sound holds by itself.
-    detected, lead_time_s : float or None
-        Share of approaches with an advisory in the 5 s before T0, and by how much in the mean.
-    false_alarms_per_hour : float
-        Advisories on hazard-free recordings.
-    false_awareness_per_hour : float
-        Times that the awareness rises on them, for sound or for a false detection.
-    false_awareness : float
-        Share of their hops in awareness: where the hours are few, steadier than the count of its rises.
-    """
-
-    state: str
-    degradation: float
-    miss_rate: float | None
+    state: str  # Its name
+    degradation: float  # Mean d that was estimated
+    miss_rate: float | None  # Mean beta of the channel where it was asked after T0
+    # Share of the hops after T0, vehicle in view, in which it is detected, as 1 - beta counts it.
     vision_only: float
-    any_detection: float
-    awareness: float
-    awareness_interval: Interval
+    any_detection: float  # Share of them in which anything that moves is detected
+    awareness: float  # Share of them in which it is detected or P(hidden) + P(visible) is above its threshold
+    awareness_interval: Interval  # Its middle 95 % over recordings drawn again
+    # Awareness in the hops in which it is not detected: what the sound holds by itself.
     unseen_awareness: float | None
-    detected: float
+    detected: float  # Share of approaches with an advisory in the 5 s before T0, and by how much in the mean
     lead_time_s: float | None
-    false_alarms_per_hour: float
+    false_alarms_per_hour: float  # Advisories on hazard-free recordings
+    # Times that the awareness rises on them, for sound or for a false detection.
     false_awareness_per_hour: float
+    # Share of their hops in awareness: where the hours are few, steadier than the count of its rises.
     false_awareness: float
 
     def to_dict(self) -> dict[str, object]:

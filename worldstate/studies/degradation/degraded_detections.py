@@ -23,21 +23,14 @@ CLEAN, OFF = "clean", "off"
 class CameraState:
     """One staged state of the camera.
 
-    Parameters
-    ----------
-    family : {"blur", "darkness", "noise", "all"}
-        What is staged.
-    degradation : float
-        d in [0, 1]; 0 is the clean camera, whatever the family.
-
     Examples
     --------
     >>> str(CameraState("blur", 0.5)), str(CameraState("all", 0.0))
     ('blur 0.5', 'clean')
     """
 
-    family: Family
-    degradation: float
+    family: Family  # What is staged
+    degradation: float  # d in [0, 1]; 0 is the clean camera, whatever the family
 
     def __str__(self) -> str:
         return f"{self.family} {self.degradation:g}" if self.degradation else CLEAN
@@ -57,45 +50,20 @@ def camera_states(families: Sequence[Family] = ("blur", "darkness", "noise")) ->
 
 @dataclass(frozen=True, slots=True)
 class Staging:
-    """Who looks at the staged frames.
+    """Who looks at the staged frames."""
 
-    Parameters
-    ----------
-    make_detector : callable
-        Makes a detector for each state.
-    rates : MissRates
-        Measured with the same detector, on other recordings.
-    camera : PinholeCamera
-        That took the video.
-    settings : VisionSettings
-        How it is asked.
-    """
-
-    make_detector: Callable[[], Detector]
-    rates: MissRates
-    camera: PinholeCamera
-    settings: VisionSettings
+    make_detector: Callable[[], Detector]  # Makes a detector for each state
+    rates: MissRates  # Measured with the same detector, on other recordings
+    camera: PinholeCamera  # That took the video
+    settings: VisionSettings  # How it is asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StagedLooks:
-    """The detections and the health of one camera, state by state.
+    """The detections and the health of one camera, state by state."""
 
-    Parameters
-    ----------
-    states : tuple of str
-        Names.
-    watched : tuple of Watched
-        One a state, of the same frames.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there is none, or not one a state.
-    """
-
-    states: tuple[str, ...]
-    watched: tuple[Watched, ...]
+    states: tuple[str, ...]  # Names
+    watched: tuple[Watched, ...]  # One a state, of the same frames
 
     def __post_init__(self) -> None:
         if not self.states or len(self.states) != len(self.watched):
@@ -109,29 +77,9 @@ def stage_looks(
     states: Sequence[CameraState],
     rng: np.random.Generator,
 ) -> StagedLooks:
-    """Decode once, degrade and look in every state.
-
-    The degradation is staged on the frames and nobody is told: the detector sees degraded frames, and d is
-    estimated from them.
-
-    Parameters
-    ----------
-    video : Video
-        Clean frames, the first one at the start of the sound.
-    staging : Staging
-        Who looks.
-    states : sequence of CameraState
-        At least one.
-    rng : numpy.random.Generator
-        Draws the staged noise.
-
-    Raises
-    ------
-    InputFileError
-        If the video is damaged.
-    InvalidArgumentError
-        If the miss rates hold no scale of health, or there is no state.
-    """
+    """Decode once, degrade and look in every state."""
+    # The degradation is staged on the frames and nobody is told: the detector sees degraded frames, and d is
+    # estimated from them.
     watchers = [Watcher(staging.make_detector(), staging.rates) for _ in states]
     for number, frame in enumerate(video.frames()):
         stamp_ns = nanoseconds(number / video.frame_rate_hz)

@@ -18,22 +18,7 @@ MAX_BYTES = 64 << 20
 
 
 def save_looks(path: str | Path, looks: StagedLooks, origin: str) -> None:
-    """Write looks as npz without objects, whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        In an existing folder.
-    looks : StagedLooks
-        What to keep; the miss rates are not kept.
-    origin : str
-        What they were made by; `load_looks` takes them back for the same origin only.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Write looks as npz without objects, whole or not at all."""
     frames = [frame for one in looks.watched for frame in one.detections.frames]
     logs = [one.degradation for one in looks.watched]
     values = {
@@ -50,22 +35,7 @@ def save_looks(path: str | Path, looks: StagedLooks, origin: str) -> None:
 
 
 def load_looks(path: str | Path, origin: str, rates: MissRates) -> StagedLooks | None:
-    """Return what `save_looks` wrote; None where nothing of this origin stands there.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    origin : str
-        As for `save_looks`.
-    rates : MissRates
-        That d was read on the scale of.
-
-    Raises
-    ------
-    InputFileError
-        If the file is too large or damaged.
-    """
+    """Return what `save_looks` wrote; None where nothing of this origin stands there."""
     if not Path(path).is_file():
         return None
     return load_npz(path, "staged looks", MAX_BYTES, lambda values: _read(values, origin, rates))

@@ -27,27 +27,13 @@ VERSION = 2
 
 @dataclass(frozen=True, slots=True)
 class StagedDataset:
-    """What to stage, and how.
+    """What to stage, and how."""
 
-    Parameters
-    ----------
-    staging : Staging
-        Who looks; its camera is resized to each video.
-    detector : str
-        Name of the detector, with its model.
-    states : tuple of CameraState
-        Of the camera.
-    seed : int
-        Draws the staged noise.
-    model : Path, optional
-        Model file; the one that ships where not given.
-    """
-
-    staging: Staging
-    detector: str
-    states: tuple[CameraState, ...]
-    seed: int = 0
-    model: Path | None = None
+    staging: Staging  # Who looks; its camera is resized to each video
+    detector: str  # Name of the detector, with its model
+    states: tuple[CameraState, ...]  # Of the camera
+    seed: int = 0  # Draws the staged noise
+    model: Path | None = None  # Model file; the one that ships where not given
 
     def origin(self, recording: Recording) -> str:
         """Name everything that the looks at a recording depend on, in a few characters."""
@@ -65,20 +51,7 @@ class StagedDataset:
 
 
 def filmed_recordings(root: Path, most: int | None = None) -> list[Recording]:
-    """Return the recordings of a data set that have a video and detections.
-
-    Parameters
-    ----------
-    root : Path
-        Folder with ``DataLog.csv``.
-    most : int, optional
-        The first so many.
-
-    Raises
-    ------
-    InputFileError
-        If the log is missing or damaged, or no recording has both.
-    """
+    """Return the recordings of a data set that have a video and detections."""
     recordings = OvadDataset(root).recordings
     filmed = [r for r in recordings if (r.path / VIDEO_NAME).is_file() and r.detections_path]
     if not filmed:
@@ -89,24 +62,7 @@ def filmed_recordings(root: Path, most: int | None = None) -> list[Recording]:
 def stage_dataset(
     folder: Path, recordings: Sequence[Recording], settings: StagedDataset, jobs: int = 1
 ) -> Iterator[StagedRecording]:
-    """Yield the recordings in their order; what the camera saw lies in `folder` and is not staged again.
-
-    Parameters
-    ----------
-    folder : Path
-        Existing; one file a recording.
-    recordings : sequence of Recording
-        With video and detections.
-    settings : StagedDataset
-        What to stage, and who listens.
-    jobs : int
-        Processes; the result does not depend on it.
-
-    Raises
-    ------
-    InputFileError
-        If a file is damaged.
-    """
+    """Yield the recordings in their order; what the camera saw lies in `folder` and is not staged again."""
     yield from in_processes(partial(_stage, folder, settings), recordings, jobs)
 
 

@@ -28,28 +28,8 @@ Heard = tuple[AcousticFrame, Measurement]
 def hear_staged(
     source: Source, looks: StagedLooks, staging: Staging, *, name: str, label: str
 ) -> StagedRecording:
-    """Return what the filter made of one recording with its camera in every state, and without it.
-
-    The sound is heard once. The last row is that of a camera that is never asked.
-
-    Parameters
-    ----------
-    source : Source
-        The recording's sound and model; its detections are the reference of what is in view.
-    looks : StagedLooks
-        What the camera saw, the first frame at the start of the sound.
-    staging : Staging
-        Whose camera it was, and how it is asked.
-    name, label : str
-        Of the recording.
-
-    Raises
-    ------
-    InputFileError
-        If a file is damaged.
-    InvalidArgumentError
-        If the sound is shorter than a second.
-    """
+    """Return what the filter made of one recording with its camera in every state, and without it."""
+    # The sound is heard once. The last row is that of a camera that is never asked.
     measured = list(measure_steps(source))
     there = [any(sighting.moving for sighting in m.sightings) for _, m in measured]
     sight = unoccluded_sector(source.context)

@@ -13,53 +13,24 @@ from worldstate.operations.recordings.hop_stream import HopStream
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StagedRecording:
-    """One recording in S states of its camera, n hops each.
+    """One recording in S states of its camera, n hops each."""
 
-    Parameters
-    ----------
-    name, label : str
-        Of the recording; label ``"none"`` where it is hazard-free.
-    t0_s : float
-        Line-of-sight entry; NaN where there is none.
-    states : tuple of str
-        Names of the states.
-    time_s : ndarray, shape (n,)
-        End of each window.
-    there : ndarray of bool, shape (n,)
-        Whether a moving object is in view, by the reference.
-    approach : ndarray, shape (n,)
-        As in `HopStream`.
-    log_likelihoods : ndarray, shape (n, K + 2)
-        As in `HopStream`.
-    answer, miss_rate, clutter_rate, seen : ndarray, shape (S, n)
-        As in `HopStream`.
-    degradation : ndarray, shape (S, n)
-        d as it was estimated.
-    presence : ndarray, shape (S, n)
-        P(hidden) + P(visible) of the filter.
-    found : ndarray of bool, shape (S, n)
-        Whether a moving object that is in view, by the reference, was detected; `seen` takes any detection.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If shapes do not agree, or a state of that name is asked for and there is none.
-    """
-
-    name: str
+    name: str  # Of the recording; label ``"none"`` where it is hazard-free
     label: str
-    t0_s: float
-    states: tuple[str, ...]
-    time_s: FloatArray
-    there: BoolArray
-    approach: FloatArray
-    log_likelihoods: FloatArray
-    answer: IntArray
+    t0_s: float  # Line-of-sight entry; NaN where there is none
+    states: tuple[str, ...]  # Names of the states
+    time_s: FloatArray  # shape (n,): End of each window
+    there: BoolArray  # shape (n,): Whether a moving object is in view, by the reference
+    approach: FloatArray  # shape (n,): As in `HopStream`
+    log_likelihoods: FloatArray  # shape (n, K + 2): As in `HopStream`
+    answer: IntArray  # shape (S, n): As in `HopStream`
     miss_rate: FloatArray
     clutter_rate: FloatArray
     seen: BoolArray
-    degradation: FloatArray
-    presence: FloatArray
+    degradation: FloatArray  # shape (S, n): d as it was estimated
+    presence: FloatArray  # shape (S, n): P(hidden) + P(visible) of the filter
+    # shape (S, n): Whether a moving object that is in view, by the reference, was detected; `seen` takes
+    # any detection.
     found: BoolArray
 
     def __post_init__(self) -> None:
@@ -81,13 +52,7 @@ class StagedRecording:
         presence: FloatArray,
         found: BoolArray,
     ) -> "StagedRecording":
-        """Return the streams of one recording, one a state, in one piece.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If there is none.
-        """
+        """Return the streams of one recording, one a state, in one piece."""
         if not streams:
             raise InvalidArgumentError("streams: expected at least one state")
         first = streams[0]
@@ -109,13 +74,7 @@ class StagedRecording:
         return self.label == "none"
 
     def index(self, state: str) -> int:
-        """Return the row of a state.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If there is no such state.
-        """
+        """Return the row of a state."""
         if state not in self.states:
             raise InvalidArgumentError(f"state: expected one of {', '.join(self.states)}, got {state:.40}")
         return self.states.index(state)

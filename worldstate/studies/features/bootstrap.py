@@ -23,11 +23,6 @@ Interval = tuple[float, float]
 class FigureDraws:
     """Figures of one method on every bootstrap sample; the same samples for every method.
 
-    Parameters
-    ----------
-    values : mapping of str to ndarray, shape (draws,)
-        For each of `FIGURES`.
-
     Examples
     --------
     >>> low, high = FigureDraws({"tpr": np.linspace(0.0, 40.0, 41)}).interval("tpr")
@@ -35,7 +30,7 @@ class FigureDraws:
     (1.0, 39.0)
     """
 
-    values: Mapping[str, FloatArray]
+    values: Mapping[str, FloatArray]  # shape (draws,): For each of `FIGURES`
 
     def interval(self, figure: str) -> Interval:
         """Return the middle 95 %."""
@@ -51,22 +46,7 @@ class FigureDraws:
 
 
 def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = DRAWS) -> list[IndexArray]:
-    """Draw recordings with replacement, as many of each label at each junction as there are.
-
-    Parameters
-    ----------
-    table : FeatureTable
-        Windows.
-    rng : numpy.random.Generator
-        Draws.
-    draws : int
-        How many samples.
-
-    Returns
-    -------
-    list of ndarray of int
-        Rows of each sample; the windows of a recording stay together.
-    """
+    """Draw recordings with replacement, as many of each label at each junction as there are."""
     keys = table.recording_keys
     rows = {key: np.flatnonzero(keys == key) for key in np.unique(keys).tolist()}
     strata: dict[tuple[str, str], list[IndexArray]] = {}
@@ -78,10 +58,8 @@ def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = 
 def draw_figures(
     table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
 ) -> FigureDraws:
-    """Return the figures on every sample, mean over the passes (seeds).
-
-    The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
-    """
+    """Return the figures on every sample, mean over the passes (seeds)."""
+    # The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
     outcomes = [_Outcome.of(table, predictions) for predictions in passes]
     figures = np.array([[outcome.figures(rows) for rows in samples] for outcome in outcomes]).mean(axis=0)
     return FigureDraws(dict(zip(FIGURES, figures.T, strict=True)))

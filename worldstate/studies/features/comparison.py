@@ -34,32 +34,7 @@ def run_passes(
     jobs: int = 1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> dict[str, Passes]:
-    """Run every seed of every method; the outcome does not depend on the number of jobs.
-
-    Parameters
-    ----------
-    methods : sequence of str
-        Names in `METHODS`.
-    table : FeatureTable
-        Windows to predict.
-    protocol : str
-        ``cv``, ``lojo`` or ``transfer``.
-    seeds : int
-        Seeds 0 to seeds - 1.
-    alpha : float
-        Budget.
-    train : FeatureTable, optional
-        Windows to learn from, under ``transfer``.
-    jobs : int
-        Processes.
-    on_pass : callable
-        Called after each, for progress.
-
-    Returns
-    -------
-    dict of str to list
-        For each method one item a seed.
-    """
+    """Run every seed of every method; the outcome does not depend on the number of jobs."""
     tasks = [(name, seed) for name in methods for seed in range(seeds)]
     run = delayed(evaluate_pass)
     outcomes = Parallel(n_jobs=jobs, return_as="generator")(

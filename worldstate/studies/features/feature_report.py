@@ -36,15 +36,8 @@ COLUMNS = (
 
 
 def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
-    """Return the figures of one pass over the table.
-
-    Hazard windows against hazard-free ones; ``front`` counts in the 4-class accuracy only.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If no junction has both hazard and hazard-free windows.
-    """
+    """Return the figures of one pass over the table."""
+    # Hazard windows against hazard-free ones; ``front`` counts in the 4-class accuracy only.
     scored = table.hazards | table.hazard_free
     hazards, score, risk = table.hazards[scored], predictions.score[scored], predictions.risk[scored]
     floor, floor_std = calibration_error_sampling(risk, np.random.default_rng(FLOOR_SEED))
@@ -82,16 +75,7 @@ def group_figures(table: FeatureTable, predictions: Predictions) -> dict[str, Fi
 
 
 def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> dict[str, Any]:
-    """Return the mean figures over all passes (seeds), with their standard deviation between seeds.
-
-    Parameters
-    ----------
-    table : FeatureTable
-        Windows.
-    passes : sequence of dict of float to Predictions
-        For each seed the predictions at beta = 1, the published statistic, which give the plain keys, and at
-        beta = 0, the visible explanation removed, which give the keys that end in ``_absent``.
-    """
+    """Return the mean figures over all passes (seeds), with their standard deviation between seeds."""
     published, absent = ([one[beta] for one in passes] for beta in (1.0, 0.0))
     figures = [window_figures(table, predictions) for predictions in published]
     return {
@@ -128,13 +112,7 @@ def mean_figures(figures: Sequence[Figures]) -> Figures:
 def write_predictions(
     path: str | Path, table: FeatureTable, passes: Sequence[Predictions], seeds: Sequence[int]
 ) -> None:
-    """Write one row a window and seed, whole or not at all; floats as they are, to the last digit.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Write one row a window and seed, whole or not at all; floats as they are, to the last digit."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)

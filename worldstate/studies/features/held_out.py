@@ -12,15 +12,8 @@ from worldstate.operations.training.window_calibration import MISS_RATES, Window
 
 
 def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[float, Predictions]:
-    """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does.
-
-    A model that compares windows with their site is given the reference from the site's other recordings.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a recording was in the training set, or the model was not calibrated for `alpha`.
-    """
+    """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does."""
+    # A model that compares windows with their site is given the reference from the site's other recordings.
     check_unseen(model, table)
     compares = isinstance(model.signature, EnsembleModel)
     inputs = with_site_references(table).features if compares else table.features
@@ -34,13 +27,7 @@ def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[fl
 
 
 def check_unseen(model: Model, table: FeatureTable) -> None:
-    """Refuse a table that shares recordings with the training set of a model.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If they overlap; the message says how many and how to keep them apart.
-    """
+    """Refuse a table that shares recordings with the training set of a model."""
     recordings = set(np.unique(table.recording_keys).tolist())
     seen = recordings & set(model.provenance.training_recordings)
     if seen:

@@ -76,36 +76,21 @@ class AblationSwitches:
 
 @dataclass(frozen=True, slots=True)
 class AblationRow:
-    """One row of the table; None where the streams hold nothing to form it from.
+    """One row of the table; None where the streams hold nothing to form it from."""
 
-    Parameters
-    ----------
-    auroc : float or None
-        Windows before T0 against hazard-free ones.
-    detected, lead_time_s : float or None
-        Share of approaches announced before T0, and by how much in the mean.
-    false_alarms_per_hour, window_rate : float
-        On hazard-free recordings.
-    ece, ece_floor, brier : float or None
-        Of the risk on the same windows, with its sampling floor.
-    awareness, vision_only : float or None
-        Share of the hops after T0, while the vehicle is in view, in which a detection is there or P(hidden) +
-        P(visible) is above its threshold, and in which a detection is there.
-    approach_weight : float
-        Mean of the weights chosen.
-    """
-
-    auroc: float | None
-    detected: float | None
+    auroc: float | None  # Windows before T0 against hazard-free ones
+    detected: float | None  # Share of approaches announced before T0, and by how much in the mean
     lead_time_s: float | None
-    false_alarms_per_hour: float
+    false_alarms_per_hour: float  # On hazard-free recordings
     window_rate: float
-    ece: float | None
+    ece: float | None  # Of the risk on the same windows, with its sampling floor
     ece_floor: float | None
     brier: float | None
+    # Share of the hops after T0, while the vehicle is in view, in which a detection is there or P(hidden) +
+    # P(visible) is above its threshold, and in which a detection is there.
     awareness: float | None
     vision_only: float | None
-    approach_weight: float
+    approach_weight: float  # Mean of the weights chosen
 
     def to_dict(self) -> dict[str, float | None]:
         """Return JSON-able values."""
@@ -166,22 +151,7 @@ def ablation_table(
     switches: AblationSwitches | None = None,
     approach_weights: tuple[float, ...] = (0.0, 0.1, 0.2, 0.4, 0.8),
 ) -> dict[str, AblationRow]:
-    """Evaluate everything on, each part off, and looming added; the folds are the same in every row.
-
-    Parameters
-    ----------
-    streams, reference_prior, switches
-        As for `evaluate_ablation`.
-    seed : int
-        Of the generator that deals the folds.
-    approach_weights : tuple of float
-        Weights of looming to choose from in the last row.
-
-    Returns
-    -------
-    dict of AblationRow
-        ``full``, ``signature_only``, ``raw_risk``, ``with_looming``.
-    """
+    """Evaluate everything on, each part off, and looming added; the folds are the same in every row."""
     base = switches or AblationSwitches()
     rows = {
         "full": base,

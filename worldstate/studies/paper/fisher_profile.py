@@ -17,21 +17,6 @@ def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
 
     .. math:: s_b = \ln E_b - \frac1B \sum_{b'} \ln E_{b'}
 
-    Parameters
-    ----------
-    band_log_energy : (..., B) float
-        Log energy of each band, any base; 16 bands in this library.
-
-    Returns
-    -------
-    (..., B) float
-        Same base, mean zero over bands.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are fewer than two bands or a value is not finite.
-
     References
     ----------
     J. Aitchison, "The statistical analysis of compositional data", J. Roy. Statist. Soc. B 44, 1982 (centred
@@ -99,28 +84,7 @@ def discriminative_range_hz(
 
     .. math:: F_b \ge s\, \max_{b'} F_{b'} \quad \text{for all bands } b \text{ of the range}
 
-    Parameters
-    ----------
-    profile : (B,) float
-        Fisher ratios, finite.
-    edges_hz : (B + 1,) float
-        Ascending edges of the bands.
-    share : float
-        Of the largest ratio, in (0, 1].
-
-    Returns
-    -------
-    low_hz, high_hz : float
-        Edges of the range.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On wrong shapes or values.
-
-    References
-    ----------
-    Derived here: section IV of the paper names such a range without a rule; a share of the peak is one.
+    Shapes: profile (B,), edges_hz (B + 1,).
 
     Examples
     --------

@@ -27,34 +27,21 @@ _BOOTSTRAPS = 200
 
 @dataclass(frozen=True, slots=True)
 class ReachOnData:
-    """How well the state of a data set's windows could be told from what was heard.
+    """How well the state of a data set's windows could be told from what was heard."""
 
-    Parameters
-    ----------
-    states, windows : int
-        K and n.
-    entropy_bits : float
-        H(z).
-    information_lower, information_plug_in, information_neighbours : float
-        Estimates of I(z; x), bits: variational lower bound and plug-in from the posteriors, and kNN on the
-        leading components of the features (NaN without features).
-    information_high : float
-        The largest estimate plus two bootstrap standard deviations: what the bound is stated at.
-    error : float
-        Of the classifier itself.
-    fano, sharp_fano : float
-        No detector errs less than this, if the information is not above `information_high`: the paper's form
-        and the one without its slack.
-    """
-
-    states: int
+    states: int  # K and n
     windows: int
-    entropy_bits: float
+    entropy_bits: float  # H(z)
+    # Estimates of I(z; x), bits: variational lower bound and plug-in from the posteriors, and kNN on the
+    # leading components of the features (NaN without features).
     information_lower: float
     information_plug_in: float
     information_neighbours: float
+    # The largest estimate plus two bootstrap standard deviations: what the bound is stated at.
     information_high: float
-    error: float
+    error: float  # Of the classifier itself
+    # No detector errs less than this, if the information is not above `information_high`: the paper's form
+    # and the one without its slack.
     fano: float
     sharp_fano: float
 
@@ -129,23 +116,14 @@ def reach_on_data(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReachOfArray:
-    """How well a bearing could be told with an array, by the Cramer-Rao bound.
+    """How well a bearing could be told with an array, by the Cramer-Rao bound."""
 
-    Parameters
-    ----------
-    azimuths_rad : ndarray, shape (n,)
-        Directions asked for.
-    std_rad : ndarray, shape (n,)
-        Smallest standard deviation of any unbiased estimator; inf at endfire of a line array.
-    with_vision_rad : ndarray, shape (n,)
-        The same once a camera of `vision_std_rad` sees the source too, under (A1).
-    endfire : ndarray, shape (n,)
-        Bearing information relative to the best direction, the corollary's cos^2.
-    """
-
-    azimuths_rad: FloatArray
+    azimuths_rad: FloatArray  # shape (n,): Directions asked for
+    # shape (n,): Smallest standard deviation of any unbiased estimator; inf at endfire of a line array.
     std_rad: FloatArray
+    # shape (n,): The same once a camera of `vision_std_rad` sees the source too, under (A1).
     with_vision_rad: FloatArray
+    # shape (n,): Bearing information relative to the best direction, the corollary's cos^2.
     endfire: FloatArray
 
 

@@ -23,70 +23,30 @@ ALPHA, ALPHA_LOOSE = 0.02, 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RuleOutcome:
-    """What one rule did in each of R recordings.
+    """What one rule did in each of R recordings."""
 
-    Parameters
-    ----------
-    detected : ndarray of bool, shape (R,)
-        An onset within 5 s before T0; False without a vehicle.
-    lead_s : ndarray, shape (R,)
-        From that onset to T0; NaN where there is none.
-    false_onsets : ndarray of int, shape (R,)
-        Onsets in a hazard-free recording; 0 in the others.
-    """
-
-    detected: BoolArray
-    lead_s: FloatArray
-    false_onsets: IndexArray
+    detected: BoolArray  # shape (R,): An onset within 5 s before T0; False without a vehicle
+    lead_s: FloatArray  # shape (R,): From that onset to T0; NaN where there is none
+    false_onsets: IndexArray  # shape (R,): Onsets in a hazard-free recording; 0 in the others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwinScore:
-    """All rules over all recordings.
+    """All rules over all recordings."""
 
-    Parameters
-    ----------
-    recordings : tuple of TwinRecording
-        Scored ones.
-    vision : RuleOutcome
-        The camera alone: something that moves is detected.
-    published, sustained : RuleOutcome
-        The argmax is left or right, at any window and over k windows.
-    ours : dict of float to RuleOutcome
-        Eq. (post) at or above gamma(alpha) over k windows, for every budget.
-    sustain_hops : tuple of int
-        k of each fold.
-    risk : tuple of ndarray
-        Calibrated risk of each window of each recording, by the other folds.
-    """
-
-    recordings: tuple[TwinRecording, ...]
-    vision: RuleOutcome
-    published: RuleOutcome
+    recordings: tuple[TwinRecording, ...]  # Scored ones
+    vision: RuleOutcome  # The camera alone: something that moves is detected
+    published: RuleOutcome  # The argmax is left or right, at any window and over k windows
     sustained: RuleOutcome
-    ours: dict[float, RuleOutcome]
-    sustain_hops: tuple[int, ...]
-    risk: tuple[FloatArray, ...]
+    ours: dict[float, RuleOutcome]  # Eq. (post) at or above gamma(alpha) over k windows, for every budget
+    sustain_hops: tuple[int, ...]  # k of each fold
+    risk: tuple[FloatArray, ...]  # Calibrated risk of each window of each recording, by the other folds
 
 
 def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -> TwinScore:
-    """Set k, gamma(alpha) and the risk map on four folds, apply them to the fifth, five times.
-
-    k maximises the share of approaches detected less the share of hazard-free recordings with an alarm, both
-    on the calibration folds; the smaller k of equals.
-
-    Parameters
-    ----------
-    recordings : sequence of TwinRecording
-        At least two with and two without a vehicle.
-    rng : numpy.random.Generator
-        Deals the recordings to folds.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are fewer.
-    """
+    """Set k, gamma(alpha) and the risk map on four folds, apply them to the fifth, five times."""
+    # k maximises the share of approaches detected less the share of hazard-free recordings with an alarm,
+    # both on the calibration folds; the smaller k of equals.
     fold_of = deal(recordings, rng)
     n = len(recordings)
     sustained: list[BoolArray] = [np.zeros(0, bool)] * n
@@ -117,25 +77,6 @@ def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -
 
 def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: int = FOLDS) -> IndexArray:
     """Deal recordings to folds so that each holds its share of every approach at every site, shape (R,).
-
-    Parameters
-    ----------
-    recordings : sequence of TwinRecording
-        At least two with and two without a vehicle.
-    rng : numpy.random.Generator
-        Draws the order within a stratum.
-    folds : int
-        At most so many.
-
-    Returns
-    -------
-    ndarray of int, shape (R,)
-        Fold of each recording.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If there are fewer than two of a kind.
 
     Examples
     --------

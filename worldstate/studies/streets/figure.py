@@ -19,13 +19,7 @@ if TYPE_CHECKING:
 
 
 def write_twin_figure(score: TwinScore, path: Path) -> None:
-    """Draw the score and write it as PNG, SVG or PDF, by the ending of `path`.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Draw the score and write it as PNG, SVG or PDF, by the ending of `path`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14.5, 3.6), layout="constrained")

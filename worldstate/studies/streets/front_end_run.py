@@ -44,20 +44,7 @@ class _Silent:
 
 
 def run_front_end(recording: SimulatedRecording, name: str = "") -> TwinRecording:
-    """Listen to a recording of the 56-microphone roof array; `TwinRecording.judged` comes after.
-
-    Parameters
-    ----------
-    recording : SimulatedRecording
-        At least a second long.
-    name : str
-        For the report.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If it is shorter than a second.
-    """
+    """Listen to a recording of the 56-microphone roof array; `TwinRecording.judged` comes after."""
     array = roof_array_56()
     vision = VisionQuery(
         PinholeCamera(), detection_log(recording), line_of_sight=unoccluded_sector(Context())

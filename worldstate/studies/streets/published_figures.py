@@ -25,20 +25,7 @@ LONGEST_TTA_S = 30.0
 
 
 def twin_figures(score: TwinScore, rows: IndexArray | None = None) -> dict[str, float]:
-    """Return every figure on the chosen recordings; NaN where nothing is there to count.
-
-    Parameters
-    ----------
-    score : TwinScore
-        All recordings, scored.
-    rows : ndarray of int, optional
-        Which of them, repetitions allowed; all where not given.
-
-    Returns
-    -------
-    dict of str to float
-        Rates and shares in [0, 1], leads in s, alarms per hour, bearings in degrees.
-    """
+    """Return every figure on the chosen recordings; NaN where nothing is there to count."""
     chosen = np.arange(len(score.recordings)) if rows is None else rows
     recordings = [score.recordings[i] for i in chosen]
     approaches = [recording for recording in recordings if not recording.hazard_free]
@@ -79,10 +66,8 @@ def rule_figures(outcome: RuleOutcome, score: TwinScore, rows: IndexArray) -> di
 
 
 def twin_intervals(score: TwinScore, rng: np.random.Generator, draws: int = DRAWS) -> dict[str, Interval]:
-    """Return the middle 95 % of every figure over samples of recordings, drawn within approach and site.
-
-    A figure that a sample does not have, such as a bearing without anything in view, is left out of it.
-    """
+    """Return the middle 95 % of every figure over samples of recordings, drawn within approach and site."""
+    # A figure that a sample does not have, such as a bearing without anything in view, is left out of it.
     strata: dict[tuple[str, str], list[int]] = {}
     for i, recording in enumerate(score.recordings):
         strata.setdefault((recording.approach, recording.site), []).append(i)
@@ -113,16 +98,6 @@ def _bearings(approaches: Sequence[TwinRecording]) -> dict[str, float]:
 
 def twin_bearings(recordings: Sequence[TwinRecording]) -> BearingChecks:
     """Put the bearings of recordings beside the prominence of their windows.
-
-    Parameters
-    ----------
-    recordings : sequence of TwinRecording
-        At least one.
-
-    Returns
-    -------
-    BearingChecks
-        One row a window; the error against the nearest moving box of the camera.
 
     Examples
     --------

@@ -53,22 +53,14 @@ class MedianRow:
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Hazard against hazard-free windows of one set, by a classifier trained on the other.
-
-    Parameters
-    ----------
-    auroc, scalar : float
-        Area of the classifier and of the loudest direction on the same windows.
-    gain : (float, float)
-        Middle 95 % of their difference over bootstrap samples of recordings.
-    """
+    """Hazard against hazard-free windows of one set, by a classifier trained on the other."""
 
     trained_on: str
     tested_on: str
     windows: int
-    auroc: float
+    auroc: float  # Area of the classifier and of the loudest direction on the same windows
     scalar: float
-    gain: Interval
+    gain: Interval  # Middle 95 % of their difference over bootstrap samples of recordings
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,16 +97,15 @@ class Realism:
 def describe_windows(features: FloatArray) -> dict[str, FloatArray]:
     """Return level and shape of windows, raw features (n, 60) -> (n,) for each of `DESCRIPTORS`.
 
-    level is the mean, peak the largest value, prominence the ratio of each segment's peak to its median
-    (mean over segments), width_deg the azimuths above half way from median to peak, change the Euclidean
-    distance of the segments.
-
     Examples
     --------
     >>> flat = describe_windows(np.full((1, 60), 0.2))
     >>> [round(float(flat[name][0]), 3) for name in DESCRIPTORS]
     [0.2, 0.2, 0.0, 1.0, 0.0]
     """
+    # level is the mean, peak the largest value, prominence the ratio of each segment's peak to its median
+    # (mean over segments), width_deg the azimuths above half way from median to peak, change the Euclidean
+    # distance of the segments.
     segments = features.reshape(len(features), SEGMENTS, -1)
     spectrum = segments.mean(axis=1)
     half = 0.5 * (spectrum.max(axis=1) + np.median(spectrum, axis=1))
@@ -130,26 +121,7 @@ def describe_windows(features: FloatArray) -> dict[str, FloatArray]:
 def compare_windows(
     real: FeatureTable, simulated: FeatureTable, rng: np.random.Generator, *, draws: int = DRAWS
 ) -> Realism:
-    """Compare real with simulated windows.
-
-    Parameters
-    ----------
-    real, simulated : FeatureTable
-        Windows as released and as `simulated_windows` makes them, of the same kind of driving.
-    rng : numpy.random.Generator
-        Draws folds and bootstrap samples.
-    draws : int
-        Bootstrap samples.
-
-    Returns
-    -------
-    Realism
-
-    Raises
-    ------
-    InvalidArgumentError
-        If either has no hazard or no hazard-free windows.
-    """
+    """Compare real with simulated windows."""
     for name, table in (("real", real), ("simulated", simulated)):
         if not table.hazards.any() or not table.hazard_free.any():
             raise InvalidArgumentError(f"{name}: expected hazard and hazard-free windows")

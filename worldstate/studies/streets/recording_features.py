@@ -28,40 +28,6 @@ NONE_APPROACH = "none"
 class TwinRecording:
     """One simulated recording as it was heard.
 
-    Parameters
-    ----------
-    name : str
-        As in ``DataLog.csv``.
-    site, approach : str
-        Junction; "left", "right" or "none".
-    t0_s, pass_s : float
-        Line-of-sight entry, and when the vehicle's middle crosses the ego's axis; NaN without a vehicle.
-    doppler : str
-        Why the tonal Doppler of the pass-by is not usable; empty where it is.
-    time_s : ndarray, shape (n,)
-        End of each window.
-    features : ndarray, shape (n, 60)
-        Published feature of the window.
-    answer : ndarray of int, shape (n,)
-    miss_rate, clutter_rate : ndarray, shape (n,)
-        Of the camera: see `HopStream`.
-    prominence : ndarray, shape (n,)
-        Peak-to-median ratio of the spatial spectrum of the window.
-    log_slope_hz : ndarray, shape (n,)
-        Looming slope of log energy; NaN where not usable.
-    reference_rad, srp_rad, music_rad : ndarray, shape (n,)
-        Azimuth of the camera's moving box and the two acoustic bearings; NaN where no box is there.
-    posteriors : ndarray, shape (n, 4)
-        Of hidden left, hidden right, visible and none at the classifier's own prior, by the signature alone;
-        equal until `judged`.
-    statistic : ndarray, shape (n,)
-        Eq. (post) at that prior with the camera's answer; zero until `judged`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the shapes do not agree.
-
     Examples
     --------
     >>> recording = TwinRecording.blank("2_00_0001", hops=3)
@@ -69,23 +35,29 @@ class TwinRecording:
     (True, np.False_)
     """
 
-    name: str
-    site: str
+    name: str  # As in ``DataLog.csv``
+    site: str  # Junction; "left", "right" or "none"
     approach: str
+    # Line-of-sight entry, and when the vehicle's middle crosses the ego's axis; NaN without a vehicle.
     t0_s: float
     pass_s: float
-    doppler: str
-    time_s: FloatArray
-    features: FloatArray
-    answer: IntArray
-    miss_rate: FloatArray
+    doppler: str  # Why the tonal Doppler of the pass-by is not usable; empty where it is
+    time_s: FloatArray  # shape (n,): End of each window
+    features: FloatArray  # shape (n, 60): Published feature of the window
+    answer: IntArray  # shape (n,)
+    miss_rate: FloatArray  # shape (n,): Of the camera: see `HopStream`
     clutter_rate: FloatArray
-    prominence: FloatArray
-    log_slope_hz: FloatArray
+    prominence: FloatArray  # shape (n,): Peak-to-median ratio of the spatial spectrum of the window
+    log_slope_hz: FloatArray  # shape (n,): Looming slope of log energy; NaN where not usable
+    # shape (n,): Azimuth of the camera's moving box and the two acoustic bearings; NaN where no box is
+    # there.
     reference_rad: FloatArray
     srp_rad: FloatArray
     music_rad: FloatArray
+    # shape (n, 4): Of hidden left, hidden right, visible and none at the classifier's own prior, by the
+    # signature alone; equal until `judged`.
     posteriors: FloatArray
+    # shape (n,): Eq. (post) at that prior with the camera's answer; zero until `judged`.
     statistic: FloatArray
 
     def __post_init__(self) -> None:
@@ -165,33 +137,13 @@ _HEARD = tuple(f.name for f in fields(TwinRecording) if f.name not in (*_TEXTS, 
 
 
 def save_twin(path: str | Path, recording: TwinRecording, origin: str) -> None:
-    """Write what was heard of a recording as npz without objects, whole or not at all.
-
-    Parameters
-    ----------
-    path : str or Path
-        In an existing folder.
-    recording : TwinRecording
-        What to keep.
-    origin : str
-        What it was made by; `load_twin` takes it back for the same origin only.
-
-    Raises
-    ------
-    InputFileError
-        If the folder is missing.
-    """
+    """Write what was heard of a recording as npz without objects, whole or not at all."""
     values = {name: np.array(getattr(recording, name)) for name in (*_TEXTS, *_SCALARS, *_HEARD)}
     save_npz(path, {"origin": np.array(origin), **values})
 
 
 def load_twin(path: str | Path, origin: str) -> TwinRecording | None:
     """Return what `save_twin` wrote, not yet judged; None where nothing of this origin stands there.
-
-    Raises
-    ------
-    InputFileError
-        If the file is too large or damaged.
 
     Examples
     --------

@@ -13,20 +13,6 @@ RELATIVE = 0.2
 class Target:
     """A published figure and how near the twin should come to it.
 
-    Parameters
-    ----------
-    label : str
-        For people.
-    published : float
-        The paper's value.
-    judged : str
-        "within" an absolute tolerance, "relative" within 20 %, same "conclusion" (on the same side of a
-        bound), "set" to it by the free knob, or "shown" only.
-    bound : float
-        The tolerance, or the bound of the conclusion.
-    counts : bool
-        Whether it is among the thirteen of which eight should agree.
-
     Examples
     --------
     >>> target = Target("lead, s", 2.29, "relative")
@@ -34,11 +20,13 @@ class Target:
     (True, False, False)
     """
 
-    label: str
-    published: float
+    label: str  # For people
+    published: float  # The paper's value
+    # "within" an absolute tolerance, "relative" within 20 %, same "conclusion" (on the same side of a
+    # bound), "set" to it by the free knob, or "shown" only.
     judged: Judged
-    bound: float = 0.0
-    counts: bool = True
+    bound: float = 0.0  # The tolerance, or the bound of the conclusion
+    counts: bool = True  # Whether it is among the thirteen of which eight should agree
 
     def agrees(self, value: float) -> bool | None:
         """Whether a value comes near enough; None where it is only shown."""

@@ -23,21 +23,11 @@ VERSION = 4
 
 @dataclass(frozen=True, slots=True)
 class TwinSettings:
-    """What the twin is made of.
+    """What the twin is made of."""
 
-    Parameters
-    ----------
-    preset : Preset
-        Levels of the simulation, the rate of distant vehicles among them.
-    duration_s : float
-        Length of each recording.
-    keep : Path, optional
-        Folder of a data set that the recordings are written to as well.
-    """
-
-    preset: Preset
-    duration_s: float = 10.0
-    keep: Path | None = None
+    preset: Preset  # Levels of the simulation, the rate of distant vehicles among them
+    duration_s: float = 10.0  # Length of each recording
+    keep: Path | None = None  # Folder of a data set that the recordings are written to as well
 
     def origin(self, plan: Plan) -> str:
         """Name everything that a recording depends on, in a few characters."""
@@ -55,24 +45,7 @@ class TwinSettings:
 def listen_twins(
     folder: Path, plans: Sequence[Plan], settings: TwinSettings, jobs: int = 1
 ) -> Iterator[TwinRecording]:
-    """Yield the recordings of the twin in the order of the plans; those in `folder` are not made again.
-
-    Parameters
-    ----------
-    folder : Path
-        Existing; one small file a recording.
-    plans : sequence of Plan
-        What to simulate.
-    settings : TwinSettings
-        How.
-    jobs : int
-        Processes; the result does not depend on it.
-
-    Raises
-    ------
-    InputFileError
-        If a file in `folder` is damaged.
-    """
+    """Yield the recordings of the twin in the order of the plans; those in `folder` are not made again."""
     work = partial(_recall_or_listen, folder, settings)
     yield from in_processes(work, plans, jobs)
 

@@ -70,33 +70,7 @@ def simulated_windows(
     levels: Preset | None = None,
     progress: Callable[[], None] = lambda: None,
 ) -> FeatureTable:
-    """Simulate windows of junctions.
-
-    Parameters
-    ----------
-    per_approach : int
-        Recordings from the left, from the right, and twice as many hazard-free ones, at every site.
-    seed : int
-        Of all; every recording has a seed of its own.
-    sites : sequence of str
-        Names of sites, of either group.
-    jobs : int
-        Processes.
-    levels : Preset, optional
-        Default preset if not given.
-    progress : callable, optional
-        Called after every recording.
-
-    Returns
-    -------
-    FeatureTable
-        Features (n, 60), raw pair sums.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range or a site unknown.
-    """
+    """Simulate windows of junctions."""
     in_range("per_approach", per_approach, 1, MAX_PER_CLASS)
     in_range("jobs", jobs, 1, 256)
     rows = []

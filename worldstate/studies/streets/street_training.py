@@ -36,32 +36,7 @@ def train_on_twin(
     per_approach: int = PER_APPROACH,
     progress: Callable[[], None] = lambda: None,
 ) -> AnySignature:
-    """Simulate training windows at the twin's sites and fit a classifier to them.
-
-    Parameters
-    ----------
-    folder : Path
-        Existing; the windows are kept there as a table of features and not made again.
-    levels : Preset
-        Levels of the simulation.
-    seed : int
-        Of the twin. Its training recordings are drawn from another stream than its test recordings.
-    method : {"baseline", "worldstate"}
-        The published classifier, or the ensemble on windows compared with their site.
-    jobs : int
-        Processes.
-    per_approach : int
-        As for `simulated_windows`.
-    progress : callable
-        Called after every recording that had to be made.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-    InputFileError
-        If a kept table is damaged.
-    """
+    """Simulate training windows at the twin's sites and fit a classifier to them."""
     made_of = [VERSION, LAYOUT, asdict(levels), seed, per_approach]
     origin = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:16]
     path = folder / f"training-{origin}.csv"
