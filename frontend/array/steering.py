@@ -175,7 +175,7 @@ class NodeBeams:
 
 
 def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:
-    """Find orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance."""
+    """Orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance."""
     # Gram-Schmidt with pivoting: the vector that is missed most is the next column. None if `max_rank` are
     # not enough.
     missed = weights.copy()

@@ -101,7 +101,7 @@ class ExplanationBelief:
         return replace(self, log_probabilities=tuple(np.maximum(spread, LOG_FLOOR).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
-        """Return the belief once vision has the vehicle of a direction: its mass is in view, accounted for."""
+        """Return the belief once vision has the vehicle of a direction: its mass is in view now."""
         # `residual` is the share that stays hidden: the sighting may have been of another vehicle.
         p, k = self.probabilities, len(self.directions)
         moved = p[direction] * (1.0 - residual)

@@ -140,7 +140,7 @@ def trace_paths(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Passage:
-    """A line from a source in the crossing street through the mouth, at a series of times, shape (T,) each."""
+    """A line from a source in the crossing street through the mouth over time, shape (T,) each."""
 
     # How far inside the mouth the line crosses it; negative where a corner is in the way.
     clearance_m: FloatArray

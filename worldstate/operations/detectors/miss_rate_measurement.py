@@ -256,7 +256,7 @@ def _health(scenes: Sequence[LabelledVideo], rng: np.random.Generator) -> Camera
 
 
 def reference_by(detector: Detector, video: Video) -> DetectionLog:
-    """Return what a detector reports on the clean frames, to serve as the reference where there is no other."""
+    """Return what a detector reports on clean frames: the reference where there is no other."""
     # Its miss rate on clean frames is then zero by definition: only the degraded ones tell anything.
     found = [detector.detect(frame) for frame in video.frames()]
     return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
