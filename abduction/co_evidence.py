@@ -49,7 +49,7 @@ class Absent:
 
         References
         ----------
-        Eq. (post) of the paper. Derived here: an empty sector needs that nothing is found by mistake either.
+        "Evidence of Absence", eq. (6). An empty sector needs that nothing is found by mistake.
         """
         spurious = np.log1p(-self.clutter_rate)
         with np.errstate(divide="ignore"):
@@ -132,7 +132,7 @@ class Unqueried:
 
         References
         ----------
-        Eq. (post) of the paper with beta = 1.
+        "Evidence of Absence", eq. (6) with beta = 1.
         """
         return np.zeros(3)
 

@@ -16,7 +16,7 @@ class SignatureEvidence:
 
     .. math:: \ell_{hid}(y) = \sum_k P(k \mid hid)\, \ell_{hid,k}(y)
 
-    is the integral over the hidden state of eq. (post), with the direction weights carried by the filter.
+    is the integral over the hidden state of eq. (6), with the direction weights carried by the filter.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
     .. math::
         p(h \mid y, V) = \pi_h\, \ell_h(y)\, p(V \mid h) \,/\, Z,
 
-    eq. (post) with V absent: :math:`p(V \mid h)` is :math:`\beta_c(\theta, d)` for the visible explanation
+    eq. (6) with V absent: :math:`p(V \mid h)` is :math:`\beta_c(\theta, d)` for the visible explanation
     and 1 for the others.
 
     Parameters
@@ -101,7 +101,7 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
 
     References
     ----------
-    Eq. (post) of the paper, section V.
+    "Evidence of Absence", eq. (6), section V.
 
     Examples
     --------
@@ -154,7 +154,7 @@ def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: C
 
     References
     ----------
-    Section V of the paper, after eq. (post).
+    "Evidence of Absence", section V, after eq. (6).
 
     Examples
     --------
@@ -172,7 +172,7 @@ def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: C
 def statistic(
     evidence: SignatureEvidence, co_evidence: CoEvidence, reference_prior: Sequence[float]
 ) -> float:
-    r"""Return eq. (post) at a fixed prior: the score in [0, 1] that a threshold was set for.
+    r"""Return eq. (6) at a fixed prior: the score in [0, 1] that a threshold was set for.
 
     With a classifier's likelihood ratios and its own training prior this is
 
@@ -202,7 +202,7 @@ def statistic(
 
     References
     ----------
-    Eq. (post) of the paper at a fixed prior.
+    "Evidence of Absence", eq. (6) at a fixed prior.
 
     Examples
     --------

@@ -88,7 +88,7 @@ class AcousticAdapter:
     front_end_settings : FrontEndSettings, optional
         Of the front-end.
     grounding : Grounding, optional
-        Weighs the model's scores with bearing, approach and engine line, eq. (lik); the scores as they are
+        Weighs the model's scores with bearing, approach and engine line, eq. (5); the scores as they are
         without.
 
     Attributes

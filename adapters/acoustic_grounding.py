@@ -1,4 +1,4 @@
-"""From what was heard of a source to eq. (lik): the classifier's scores weighed with physics beside them."""
+"""From what was heard of a source to eq. (5): the classifier's scores weighed with physics beside them."""
 
 from dataclasses import dataclass, field
 

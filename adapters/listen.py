@@ -67,7 +67,7 @@ class Source:
     site : SiteEstimate or None
         What is known of the site beforehand, from a checkpoint.
     grounding : Grounding or None
-        Weighs the model's scores with bearing, approach and engine line, eq. (lik).
+        Weighs the model's scores with bearing, approach and engine line, eq. (5).
     ego_noise : EgoNoiseSettings or None
         Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it.
     """
@@ -148,7 +148,7 @@ def open_source(
     site : SiteEstimate, optional
         What is known of the site beforehand, from a checkpoint.
     grounding : Grounding, optional
-        Weighs the model's scores with bearing, approach and engine line, eq. (lik); off where not given.
+        Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
     ego_noise : bool or EgoNoiseSettings
         Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
         spatial spectrum, bearing and prominence. The signature hears what it was trained with.

@@ -143,10 +143,6 @@ class FrontEndSettings:
         -------
         ndarray, shape (A,)
             Radians.
-
-        References
-        ----------
-        From the definition.
         """
         return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
 
@@ -159,10 +155,6 @@ class FrontEndSettings:
         -------
         ndarray, shape (E,)
             Radians.
-
-        References
-        ----------
-        From the definition.
 
         Examples
         --------
@@ -180,10 +172,6 @@ class FrontEndSettings:
         -------
         azimuths, elevations : ndarray, shape (E * A,)
             Radians.
-
-        References
-        ----------
-        From the definition.
         """
         azimuths, elevations = np.meshgrid(self.azimuths_rad(), self.elevations_rad())
         return azimuths.ravel(), elevations.ravel()

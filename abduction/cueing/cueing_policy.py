@@ -115,7 +115,7 @@ class CueingPolicy:
 
         References
         ----------
-        Section VII of the paper.
+        "Evidence of Absence", section VII.
         """
         return statistic >= self.gamma
 

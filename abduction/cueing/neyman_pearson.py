@@ -43,7 +43,7 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
 
     References
     ----------
-    Section VII of the paper; DESIGN.md, Definitions, gamma(alpha).
+    "Evidence of Absence", section VII; DESIGN.md, Definitions, gamma(alpha).
 
     Examples
     --------

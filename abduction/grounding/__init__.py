@@ -1,1 +1,1 @@
-"""The classifier's scores weighed with physics, eq. (1) of the paper."""
+"""The classifier's scores weighed with physics, "Evidence of Absence", eq. (5)."""

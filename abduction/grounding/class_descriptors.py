@@ -130,10 +130,6 @@ class Descriptor:
         ----------
         radial_speed_m_s : ndarray, shape (n,)
             Grid of v_r, m/s.
-
-        References
-        ----------
-        From the definition: a normal law on a grid.
         """
         log_weight = -0.5 * ((radial_speed_m_s - self.speed_mean_m_s) / self.speed_std_m_s) ** 2
         return np.asarray(log_weight - np.logaddexp.reduce(log_weight))

@@ -1,4 +1,4 @@
-r"""Grounded signature likelihoods, eq. (lik), and their integral over class and state.
+r"""Grounded signature likelihoods, eq. (5), and their integral over class and state.
 
 .. math::
     \ell_h(y) = \frac{P(h \mid s)}{\pi_h} \sum_c P(c) \int p(o \mid c, v_r)\, p(\hat v \mid v_r)\,
@@ -138,7 +138,7 @@ class GroundedAnswer:
     Parameters
     ----------
     evidence : SignatureEvidence
-        Log-likelihoods, for eq. (post).
+        Log-likelihoods, for eq. (6).
     best : HiddenState
         arg max over z.
     class_posterior : dict of str to float
@@ -194,7 +194,7 @@ def ground(
 
     References
     ----------
-    Eq. (lik) of the paper, and its integral in section V.
+    "Evidence of Absence", eq. (5), and its integral in section V.
 
     Examples
     --------

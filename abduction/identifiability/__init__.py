@@ -1,1 +1,1 @@
-"""What any detector could reach: information and Fisher bounds, section VI of the paper."""
+"""What any detector could reach: information and Fisher bounds, "Evidence of Absence", section VI."""

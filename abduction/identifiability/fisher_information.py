@@ -32,7 +32,7 @@ def combined_information(parts: Sequence[ArrayLike]) -> FloatArray:
 
     References
     ----------
-    Proposition (prop:recover) of the paper, part (ii).
+    "Evidence of Absence", proposition 1, part (ii).
 
     Examples
     --------

@@ -234,7 +234,7 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
 
     References
     ----------
-    Proposition (prop:recover) of the paper, part (i).
+    "Evidence of Absence", proposition 1, part (i).
 
     Examples
     --------

@@ -85,10 +85,6 @@ class ClassifierSignature:
         ------
         InvalidArgumentError
             If X is not finite or the classifier answers with something that is no distribution.
-
-        References
-        ----------
-        From the definition.
         """
         inputs = finite_array("X", X, (None, None))
         answer = finite_array(

@@ -2,7 +2,7 @@ r"""The published signature model: from a feature vector to likelihoods of the e
 
 A linear one-against-one machine on standardised features; each pair's decision value goes through a sigmoid,
 and the pairs are coupled into posteriors of front, left, none and right. Dividing by the class frequencies of
-the training set leaves likelihoods, which is what eq. (post) takes.
+the training set leaves likelihoods, which is what eq. (6) takes.
 """
 
 from collections.abc import Mapping
@@ -226,7 +226,7 @@ class SignatureModel:
 
 
 def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatArray:
-    r"""Return eq. (post) at the training prior for many windows at once, shape (n,).
+    r"""Return eq. (6) at the training prior for many windows at once, shape (n,).
 
     .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
 

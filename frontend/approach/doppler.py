@@ -154,7 +154,7 @@ def radial_speed(
 
     References
     ----------
-    Section IV of the paper; the S-curve: see `pass_by`; BIC: G. Schwarz, "Estimating the
+    "Evidence of Absence", section IV; the S-curve: see `pass_by`; BIC: G. Schwarz, "Estimating the
     dimension of a model", Ann. Statist. 6, 1978.
 
     Examples

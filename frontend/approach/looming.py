@@ -1,6 +1,6 @@
 r"""Acoustic looming: the rate at which a sound grows gives the reciprocal time-to-arrival.
 
-For a point source at range d the band energy E goes as 1/d^2, eq. (looming):
+For a point source at range d the band energy E goes as 1/d^2, eq. (2):
 
 .. math:: \frac{d}{dt} \log E = -2 \frac{\dot d}{d} = \frac{2}{\mathrm{TTA}}
 
@@ -102,7 +102,7 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
 
     References
     ----------
-    Eq. (looming) of the paper, after D. Lee 1976: see `looming`. The line is derived
+    "Evidence of Absence", eq. (2), after D. Lee 1976: see `looming`. The line is derived
     here: E goes as the inverse square of the range, which changes evenly at constant speed.
 
     Examples

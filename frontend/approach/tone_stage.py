@@ -101,10 +101,6 @@ class ToneStage:
         .. math:: y[m] = \sum_n h[n]\, \frac1{|C|} \sum_{i \in C} x_i[m D + n]
 
         Shapes: samples (n, M).
-
-        References
-        ----------
-        From the definition; h and D as in `Decimator`, after J. F. Kaiser 1974.
         """
         # over the microphones C next to the middle.
         if not np.array_equal(mask.keep, self._keep):

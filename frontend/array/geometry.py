@@ -23,10 +23,6 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
 
-    References
-    ----------
-    From the definition: spherical coordinates on the axes of REP-103, 2010.
-
     Examples
     --------
     >>> direction_vectors([0.0, np.pi / 2]).round(6) + 0.0

@@ -86,7 +86,7 @@ class MicrophoneArray:
 
     @property
     def horizontal_moment_m2(self) -> float:
-        """S_xx of eq. (crbtheta): sum of (p_m - mean p)^2 over the coordinates p = y, square metres."""
+        """S_xx of eq. (4): sum of (p_m - mean p)^2 over the coordinates p = y, square metres."""
         return float(np.sum(self.centred_m[:, 1] ** 2))
 
     @property
@@ -112,7 +112,7 @@ class MicrophoneArray:
         References
         ----------
         H. L. Van Trees, *Optimum Array Processing*, 2002, chapter 2 (half a wavelength between sensors); with
-        the mean spacing as in section IV of the paper.
+        the mean spacing as in "Evidence of Absence", section IV.
 
         Examples
         --------

@@ -117,10 +117,6 @@ class Steering:
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
 
         Shapes: vectors (bins, M, k).
-
-        References
-        ----------
-        From the definition of a projection; R. O. Schmidt 1986 for its use.
         """
         beams = self if self.nodes is None else self.nodes
         rows = vectors.transpose(0, 2, 1)

@@ -17,7 +17,7 @@ NEGLIGIBLE = 1e-12
 
 
 def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: float) -> float:
-    r"""Bound on the variance of the delay between two microphones, eq. (crbtau).
+    r"""Bound on the variance of the delay between two microphones, eq. (3).
 
     .. math:: \mathrm{var}(\hat\tau) \ge \Big[2T \int_0^\infty (2\pi f)^2 \frac{C(f)}{1 - C(f)}\,df\Big]^{-1}
 
@@ -49,8 +49,8 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
 
     References
     ----------
-    Eq. (crbtau) of the paper, after C. Knapp and G. C. Carter 1976 (see `gcc`) and G. C. Carter, "Coherence
-    and time delay estimation", Proc. IEEE 75, 1987.
+    "Evidence of Absence", eq. (3), after C. Knapp and G. C. Carter 1976 (see `gcc`) and G. C. Carter,
+    "Coherence and time delay estimation", Proc. IEEE 75, 1987.
 
     Examples
     --------
@@ -81,7 +81,7 @@ def bearing_crb_rad2(
     random_signal: bool = False,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> float:
-    r"""Bound on the variance of an azimuth, eq. (crbtheta) for any array.
+    r"""Bound on the variance of an azimuth, eq. (4) for any array.
 
     With u the unit vector to the source and :math:`S = \sum_m (p_m - \bar p)(p_m - \bar p)^T`,
 
@@ -125,9 +125,9 @@ def bearing_crb_rad2(
 
     References
     ----------
-    Eq. (crbtheta) of the paper; H. L. Van Trees, *Optimum Array Processing*, 2002, section 8.4; P. Stoica and
-    A. Nehorai, "Performance study of conditional and unconditional direction-of-arrival estimation", IEEE
-    Trans. ASSP 38, 1990.
+    "Evidence of Absence", eq. (4); H. L. Van Trees, *Optimum Array Processing*, 2002, section 8.4; P.
+    Stoica and A. Nehorai, "Performance study of conditional and unconditional direction-of-arrival
+    estimation", IEEE Trans. ASSP 38, 1990.
 
     Examples
     --------
@@ -303,7 +303,7 @@ def radial_speed_crb_m2_s2(
 
     References
     ----------
-    Section IV of the paper.
+    "Evidence of Absence", section IV.
 
     Examples
     --------

@@ -46,7 +46,7 @@ def bearing_std_rad(
     array([ 3.4,  6.8, 10.8])
     """
     # sigma_0 is what a prominent line-of-sight source shows on the road; the cosine is the geometry of eq.
-    # (crbtheta); the root lets the prominence rho fade into ignorance, which is uniform over the searched
+    # (4); the root lets the prominence rho fade into ignorance, which is uniform over the searched
     # span Delta. An empirical model, not a bound.
     uniform = span_rad / np.sqrt(12.0)
     excess = prominence - 1.0

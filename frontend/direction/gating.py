@@ -57,10 +57,6 @@ class GatingCurve:
         float or NotUsable
             A prominence.
 
-        References
-        ----------
-        From the definition.
-
         Examples
         --------
         >>> curve = gating_curve([1.1, 1.2, 2.0, 3.0], [0.4, 0.3, 0.02, 0.01])
@@ -92,10 +88,6 @@ class GatingCurve:
         ------
         InvalidArgumentError
             If the share is out of range.
-
-        References
-        ----------
-        From the definition.
 
         Examples
         --------

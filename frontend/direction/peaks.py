@@ -68,10 +68,6 @@ def find_peaks(
     InvalidArgumentError
         On another shape, fewer than three points, NaN or infinity.
 
-    References
-    ----------
-    From the definition: the vertex of the parabola through three points.
-
     Examples
     --------
     >>> grid = np.radians(np.arange(-90.0, 91.0))

@@ -1,4 +1,4 @@
-"""Eq. (lik): its integral against adaptive quadrature, its couplings, and a user's own classifier."""
+"""Eq. (5): its integral against adaptive quadrature, its couplings, and a user's own classifier."""
 
 import math
 

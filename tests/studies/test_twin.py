@@ -214,7 +214,7 @@ def test_origin_names_all_that_a_recording_depends_on():
 
 
 def test_another_classifier_judges_what_was_heard(streams):
-    """Eq. (post) of the shipped classifier, hop by hop, from the kept features and answers."""
+    """Eq. (6) of the shipped classifier, hop by hop, from the kept features and answers."""
     rng = np.random.default_rng(2)
     signature, _ = load_model()
     features = rng.uniform(0.05, 0.4, (HOPS, 60))

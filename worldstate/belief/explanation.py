@@ -21,7 +21,7 @@ _FOLDED_IN = Unqueried("already weighed into the prior")
 class ExplanationBelief:
     r"""P(hidden_k), P(in view, come from k), P(in view, from elsewhere), P(none), given all so far.
 
-    predict is the Chapman-Kolmogorov step :math:`p \leftarrow p\, e^{Q\,dt}`, update is eq. (post).
+    predict is the Chapman-Kolmogorov step :math:`p \leftarrow p\, e^{Q\,dt}`, update is eq. (6).
 
     Examples
     --------

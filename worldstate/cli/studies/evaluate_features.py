@@ -23,9 +23,9 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --protocol transfer  learn on windows of a standing ego, predict those of --group
 
   --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
-                       Keys that end in _absent are of eq. (post) with the visible explanation removed
+                       Keys that end in _absent are of eq. (6) with the visible explanation removed
   --method worldstate  windows compared with the unlabelled reference of their site, taken from its other
-                       recordings; mirror-symmetric ensemble; eq. (post) with the visible explanation removed.
+                       recordings; mirror-symmetric ensemble; eq. (6) with the visible explanation removed.
                        "rows" and "gains" compare it with the baseline, with the untrained loudest direction,
                        and with itself given hazard-free windows of the site (a commissioning drive);
                        Under transfer it is one expert of the pattern above the site's quiet windows, its

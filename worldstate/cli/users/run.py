@@ -56,7 +56,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--grounded",
         action="store_true",
-        help="weigh the signature with bearing and approach, eq. (lik) (default: off)",
+        help="weigh the signature with bearing and approach, eq. (5) (default: off)",
     )
     parser.add_argument(
         "--ego-noise",

@@ -18,7 +18,7 @@ class ArrayBounds:
     microphones : int
         M.
     horizontal_moment_m2 : float
-        S_xx of eq. (crbtheta).
+        S_xx of eq. (4).
     aperture_m : tuple of float
         Extent along x, y and z, metres.
     mean_spacing_m, alias_hz : float

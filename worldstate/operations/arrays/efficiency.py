@@ -200,7 +200,7 @@ def tone_trial(*, complex_signal: bool) -> Trial:
 
 
 def delay_trial() -> Trial:
-    """Delay between two microphones by GCC-PHAT, against eq. (crbtau), seconds.
+    """Delay between two microphones by GCC-PHAT, against eq. (3), seconds.
 
     Examples
     --------
@@ -231,7 +231,7 @@ def bearing_trial(
     frequency_hz: float = 1000.0,
     snapshots: int = 20,
 ) -> Trial:
-    """Azimuth by SRP-PHAT on the front-end's grid of one degree, against eq. (crbtheta), radians.
+    """Azimuth by SRP-PHAT on the front-end's grid of one degree, against eq. (4), radians.
 
     Examples
     --------

@@ -16,7 +16,7 @@ LARGEST_SCORE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class StatisticSwitches:
-    """What of eq. (post) the statistic uses.
+    """What of eq. (6) the statistic uses.
 
     Examples
     --------
@@ -41,7 +41,7 @@ class StatisticSwitches:
 def stream_statistic(
     stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
 ) -> FloatArray:
-    r"""Return eq. (post) at a fixed prior at every hop, shape (n,), in [0, 1].
+    r"""Return eq. (6) at a fixed prior at every hop, shape (n,), in [0, 1].
 
     .. math:: \mathrm{logit}\, s = \log \frac{\sum_k \pi_k \ell_k}
               {\pi_{vis}\, p(V | vis)\, \ell_{vis} / p(V | hid) + \pi_0\, \ell_0}

@@ -60,7 +60,7 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
 
     References
     ----------
-    R. A. Fisher 1936, one band at a time: see `fisher_profile`; section IV of the paper.
+    R. A. Fisher 1936, one band at a time: see `fisher_profile`; "Evidence of Absence", section IV.
 
     Examples
     --------

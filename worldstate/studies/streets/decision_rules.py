@@ -38,7 +38,7 @@ class TwinScore:
     vision: RuleOutcome  # The camera alone: something that moves is detected
     published: RuleOutcome  # The argmax is left or right, at any window and over k windows
     sustained: RuleOutcome
-    ours: dict[float, RuleOutcome]  # Eq. (post) at or above gamma(alpha) over k windows, for every budget
+    ours: dict[float, RuleOutcome]  # Eq. (6) at or above gamma(alpha) over k windows, for every budget
     sustain_hops: tuple[int, ...]  # k of each fold
     risk: tuple[FloatArray, ...]  # Calibrated risk of each window of each recording, by the other folds
 

@@ -57,7 +57,7 @@ class TwinRecording:
     # shape (n, 4): Of hidden left, hidden right, visible and none at the classifier's own prior, by the
     # signature alone; equal until `judged`.
     posteriors: FloatArray
-    # shape (n,): Eq. (post) at that prior with the camera's answer; zero until `judged`.
+    # shape (n,): Eq. (6) at that prior with the camera's answer; zero until `judged`.
     statistic: FloatArray
 
     def __post_init__(self) -> None:
