@@ -1,4 +1,4 @@
-r"""How much an absence weighs: the miss rate of the channel that was asked, beta_c(theta, d)."""
+r"""Miss rate of a co-evidence channel, beta_c(theta, d), over azimuth and degradation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

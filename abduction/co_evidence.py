@@ -1,7 +1,7 @@
-"""The answer of the channel that was asked for co-evidence: present, absent, or unqueried.
+"""Answers of a co-evidence channel: present, absent, or unqueried.
 
-Absence is a measurement with a type of its own. A sensor that was not asked says nothing, which is a third
-thing and neither of the two.
+Absence is a measurement and has a type of its own. A sensor that was not asked gives neither presence nor
+absence: `Unqueried`, beta = 1.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a signature says of each explanation, as log-likelihoods."""
+"""Log-likelihoods of one observation under every explanation."""
 
 from dataclasses import dataclass
 

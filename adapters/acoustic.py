@@ -1,4 +1,4 @@
-"""The acoustic modality: blocks of samples in, measurements out."""
+"""Acoustic measurement adapter: blocks of samples in, measurements out."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""From what was heard of a source to eq. (5): the classifier's scores weighed with physics beside them."""
+"""Grounded acoustic evidence: the classifier's scores combined with bearing, approach and engine line, eq. (5)."""
 
 from dataclasses import dataclass, field
 

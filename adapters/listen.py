@@ -1,4 +1,4 @@
-"""Sound in, world-state out: the whole chain over a recording, for those who bring no loop of their own."""
+"""The whole chain over a recording: sound in, one world-state a hop out."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -15,7 +15,7 @@ _EXTREME_LOGIT = 20.0
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveBudget:
-    r"""A false-alarm rate to be kept, and how far the threshold may go for it.
+    r"""Target false-alarm rate and the range within which the threshold may move.
 
     The calibrated threshold is shifted in log-odds, :math:`\mathrm{logit}\,\gamma_t = \mathrm{logit}\,\gamma
     + x_t`, with
@@ -132,7 +132,7 @@ class AdaptiveBudget:
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveThreshold:
-    """What the adaptive threshold has learned so far.
+    """State of the adaptive threshold.
 
     Examples
     --------

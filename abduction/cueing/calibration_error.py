@@ -1,4 +1,4 @@
-"""Whether a risk of .3 comes true in 30 % of the cases: reliability, ECE with its floor, Brier score."""
+"""Calibration of risk: reliability curve, ECE with its sampling floor, Brier score."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _FLOOR_DRAWS = 400
 
 @dataclass(frozen=True, slots=True)
 class ReliabilityCurve:
-    """Predicted against observed frequency, in the bins that hold anything.
+    """Predicted against observed frequency, in the bins that are not empty.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def calibration_error_sampling(
 
 
 def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
-    r"""Return the mean squared difference between risk and what came true.
+    r"""Return the mean squared difference between risk and outcome.
 
     .. math:: B = \frac1n \sum_i (r_i - y_i)^2
 

@@ -1,4 +1,7 @@
-r"""Thresholds with a finite-sample guarantee: the unit is a recording, because windows repeat each other."""
+r"""Conformal thresholds: a finite-sample guarantee over recordings.
+
+The exchangeable unit is a recording, because the windows of one recording are strongly correlated.
+"""
 
 import math
 from collections.abc import Sequence

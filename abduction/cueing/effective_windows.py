@@ -1,4 +1,4 @@
-"""How many windows a stream of overlapping windows is worth."""
+"""Effective number of independent windows in a stream of overlapping ones."""
 
 from collections.abc import Sequence
 

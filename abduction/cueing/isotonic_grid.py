@@ -1,4 +1,4 @@
-"""Least squares on a grid whose values may fall along neither axis."""
+"""Isotonic regression on a two-dimensional grid."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -1,4 +1,4 @@
-r"""The threshold of a false-alarm budget: gamma(alpha)."""
+r"""Neyman-Pearson threshold gamma(alpha) of a false-alarm budget."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-r"""What a class of road user is like: how it sounds, what a camera would call it, what physics ties together.
+r"""Descriptors of road-user classes: speed prior, camera labels, and couplings between observables and speed.
 
 A coupling says what an observable of the signature is worth at a given radial speed, as curves over speed. It
 can be tested by itself and switched off.

@@ -32,7 +32,7 @@ _RANGES_M = np.geomspace(5.0, 60.0, 24)
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """Where an observable lies when it belongs to no source: the density that others are relative to.
+    """Density of an observable that belongs to no source; all other densities are relative to it.
 
     Examples
     --------
@@ -62,7 +62,7 @@ BACKGROUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class AzimuthPrior:
-    """Where a source may stand under one explanation: a normal law about an azimuth, cut off at +-90 degrees.
+    """Prior of a source's azimuth under one explanation: a normal law truncated at +-90 degrees.
 
     Examples
     --------
@@ -87,7 +87,7 @@ class AzimuthPrior:
 
 @dataclass(frozen=True, slots=True)
 class GroundedSettings:
-    """Where sources stand and which ties are believed.
+    """Azimuth priors and the couplings that are used.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class GroundedSettings:
 
 @dataclass(frozen=True, slots=True)
 class HiddenState:
-    """The state z that explains an observation best, were a hidden source its cause.
+    """The state z that explains an observation best under the hidden explanation.
 
     Examples
     --------
@@ -133,7 +133,7 @@ class HiddenState:
 
 @dataclass(frozen=True, slots=True)
 class GroundedAnswer:
-    """Likelihoods of the explanations, and the best hidden state with what it predicts.
+    """Likelihoods of the explanations, and the best hidden state with its predictions.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def ground(
     descriptors: Sequence[Descriptor],
     settings: GroundedSettings | None = None,
 ) -> GroundedAnswer:
-    r"""Weigh the classifier's evidence with what physics says of the other measurements.
+    r"""Combine the classifier's evidence with the physical likelihoods of the other measurements.
 
     .. math:: \log \ell'_h = \log \ell_h + \log \sum_{c, v} P(c)\, P(v \mid c)\,
               \frac{p(o \mid c, v)\, p(\hat v \mid v)}{p_0}

@@ -1,4 +1,4 @@
-"""What a front-end measured of one source, beside the feature that the classifier looks at."""
+"""Measurements of one source that accompany the classifier's feature."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Fisher information of several modalities: what adds up, and what does not where noise has one cause."""
+"""Fisher information of several modalities, with independent noise and with a common cause."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-r"""How much an observation says of a hidden state, in bits, and what no detector can do better than."""
+r"""Mutual information between observation and hidden state, and the error bounds that follow from it."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Any classifier as a signature model: whatever has scikit-learn's predict_proba and says its classes."""
+"""Signature model from any fitted classifier with scikit-learn's `predict_proba` and `classes_`."""
 
 from typing import Any, Protocol
 

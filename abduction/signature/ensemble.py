@@ -1,6 +1,6 @@
 r"""Signature model for junctions never seen: linear experts on a window compared with its site.
 
-Every expert looks at the window in its own way (a view) and gives log-posteriors; the ensemble is their mean
+Every expert is given one view of the window and returns log-posteriors; the ensemble is their mean
 over experts and over the window and its mirror image, sides exchanged:
 
 .. math:: \log P(c \mid x) \propto \tfrac{1}{2 E} \sum_e \big[ \ell_e(c, x) + \ell_e(\bar c, \bar x) \big],

@@ -25,7 +25,7 @@ _ITERATIONS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What one expert looks at and how strongly it is held back.
+    """View and ridge penalty of one expert.
 
     Examples
     --------

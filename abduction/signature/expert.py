@@ -21,7 +21,7 @@ VIEWS = (*KINDS, SHAPE, SHAPE_CHANGE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expert:
-    """One linear softmax classifier and what it looks at.
+    """One linear softmax classifier and its view of the window.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class Expert:
 
 
 def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
-    r"""Return what experts look at, each of shape (n, inputs); what several share is computed once.
+    r"""Return the views, each of shape (n, inputs); parts that several share are computed once.
 
     .. math:: v = x - r \text{ (mean, median, quiet)}, \qquad v = \phi(x) \text{ (shape)}, \qquad
               v = \phi(x) - \phi(r_{median}) \text{ (change)}
@@ -116,7 +116,7 @@ def log_softmax(sums: FloatArray) -> FloatArray:
 
 
 def total(values: FloatArray) -> FloatArray:
-    r"""Return the sums of rows, shape (n, 1), the same to the bit in whatever order the columns stand.
+    r"""Return the sums of rows, shape (n, 1), bit-identical under any order of the columns.
 
     .. math:: s_i = \sum_j x_{ij}
 

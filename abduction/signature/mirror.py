@@ -1,4 +1,4 @@
-"""The mirror image of a feature vector: what the same scene with its sides exchanged would give."""
+"""Mirror image of a feature vector: the feature of the same scene with left and right exchanged."""
 
 from worldstate.ground.typing import FloatArray
 

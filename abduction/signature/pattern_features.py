@@ -1,4 +1,4 @@
-"""The shape of a window in a few numbers: how high, how wide, on which side, rising or falling."""
+"""Summary of a window's pattern over azimuth: peaks, widths, sides and changes."""
 
 import numpy as np
 

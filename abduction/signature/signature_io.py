@@ -1,4 +1,4 @@
-"""The signature models that a file may hold, told apart by their kind."""
+"""Signature models on file, distinguished by their kind."""
 
 from collections.abc import Mapping
 

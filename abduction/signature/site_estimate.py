@@ -32,7 +32,7 @@ from .site_reference import SiteReference, log_levels
 
 @dataclass(frozen=True, slots=True)
 class SiteEstimateSettings:
-    """How fast a site is learned and how far it is believed.
+    """Forgetting time and gains of the site estimate.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class SiteEstimate:
 
     @classmethod
     def start(cls, n_features: int) -> "SiteEstimate":
-        """Return the estimate of one who has heard nothing.
+        """Return the estimate before any window.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-r"""What a site is like when nothing is known of its labels: the reference that features are compared with.
+r"""Reference of a site: unlabelled summaries that features are compared with.
 
 A feature is a row of positive levels, so the comparison is a difference of logarithms: reflections that every
 window of a junction shares drop out, and a classifier trained elsewhere meets what it knows.
@@ -20,7 +20,7 @@ KINDS = ("mean", "median", "quiet")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteReference:
-    """Three summaries of the log-levels at one site, none of which needs a label.
+    """Three unlabelled summaries of the log-levels at one site.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A signature model that learns its site while it listens."""
+"""Signature model with a running estimate of its site."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -1,4 +1,4 @@
-"""The size of the samples that a RIFF, RF64 or W64 header promises, to tell a cut file from a whole one.
+"""Sample bytes that a RIFF, RF64 or W64 header announces: a shorter file is truncated.
 
 libsndfile reads a file that was cut short as a shorter one, without a word: a recorder that ran out of disk
 would go unnoticed. So the promise is read here.

@@ -1,4 +1,4 @@
-"""Multichannel recordings in blocks, with everything that can be wrong with them said at the door."""
+"""Multichannel sound files, read in blocks and checked when they are opened."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""From labelled recordings to a table of feature windows, for an array of one's own."""
+"""Extraction of labelled feature windows from recordings of any array."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The layout of OVAD: what was recorded where, with which label, and when the vehicle came into sight.
+"""Data sets in OVAD's layout: recordings with site, label and line-of-sight entry T0.
 
 ``<root>/DataLog.csv`` with the columns ID, Environment, Class and T0, and one folder a recording,
 ``<root>/<environment>/<class>/<ID>/``, with ``out_multi.wav`` and, for a standing ego, camera detections.

@@ -1,4 +1,4 @@
-"""Names of files and columns in the layout of OVAD, for those who read it and those who write it."""
+"""Names of files and columns in OVAD's layout, shared by reader and simulator."""
 
 LOG_NAME = "DataLog.csv"
 AUDIO_NAME = "out_multi.wav"

@@ -1,4 +1,4 @@
-"""The labelled one-second windows of a data set in OVAD's layout, where the released program cuts them."""
+"""Labelled one-second windows of a data set in OVAD's layout, cut where the released program cuts them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Whole files or none: write under a temporary name, then rename.
+"""Atomic file writing: a temporary name, then a rename.
 
 A reader never meets half a file, and a run that fails leaves nothing behind.
 """

@@ -1,4 +1,4 @@
-"""All that a running chain carries, on disk: the filter's memory and what was learned of the site."""
+"""Checkpoints on disk: the filter's memory and the site estimate."""
 
 import json
 from collections.abc import Mapping

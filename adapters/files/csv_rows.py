@@ -1,4 +1,4 @@
-"""Small tables in CSV: the columns that are wanted, with the line that each row came from."""
+"""Rows of a CSV file: selected columns with their line numbers."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Models on disk: JSON with a schema and a version, coefficients only, nothing that could be executed."""
+"""Model files: versioned JSON that holds coefficients only."""
 
 import json
 from collections.abc import Mapping

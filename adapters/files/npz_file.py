@@ -1,4 +1,4 @@
-"""Arrays as an npz file without objects: written whole or not at all, read within a bound."""
+"""Arrays in npz files: no pickled objects, bounded size, atomic writing."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Independent work over processes, in order: what comes out does not depend on how many there are."""
+"""Parallel map over processes; results are in order and do not depend on the number of processes."""
 
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence

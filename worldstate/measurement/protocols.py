@@ -1,4 +1,4 @@
-"""What a modality must offer so that the filter can use it, and what it may ask of another one."""
+"""Protocols of a modality: measurement adapter and co-evidence channel."""
 
 from collections.abc import Collection
 from typing import Literal, Protocol, TypeVar

@@ -1,4 +1,4 @@
-"""Ranges of azimuth that a channel is asked about."""
+"""Azimuth sectors that a co-evidence channel is asked about."""
 
 import math
 from dataclasses import dataclass

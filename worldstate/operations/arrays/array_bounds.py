@@ -1,4 +1,4 @@
-"""What the places of the microphones allow: moment, aperture, alias frequency and the bearing bound."""
+"""Bounds that follow from the microphone positions: moment, aperture, alias frequency, bearing bound."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

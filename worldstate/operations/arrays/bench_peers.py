@@ -1,4 +1,4 @@
-"""The same work by others, where they are installed.
+"""The same computations by peer libraries, where they are installed.
 
 `published_chain` restates the chain of the published acoustic baseline in its amortised form: scipy's STFT of
 the whole file, channel by channel, its cost shared among the hops; then for every hop two segments of half a

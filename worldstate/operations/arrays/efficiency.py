@@ -1,4 +1,4 @@
-r"""How near the front-end's estimators come to their bounds: Monte-Carlo variance beside Cramer-Rao.
+r"""Efficiency of the front-end's estimators: Monte-Carlo variance beside the Cramer-Rao bound.
 
 The waves are of the kind that each bound assumes: a tone in white noise, Gaussian noise heard by two
 microphones, a plane wave of constant modulus and random phase at an array. Whatever is estimated is estimated

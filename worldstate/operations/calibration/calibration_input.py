@@ -1,4 +1,4 @@
-"""What can be calibrated on: data sets, recordings, sound files, streams heard before."""
+"""Inputs of a calibration: data sets, recordings, sound files, saved hop streams."""
 
 from pathlib import Path
 

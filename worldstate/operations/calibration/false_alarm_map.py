@@ -1,4 +1,4 @@
-"""From a share of windows to alarms in an hour: what a budget alpha means to the one who hears them."""
+"""False alarms per hour that follow from a window-level budget alpha."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Videos to measure absence on, with the boxes that belong to them."""
+"""Videos with reference boxes, for the measurement of miss rates."""
 
 from pathlib import Path
 

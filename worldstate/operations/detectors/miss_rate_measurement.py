@@ -1,4 +1,4 @@
-"""How often a camera's detector misses what is there: re-detection on staged-degraded frames."""
+"""Miss rates of a camera's detector, measured by re-detection on degraded frames."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Recordings dealt to folds, so that no threshold is set on the recording that it judges."""
+"""Folds over recordings: no threshold is set on a recording that it is scored on."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The untrained scalar that every method has to beat: how loud the loudest direction is."""
+"""Untrained baseline: the level of the loudest direction."""
 
 from typing import Self
 

@@ -1,4 +1,4 @@
-"""What is compared in an evaluation on feature windows: the method, and what it has to beat."""
+"""Methods and baselines of an evaluation on feature windows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

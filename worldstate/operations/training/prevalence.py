@@ -1,4 +1,4 @@
-"""Risk at a site without labels: shifted until hazards are as frequent there as they were in training."""
+"""Prior shift without labels: risk moved until its mean equals the training prevalence."""
 
 import numpy as np
 from numpy.typing import ArrayLike

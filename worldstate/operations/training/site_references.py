@@ -1,4 +1,4 @@
-"""Windows with their site's reference behind them, taken from other recordings than the one scored."""
+"""Feature windows with the reference of their site, taken from other recordings than the scored one."""
 
 from dataclasses import replace
 

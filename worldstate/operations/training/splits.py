@@ -1,4 +1,4 @@
-"""Who is tested by whom: folds that never part a recording."""
+"""Cross-validation splits that keep a recording in one fold."""
 
 from collections.abc import Callable
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Threshold and risk map from windows that stand alone, one hazard-free window a recording."""
+"""Threshold and risk map from single windows, one hazard-free window a recording."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
