@@ -1,4 +1,4 @@
-"""Grounded acoustic evidence: the classifier's scores combined with bearing, approach and engine line, eq. (5)."""
+"""Grounded acoustic evidence: classifier scores combined with bearing, approach and engine line, eq. (5)."""
 
 from dataclasses import dataclass, field
 
