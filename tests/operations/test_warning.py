@@ -27,6 +27,7 @@ def test_lead_time_counts_from_the_first_onset_within_five_seconds():
     assert got.lead_time_s == 2.5
     assert got.first_advisory_s == 5.5
     assert got.false_advisories_before == 1
+    assert got.advisories_after_t0 == 0
     assert got.hidden_entity_id == "again"
 
 
@@ -34,12 +35,14 @@ def test_an_advisory_after_line_of_sight_leads_nothing():
     got = summary(4.0, {6.0: "late"})
     assert got.lead_time_s is None
     assert got.first_advisory_s == 6.0
+    assert got.advisories_after_t0 == 1
 
 
 def test_every_onset_is_false_where_nothing_approaches():
     got = summary(None, {2.0: "a", 5.0: "b"})
     assert got.lead_time_s is None
     assert got.false_advisories_before == 2
+    assert got.advisories_after_t0 is None
 
 
 def test_parked_cars_are_no_hand_over():

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.files.atomic import atomic_path
 from worldstate.frontend.direction.gating import GatingCurve, gating_curve
 from worldstate.ground.checks import check_shape
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
+from worldstate.operations.figure_style import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,15 +115,11 @@ def check_bearings(
 
 def write_gating_figure(checks: BearingChecks, path: Path, title: str = "") -> None:
     """Draw the curve and what prominence says of presence, and write both by the ending of `path`."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    draw_gating(left, checks)
-    _draw_presence(right, checks)
-    figure.suptitle(title)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format=path.suffix.lstrip(".") or "png")
+    with figure_file(path, 8.0, 3.6) as figure:
+        left, right = figure.subplots(1, 2)
+        draw_gating(left, checks)
+        _draw_presence(right, checks)
+        figure.suptitle(title)
 
 
 def draw_gating(axes: "Axes", checks: BearingChecks) -> None:

@@ -10,16 +10,20 @@ import numpy as np
 
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.listen import Source, Step, listen_steps
+from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.values import seconds
 from worldstate.state import WorldState
 
 from .bearing_gating import BearingChecks, check_bearings
 from .channel_report import HealthLog, RecordingHealth
-from .timeline import EntityTrail, Timeline
+from .timeline import EntityTrack, Timeline
+from .true_track import read_true_tracks
 from .warning import WarningMeter, WarningSummary
 
 # An entity is drawn where it more likely exists than not.
 LIKELY = 0.5
+# From the middle of a decision window to its end, with the settings that a `Source` is listened to with.
+_WINDOW_AGE_S = 0.5 * FrontEndSettings().window_hops / FrontEndSettings().hop_rate_hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +125,7 @@ class _HopLog:
     time_s: list[float] = field(default_factory=list)
     statistic: list[float] = field(default_factory=list)
     risk: list[float] = field(default_factory=list)
-    advisory: list[bool] = field(default_factory=list)
+    advisory: dict[str, list[bool]] = field(default_factory=lambda: {"left": [], "right": []})
     srp: list[np.ndarray] = field(default_factory=list)
     entities: dict[str, list[tuple[float, float, float, bool]]] = field(default_factory=dict)
     heard: list[tuple[float, float, float]] = field(default_factory=list)
@@ -135,7 +139,8 @@ class _HopLog:
         self.time_s.append(now_s)
         self.statistic.append(max((cue.statistic for cue in state.cues), default=0.0))
         self.risk.append(state.risk)
-        self.advisory.append(any(cue.advisory for cue in state.cues))
+        for side, raised in self.advisory.items():
+            raised.append(any(cue.advisory and cue.direction == side for cue in state.cues))
         self.srp.append(step.frame.srp.astype(np.float32))
         self.azimuths_rad = step.frame.azimuths_rad
         for entity in state.entities:
@@ -159,17 +164,19 @@ class _HopLog:
             risk=np.array(self.risk),
             threshold=source.policy.gamma,
             alpha=source.policy.alpha,
-            advisory=np.array(self.advisory, dtype=bool),
+            advisory={side: np.array(raised, dtype=bool) for side, raised in self.advisory.items()},
             azimuths_rad=self.azimuths_rad,
             srp=np.array(self.srp),
-            entities=tuple(map(_trail, self.entities.values())),
+            srp_age_s=_WINDOW_AGE_S,
+            entities=tuple(map(_entity_track, self.entities.values())),
             sighting_time_s=sightings[:, 0],
             sighting_azimuth_rad=sightings[:, 1],
             t0_s=source.t0_s,
+            truth=read_true_tracks(source.audio_path.parent),
             title=title,
         )
 
 
-def _trail(rows: list[tuple[float, float, float, bool]]) -> EntityTrail:
+def _entity_track(rows: list[tuple[float, float, float, bool]]) -> EntityTrack:
     time_s, azimuth_rad, std_rad, hidden = np.array(rows, dtype=np.float64).T
-    return EntityTrail(time_s, azimuth_rad, std_rad, hidden.astype(bool))
+    return EntityTrack(time_s, azimuth_rad, std_rad, hidden.astype(bool))

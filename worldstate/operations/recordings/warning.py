@@ -18,6 +18,8 @@ class WarningSummary:
     first_advisory_s: float | None
     lead_time_s: float | None  # ``t0_s - first_advisory_s`` where that onset came before line-of-sight entry
     false_advisories_before: int  # Onsets more than 5 s before `t0_s`; without a `t0_s` every onset
+    # Onsets at or after `t0_s`: of a vehicle that can be seen, or that has just left the view. None without.
+    advisories_after_t0: int | None
     advisory_onsets_s: tuple[float, ...]  # All rising edges of the advisory
     # The entity that the last advisory before `t0_s` spoke of; without a `t0_s`, or where none led, that of
     # the first advisory counted.
@@ -57,6 +59,9 @@ class WarningMeter:
             first_advisory_s=first_s,
             lead_time_s=found.lead_time_s if found else None,
             false_advisories_before=found.false_advisories_before if found else len(onsets_s),
+            advisories_after_t0=None
+            if self.t0_s is None
+            else sum(time_s >= self.t0_s for time_s in onsets_s),
             advisory_onsets_s=onsets_s,
             hidden_entity_id=self._hidden_id or hidden_id,
             visible_entity_id=self._visible_id,
