@@ -17,10 +17,7 @@ SCHEMA_VERSION = "1.1.0"
 
 
 def describe(
-    settings: SimulationSettings,
-    frames_s: FloatArray,
-    seen: list[Trajectory],
-    camera: PinholeCamera,
+    settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], camera: PinholeCamera
 ) -> dict[str, Any]:
     """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON."""
     # Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`,
@@ -42,10 +39,7 @@ def describe(
         "entry_s": settings.entry_s if frames else None,
         "frames": frames[0] if frames else [],
         "others": frames[1:],
-        "ego": {
-            "x_m": ego_x.round(6).tolist(),
-            "speed_mps": settings.ego.at_mps(frames_s).round(6).tolist(),
-        },
+        "ego": {"x_m": ego_x.round(6).tolist(), "speed_mps": settings.ego.at_mps(frames_s).round(6).tolist()},
     }
 
 

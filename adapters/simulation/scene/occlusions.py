@@ -26,9 +26,7 @@ class OccludedScene:
 def lead_vehicle() -> OccludedScene:
     """Return a van six metres ahead that hides what comes towards us in the next lane."""
     return OccludedScene(
-        _open("SL1", box(6.0, 12.0, -1.1, 1.1)),
-        ((60.0, 2.2), (30.0, 2.6), (10.0, 3.2), (-10.0, 3.2)),
-        "left",
+        _open("SL1", box(6.0, 12.0, -1.1, 1.1)), ((60.0, 2.2), (30.0, 2.6), (10.0, 3.2), (-10.0, 3.2)), "left"
     )
 
 

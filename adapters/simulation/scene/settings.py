@@ -167,11 +167,7 @@ class SimulationSettings:
 
 
 def draw_settings(
-    site_name: str,
-    approach: str,
-    rng: np.random.Generator,
-    duration_s: float = 10.0,
-    kind: str = "light",
+    site_name: str, approach: str, rng: np.random.Generator, duration_s: float = 10.0, kind: str = "light"
 ) -> SimulationSettings:
     """Draw how a vehicle drives, in sight at 65 to 75 % of the time.
 

@@ -27,10 +27,7 @@ class Table:
 
 
 def emission_times(
-    receive_s: FloatArray,
-    emit_s: FloatArray,
-    travel_m: FloatArray,
-    speed_mps: float,
+    receive_s: FloatArray, emit_s: FloatArray, travel_m: FloatArray, speed_mps: float
 ) -> FloatArray:
     """Solve t = t_e + r(t_e) / c for the emission times t_e of given receive times.
 

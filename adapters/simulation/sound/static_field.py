@@ -51,12 +51,7 @@ class StaticSources:
         self._out, self._rate = out, sample_rate_hz
         self._waiting: list[tuple[Float32Array, FloatArray, FloatArray]] = []
 
-    def add(
-        self,
-        signals: Float32Array,
-        delays_s: FloatArray,
-        gains: FloatArray | None = None,
-    ) -> None:
+    def add(self, signals: Float32Array, delays_s: FloatArray, gains: FloatArray | None = None) -> None:
         """Add sources; see `add_static`."""
         factors = np.ones_like(delays_s) if gains is None else gains
         self._waiting.append((signals, delays_s, factors))

@@ -26,15 +26,7 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.typing import Complex64Array, Float32Array
 
 from .bench_peers import peer_times
-from .bench_stages import (
-    AZIMUTHS_RAD,
-    GOAL,
-    NFFT,
-    RATE_HZ,
-    SRP_BINS,
-    srp_beams,
-    stage_times,
-)
+from .bench_stages import AZIMUTHS_RAD, GOAL, NFFT, RATE_HZ, SRP_BINS, srp_beams, stage_times
 from .stopwatch import Milliseconds, elapsed_ms
 
 SECONDS = 6

@@ -22,10 +22,7 @@ SRP_BAND_HZ, FEATURE_BAND_HZ = [300.0, 1800.0], [50.0, 1500.0]
 
 
 def peer_times(
-    sound: Float32Array,
-    frames: Complex64Array,
-    sample_rate_hz: int,
-    azimuths_rad: FloatArray,
+    sound: Float32Array, frames: Complex64Array, sample_rate_hz: int, azimuths_rad: FloatArray
 ) -> dict[str, Milliseconds]:
     """Return milliseconds per hop of each peer, keys beginning with ``peer_``; empty where none is installed.
 

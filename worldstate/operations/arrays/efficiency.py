@@ -225,11 +225,7 @@ def delay_trial() -> Trial:
 
 
 def bearing_trial(
-    array: MicrophoneArray,
-    *,
-    azimuth_rad: float = 0.0,
-    frequency_hz: float = 1000.0,
-    snapshots: int = 20,
+    array: MicrophoneArray, *, azimuth_rad: float = 0.0, frequency_hz: float = 1000.0, snapshots: int = 20
 ) -> Trial:
     """Azimuth by SRP-PHAT on the front-end's grid of one degree, against eq. (4), radians.
 

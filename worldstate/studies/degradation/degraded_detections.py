@@ -72,10 +72,7 @@ class StagedLooks:
 
 
 def stage_looks(
-    video: Video,
-    staging: Staging,
-    states: Sequence[CameraState],
-    rng: np.random.Generator,
+    video: Video, staging: Staging, states: Sequence[CameraState], rng: np.random.Generator
 ) -> StagedLooks:
     """Decode once, degrade and look in every state."""
     # The degradation is staged on the frames and nobody is told: the detector sees degraded frames, and d is
