@@ -30,6 +30,8 @@ class LevelMeter:
         bins = band_bins((low, min(high, _HIGHEST * sample_rate_hz)), sample_rate_hz, settings.nfft)
         self._bins = range(max(bins.start, 1), bins.stop)
         self._edges = band_edges(self._bins, settings.level_bands)
+        # A bin reaches half its width to either side of its frequency.
+        self.edges_hz: FloatArray = (self._edges - 0.5) * sample_rate_hz / settings.nfft
         self._nfft = settings.nfft
         step = -(-n_channels // settings.level_channels)
         self._channels = slice(None, None, step)

@@ -56,26 +56,6 @@ def entropy_bits(probabilities: ArrayLike) -> float:
     return max(float(-(positive * np.log2(positive)).sum()), 0.0)
 
 
-def mutual_information_bits(joint: ArrayLike) -> float:
-    r"""Return :math:`I(z; x) = \sum p(z, x) \log_2 \frac{p(z, x)}{p(z) p(x)}` of a joint table.
-
-    Shapes: joint (states, observations).
-
-    References
-    ----------
-    C. E. Shannon, "A mathematical theory of communication", Bell Syst. Tech. J. 27, 1948.
-
-    Examples
-    --------
-    >>> mutual_information_bits([[0.5, 0.0], [0.0, 0.5]])
-    1.0
-    """
-    p = _distribution("joint", finite_array("joint", joint, (None, None)))
-    independent = p.sum(axis=1, keepdims=True) * p.sum(axis=0, keepdims=True)
-    there = p > 0.0
-    return max(float((p[there] * np.log2(p[there] / independent[there])).sum()), 0.0)
-
-
 def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Information:
     r"""Estimate I(z; x) from posteriors q(z | x) of windows that the classifier was not trained on.
 
@@ -285,49 +265,6 @@ def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
     if remaining >= math.log2(k) - 1e-12:
         return largest
     return float(brentq(lambda p: _fano_function(p, k) - remaining, 0.0, largest))
-
-
-def conditional_information(acoustic: ArrayLike, both: ArrayLike, states: ArrayLike) -> float:
-    r"""Estimate the vision-unique part I(z; x_vis | x_ac), bits.
-
-    .. math:: \hat I = \overline{\log_2 \frac{q(z_i | x_{ac,i}, x_{vis,i})}{q(z_i | x_{ac,i})}}
-
-    Shapes: acoustic, both (n, K), states (n,).
-
-    Examples
-    --------
-    >>> round(conditional_information([[0.5, 0.5]] * 2, [[0.9, 0.1], [0.1, 0.9]], [0, 1]), 3)
-    0.848
-    """
-    # It is what is lost with vision, and no acoustic detector can bring it back at run time. A difference of
-    # two lower bounds, so itself no bound; negative where the posteriors of both are the worse ones.
-    without, z = _checked(acoustic, states)
-    with_vision, _ = _checked(both, states)
-    check_shape("both", with_vision.shape, without.shape)
-    rows = np.arange(z.size)
-    ratio = np.maximum(with_vision[rows, z], _SMALLEST) / np.maximum(without[rows, z], _SMALLEST)
-    return float(np.log2(ratio).mean())
-
-
-def fuse(acoustic: ArrayLike, visual: ArrayLike, prior: ArrayLike) -> FloatArray:
-    r"""Return posteriors of both channels under (A1), independence given the state, shape (n, K).
-
-    .. math:: q(z | x_{ac}, x_{vis}) \propto q(z | x_{ac})\, q(z | x_{vis}) / p(z)
-
-    Shapes: acoustic, visual (n, K), prior (K,).
-
-    Examples
-    --------
-    >>> fuse([[0.8, 0.2]], [[0.5, 0.5]], [0.5, 0.5])
-    array([[0.8, 0.2]])
-    """
-    a = finite_array("acoustic", acoustic, (None, None))
-    v = finite_array("visual", visual, a.shape)
-    p = _distribution("prior", finite_array("prior", prior, (a.shape[1],)))
-    if (p <= 0.0).any():
-        raise InvalidArgumentError("prior: expected positive numbers")
-    joint = np.maximum(a, _SMALLEST) * np.maximum(v, _SMALLEST) / p
-    return np.asarray(joint / joint.sum(axis=1, keepdims=True))
 
 
 def _fano_numbers(entropy: float, information: float, states: int) -> tuple[float, float, int]:

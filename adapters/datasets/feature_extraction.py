@@ -70,9 +70,17 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
     InputFileError
         If a recording is damaged, has another number of channels than the array, or is too short.
     """
+    for samples, rate_hz in read_windows(windows, array.n_microphones):
+        yield published_feature(samples, array, rate_hz)
+
+
+def read_windows(
+    windows: list[LabelledWindow], channels: int | None = None
+) -> Iterator[tuple[Float32Array, int]]:
+    """Yield the samples of each window, shape (n, M), and their rate in Hz."""
     for window in windows:
-        with open_audio(window.path, array.n_microphones) as source:
-            yield published_feature(_last_second(source, window), array, source.sample_rate_hz)
+        with open_audio(window.path, channels) as source:
+            yield _last_second(source, window), source.sample_rate_hz
 
 
 def feature_table(windows: list[LabelledWindow], features: list[FloatArray]) -> FeatureTable:

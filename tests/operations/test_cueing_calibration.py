@@ -23,8 +23,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Measurement, Sighting
 from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
-from worldstate.operations.calibration.false_alarm_map import false_alarm_rate, threshold_for_rate
-from worldstate.operations.recordings.advisories import rising_edges
+from worldstate.operations.calibration.false_alarm_map import false_alarm_rate
 from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, load_streams, save_streams
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 
@@ -84,26 +83,6 @@ def test_a_stream_keeps_what_was_measured():
     assert (stream.approach.item(), stream.seen.item(), stream.before_sight.item()) == (2.0, True, True)
     with pytest.raises(InvalidArgumentError, match="hop"):
         hop_stream([], name="a")
-
-
-@settings(deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.floats(0.0, 20.0), st.booleans())
-def test_the_map_read_backwards_is_the_smallest_threshold_above_which_the_rate_is_kept(
-    seed, hops, rate, ties
-):
-    rng = np.random.default_rng(seed)
-    streams = [rng.random(rng.integers(1, 40)).round(1 if ties else 6) for _ in range(5)]
-    found = threshold_for_rate(streams, rate, hops, hop_s=60.0)
-
-    def per_hour(gamma):
-        alarms = [sustained_statistic(s, hops) >= gamma for s in streams]
-        return sum(len(rising_edges(a)) for a in alarms) / (sum(map(len, alarms)) / 60.0)
-
-    levels = np.unique(np.concatenate(streams))
-    assert all(per_hour(g) <= rate + 1e-6 for g in [found.gamma, *levels[levels > found.gamma]])
-    assert found.per_hour == pytest.approx(per_hour(found.gamma))
-    if (below := np.nextafter(max(found.gamma, -1.0), -np.inf)) in levels:
-        assert per_hour(below) > rate
 
 
 @given(st.integers(0, 40), st.integers(50, 400))

@@ -22,6 +22,8 @@ COMMANDS = (
     "studies.evaluate_features",
     "users.extract_features",
     "studies.twin",
+    "studies.ablations",
+    "studies.identifiability",
     "users.bench",
 )
 

@@ -1,12 +1,15 @@
-"""Run a source with a bar that follows the audio."""
+"""Run recordings with a bar that says how far they are."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.listen import Source
+from worldstate.operations.calibration.calibration_input import find_inputs, read_input
+from worldstate.operations.recordings.hop_stream import HopStream
 from worldstate.operations.recordings.recording_report import RecordingReport, run_recording
 
-from .progress import progress_bar
+from .progress import progress_bar, track
 
 
 def listen_with_progress(source: Source, *, title: str, states_path: Path | None) -> RecordingReport:
@@ -15,3 +18,10 @@ def listen_with_progress(source: Source, *, title: str, states_path: Path | None
         hops = 10.0 * audio.frames / audio.sample_rate_hz
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
         return run_recording(source, title=title, states_path=states_path, on_hop=lambda step: bar.advance())
+
+
+def read_streams(inputs: Iterable[Path], array: Path | None, model: Path | None) -> list[HopStream]:
+    """Return the hop streams of data sets, recordings, sound files and what --save-streams wrote."""
+    found = [item for path in inputs for item in find_inputs(path)]
+    read = track(found, "listening", len(found))
+    return [stream for path in read for stream in read_input(path, array=array, model=model)]

@@ -1,10 +1,13 @@
 """Progress on standard error for anything that takes more than two seconds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+Item = TypeVar("Item")
 
 
 class Bar:
@@ -31,3 +34,17 @@ def progress_bar(description: str, total: float | None, *, quiet: bool = False) 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
         yield Bar(progress, progress.add_task(description, total=total))
+
+
+def track(items: Iterable[Item], description: str, total: float) -> Iterator[Item]:
+    """Yield the items, a step of a progress bar for each.
+
+    Examples
+    --------
+    >>> list(track(range(3), "counting", 3))
+    [0, 1, 2]
+    """
+    with progress_bar(description, total) as bar:
+        for item in items:
+            yield item
+            bar.advance()

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.detector_options import (
     add_detector_options,
     detector_filter,
@@ -11,7 +12,7 @@ from worldstate.cli.common.detector_options import (
     detector_name,
 )
 from worldstate.cli.common.output import print_summary
-from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.ovad import Recording
@@ -44,14 +45,15 @@ example:
   worldstate evaluate-degradation sim --miss-rates beta.json --model street.json --jobs 2 --out sweep"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "evaluate-degradation",
-        help="hazard awareness while the camera fails, beside vision alone",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "hazard awareness while the camera fails, beside vision alone",
+        DESCRIPTION,
+        EXAMPLE,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="recordings with video")
     parser.add_argument(
@@ -72,8 +74,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--out", type=Path, default=Path("degradation"), metavar="DIR", help="(default: %(default)s)"
     )
-    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -127,12 +127,7 @@ def _stage(
     from worldstate.studies.degradation.staged_dataset import stage_dataset
 
     folder.mkdir(parents=True, exist_ok=True)
-    done = []
-    with progress_bar("staging the camera", len(found)) as bar:
-        for recording in stage_dataset(folder, found, settings, jobs):
-            done.append(recording)
-            bar.advance()
-    return done
+    return list(track(stage_dataset(folder, found, settings, jobs), "staging the camera", len(found)))
 
 
 def _origin(arguments: argparse.Namespace, recordings: "list[StagedRecording]") -> dict[str, object]:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.feature_options import add_table_options
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.progress import progress_bar
@@ -42,14 +43,15 @@ examples:
   worldstate evaluate-features features.csv --model model.json --only testset.csv"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "evaluate-features",
-        help="evaluate signature and cueing on feature windows",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "evaluate signature and cueing on feature windows",
+        DESCRIPTION,
+        EXAMPLE,
     )
     add_table_options(parser)
     parser.add_argument(
@@ -66,8 +68,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--predictions", type=Path, metavar="CSV", help="write one row a window and seed")
-    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
-from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.progress import progress_bar, track
 
 if TYPE_CHECKING:
     from worldstate.abduction.signature.signature_io import AnySignature
@@ -43,14 +44,15 @@ examples:
   worldstate twin --realism features.csv --out twin"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "twin",
-        help="published figures on simulated recordings, beside the paper's",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "published figures on simulated recordings, beside the paper's",
+        DESCRIPTION,
+        EXAMPLE,
     )
     parser.add_argument("--static", type=int, default=83, metavar="N", help="recordings (default: 83)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -76,8 +78,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="of the real windows: standing or moving ego (default: %(default)s)",
     )
     parser.add_argument("--keep", action="store_true", help="keep the recordings too, 80 MB each")
-    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -128,12 +128,8 @@ def _listen(arguments: argparse.Namespace) -> "list[TwinRecording]":
     heard.mkdir(parents=True, exist_ok=True)
     keep = arguments.out / "recordings" if arguments.keep else None
     settings = TwinSettings(_levels(arguments), arguments.duration, keep)
-    recordings = []
-    with progress_bar("simulating and listening", len(plans)) as bar:
-        for recording in listen_twins(heard, plans, settings, arguments.jobs):
-            recordings.append(recording)
-            bar.advance()
-    return recordings
+    made = listen_twins(heard, plans, settings, arguments.jobs)
+    return list(track(made, "simulating and listening", len(plans)))
 
 
 def _signature(arguments: argparse.Namespace) -> "AnySignature":

@@ -4,6 +4,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -14,18 +15,17 @@ Time the acoustic front-end per 0.1-s hop, stage by stage: 56 channels at 47,998
 that are installed (pyroomacoustics, and the published chain built on it) are timed in the same run."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "bench",
-        help="milliseconds per hop, beside the peers",
-        description=DESCRIPTION,
-        epilog="example: worldstate bench --rounds 5",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "milliseconds per hop, beside the peers",
+        DESCRIPTION,
+        "example: worldstate bench --rounds 5",
     )
     parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,12 +5,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
-from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
     from worldstate.operations.calibration.cueing_calibration import CueingCalibration
-    from worldstate.operations.recordings.hop_stream import HopStream
 
 DESCRIPTION = """\
 Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
@@ -26,14 +25,10 @@ examples:
   worldstate calibrate my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
-        "calibrate",
-        help="set thresholds on your own hazard-free hours",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, run, "calibrate", "set thresholds on your own hazard-free hours", DESCRIPTION, EXAMPLE
     )
     parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
     parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
@@ -56,8 +51,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--keep", type=float, metavar="N", help="let the threshold move to keep N false alarms an hour"
     )
     parser.add_argument("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -65,6 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from worldstate.adapters.files.model_file import read_model, save_model
+    from worldstate.cli.common.listening import read_streams
     from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
     from worldstate.operations.recordings.hop_stream import save_streams
 
@@ -77,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         keep_per_hour=arguments.keep,
     )
     model = read_model(arguments.model)
-    streams = _streams(arguments)
+    streams = read_streams(arguments.inputs, arguments.array, arguments.model)
     if arguments.save_streams is not None:
         save_streams(arguments.save_streams, streams)
     done = calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
@@ -88,18 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"worldstate: warning: {warning}", file=sys.stderr)
     _print(arguments, done)
     return 0
-
-
-def _streams(arguments: argparse.Namespace) -> "list[HopStream]":
-    from worldstate.operations.calibration.calibration_input import find_inputs, read_input
-
-    found = [item for path in arguments.inputs for item in find_inputs(path)]
-    streams = []
-    with progress_bar("listening", len(found)) as bar:
-        for path in found:
-            streams += read_input(path, array=arguments.array, model=arguments.model)
-            bar.advance()
-    return streams
 
 
 def _print(arguments: argparse.Namespace, done: "CueingCalibration") -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 
 if TYPE_CHECKING:
@@ -20,21 +21,20 @@ Simulate a delivery van that approaches a blind junction, listen to it, and watc
 before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "demo",
-        help="hear one hidden vehicle, from simulation to figure",
-        description=DESCRIPTION,
-        epilog="example: worldstate demo --out out/demo --seed 7",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "hear one hidden vehicle, from simulation to figure",
+        DESCRIPTION,
+        "example: worldstate demo --out out/demo --seed 7",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=1, help="another seed, another recording (default: 1)")
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def simulate_approach(root: Path, seed: int) -> Path:

@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
-from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_extraction import LabelledWindow
@@ -28,14 +29,15 @@ examples:
   worldstate train features.csv --method worldstate --out model.json"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "extract-features",
-        help="compute feature windows from labelled recordings",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "compute feature windows from labelled recordings",
+        DESCRIPTION,
+        EXAMPLE,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
@@ -43,8 +45,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--array", type=Path, metavar="XML", help="microphones (default: the 56-microphone roof array)"
     )
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,11 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
     windows, left_out = _windows(arguments)
-    features = []
-    with progress_bar("extracting", len(windows)) as bar:
-        for feature in extract_features(windows, array):
-            features.append(feature)
-            bar.advance()
+    features = list(track(extract_features(windows, array), "extracting", len(windows)))
     table = feature_table(windows, features)
     write_features(arguments.out, table)
     summary = {

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.detector_options import add_detector_options, detector_maker, detector_name
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.progress import progress_bar
@@ -31,14 +32,15 @@ examples:
       --labels person bicycle car --out beta.json"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
+        run,
         "measure-absence",
-        help="measure how often a camera's detector misses what is there",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "measure how often a camera's detector misses what is there",
+        DESCRIPTION,
+        EXAMPLE,
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
     parser.add_argument("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
@@ -50,8 +52,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="JSON", help="exactly this file")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw beta over d")
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.progress import progress_bar
 
@@ -29,14 +30,10 @@ examples:
   worldstate run sim/SA1/left/1_00_0000"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
-        "simulate",
-        help="write simulated recordings in the OVAD layout",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, run, "simulate", "write simulated recordings in the OVAD layout", DESCRIPTION, EXAMPLE
     )
     parser.add_argument("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     parser.add_argument(
@@ -54,8 +51,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
     parser.add_argument("--video", action="store_true", help="render the camera's video, too")
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.feature_options import add_table_options
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.progress import progress_bar
@@ -20,14 +21,10 @@ example:
   worldstate train features.csv --group static --exclude testset.csv --out model.json"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = subparsers.add_parser(
-        "train",
-        help="train a signature model on feature windows",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = add_command(
+        subparsers, run, "train", "train a signature model on feature windows", DESCRIPTION, EXAMPLE
     )
     add_table_options(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
@@ -43,8 +40,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
     parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
     parser.add_argument("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -92,10 +92,6 @@ class AblationRow:
     vision_only: float | None
     approach_weight: float  # Mean of the weights chosen
 
-    def to_dict(self) -> dict[str, float | None]:
-        """Return JSON-able values."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:

@@ -4,12 +4,45 @@ Source of the profile: R. A. Fisher, "The use of multiple measurements in taxono
 at a time.
 """
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.frontend.levels import LevelMeter
+from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BandProfile:
+    """Fisher ratio of every band between windows with a vehicle and without one."""
+
+    edges_hz: FloatArray  # shape (B + 1,)
+    by_level: FloatArray  # shape (B,): Of the log-energies themselves
+    by_shape: FloatArray  # shape (B,): Of their shape, which gain and range do not change
+    range_hz: tuple[float, float]  # Around the best band of the shape: see `discriminative_range_hz`
+
+
+def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArray) -> BandProfile:
+    """Compare the band levels of windows, samples (n, M) at a rate, with a vehicle and without one."""
+    # All windows need the bands of one rate: the first one's.
+    rows, edges_hz = [], None
+    for samples, rate_hz in windows:
+        meter = LevelMeter(samples.shape[1], rate_hz, FrontEndSettings())
+        edges_hz = meter.edges_hz if edges_hz is None else edges_hz
+        if not np.array_equal(meter.edges_hz, edges_hz):
+            raise InvalidArgumentError(f"windows: expected one sample rate, got {rate_hz:g} Hz too")
+        rows.append(meter.push(samples))
+    if edges_hz is None:
+        raise InvalidArgumentError("windows: expected at least two with a vehicle and two without")
+    energy = np.array(rows)
+    shape = level_invariant_shape(energy)
+    by_level, by_shape = (fisher_profile(one[vehicle], one[~vehicle]) for one in (energy, shape))
+    return BandProfile(edges_hz, by_level, by_shape, discriminative_range_hz(by_shape, edges_hz))
 
 
 def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
@@ -57,10 +90,6 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
     Notes
     -----
     Sampling lifts it: without any difference its mean is about 1/(2n) + 1/(2m).
-
-    References
-    ----------
-    R. A. Fisher 1936, one band at a time: see `fisher_profile`; "Evidence of Absence", section IV.
 
     Examples
     --------

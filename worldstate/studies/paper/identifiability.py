@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.abduction.identifiability.fisher_information import combined_information
 from worldstate.abduction.identifiability.information import (
     fano_bound,
     information_from_posteriors,
@@ -14,11 +13,18 @@ from worldstate.abduction.identifiability.information import (
     sharp_fano_bound,
     state_entropy_bits,
 )
+from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_information
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.operations.training.feature_evaluation import MakeClassifier, out_of_fold
+from worldstate.operations.training.methods import site_ensemble
+from worldstate.operations.training.splits import folds_by_recording
+from worldstate.operations.training.training import TrainingMethod, seen_by
 
 # A kNN estimate in more dimensions than this is far below the truth at a few hundred windows.
 _COMPONENTS = 3
@@ -44,11 +50,6 @@ class ReachOnData:
     # and the one without its slack.
     fano: float
     sharp_fano: float
-
-    def to_dict(self) -> dict[str, float | None]:
-        """Return JSON-able values; unknown is None."""
-        values = {name: getattr(self, name) for name in self.__slots__}
-        return {name: None if math.isnan(value) else value for name, value in values.items()}
 
 
 def reach_on_data(
@@ -114,6 +115,16 @@ def reach_on_data(
     )
 
 
+def reach_on_table(table: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> ReachOnData:
+    """Bound the error of any classifier of the windows of a table, beside that of a method out of fold."""
+    inputs = seen_by(table, method)
+    make: MakeClassifier = site_ensemble if method == "worldstate" else PublishedClassifier
+    posteriors = out_of_fold(inputs, folds_by_recording(inputs, rng), make, rng)
+    states = np.array([CLASSES.index(label) for label in table.labels.tolist()])
+    features = np.log(table.features)
+    return reach_on_data(posteriors, states, rng, features=features, groups=table.recording_keys)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ReachOfArray:
     """How well a bearing could be told with an array, by the Cramer-Rao bound."""
@@ -177,11 +188,12 @@ def reach_of_array(
         ]
     )
     heard = np.divide(1.0, variance, out=np.zeros_like(variance), where=np.isfinite(variance))
-    both = [combined_information([[[j]], [[seen]]])[0, 0] for j in heard.tolist()]
+    std = np.sqrt(variance)
     return ReachOfArray(
         azimuths_rad=azimuths,
-        std_rad=np.sqrt(variance),
-        with_vision_rad=_deviation(np.array(both)),
+        # Round-off leaves a sliver of information at endfire: a spread beyond half a turn is no bearing.
+        std_rad=np.where(std > math.pi, math.inf, std),
+        with_vision_rad=_deviation(heard + seen),
         endfire=endfire_information(array.positions_m, azimuths),
     )
 
