@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from filterpy.kalman import ExtendedKalmanFilter
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -11,6 +12,7 @@ from scipy.stats import chi2
 
 from worldstate.belief.motion import MotionBelief, predict, relax, update_approach, update_azimuth
 from worldstate.belief.polar import jacobian, process_noise, propagate
+from worldstate.ground.values import wrap_angle
 
 states = st.tuples(st.floats(-3.0, 3.0), st.floats(-0.8, 0.8), st.floats(-0.8, 0.8), st.floats(1.5, 4.5)).map(
     np.array
@@ -180,3 +182,50 @@ def test_the_errors_are_as_large_as_it_says():
     runs = 80
     low, high = chi2.ppf([0.0005, 0.9995], 4 * runs) / runs
     assert low < mean_nees(runs, seed=3) < high
+
+
+def engine(belief):
+    """filterpy's filter on a belief: the oracle."""
+    kalman = ExtendedKalmanFilter(dim_x=4, dim_z=1)
+    kalman.x, kalman.P = belief.mean.copy(), belief.covariance.copy()
+    return kalman
+
+
+spreads = st.tuples(*[st.floats(0.01, 1.0)] * 4)
+turns = st.integers(0, 2**32 - 1)
+
+
+def correlated(state, spread, seed):
+    """A belief whose components are correlated."""
+    turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(4, 4)))
+    covariance = turn @ np.diag(np.square(spread)) @ turn.T
+    return MotionBelief(state, 0.5 * (covariance + covariance.T))
+
+
+@given(states, spreads, turns, times)
+def test_predict_is_that_of_an_extended_kalman_filter(state, spread, seed, time_s):
+    assume(state[2] * time_s > -0.5)  # Nearer than half its range nobody comes within a step
+    belief = correlated(state, spread, seed)
+    kalman = engine(belief)
+    kalman.F = jacobian(state, time_s)
+    kalman.Q = process_noise(2.0, float(np.clip(np.exp(state[3]), 3.0, 200.0)), time_s)
+    kalman.predict()
+    after = predict(belief, time_s, 2.0)
+    assert wrapped(after.mean - propagate(state, time_s)) == pytest.approx(0.0, abs=1e-12)
+    assert after.covariance == pytest.approx(kalman.P, abs=1e-12)
+
+
+@given(states, spreads, turns, st.floats(-3.1, 3.1), st.floats(0.01, 1.0), st.sampled_from([0, 2]))
+def test_update_is_that_of_an_extended_kalman_filter(state, spread, seed, value, std, row):
+    belief = correlated(state, spread, seed)
+    kalman, pick = engine(belief), np.eye(4)[row : row + 1]
+    kalman.update(
+        np.array([value]),
+        HJacobian=lambda x: pick,
+        Hx=lambda x: x[row : row + 1],
+        R=np.array([[std**2]]),
+        residual=(lambda z, x: wrap_angle(z - x)) if row == 0 else np.subtract,
+    )
+    after = update_azimuth(belief, value, std, 1.0) if row == 0 else update_approach(belief, -value, std, 1.0)
+    assert wrapped(after.mean - kalman.x) == pytest.approx(0.0, abs=1e-12)
+    assert after.covariance == pytest.approx(kalman.P, abs=1e-12)

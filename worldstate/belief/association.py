@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
@@ -27,6 +26,9 @@ def match_visible(
     if not candidates or not sightings:
         return {}
     cost = np.array([[_distance(tracks[i], s, settings) for s in sightings] for i in candidates])
+    # Imported where it is needed: scipy.optimize takes longer than all else that the core imports.
+    from scipy.optimize import linear_sum_assignment
+
     rows, columns = linear_sum_assignment(cost)
     return {
         candidates[row]: int(column)

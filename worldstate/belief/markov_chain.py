@@ -9,7 +9,6 @@ chain adds is the answer to "was that the one we heard before?".
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import expm
 
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND
@@ -57,6 +56,9 @@ def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
     >>> transition((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2, 100_000_000).sum(axis=1).round(12)
     array([1., 1., 1., 1., 1., 1.])
     """
+    # Imported where it is needed: scipy.linalg takes as long to import as numpy.
+    from scipy.linalg import expm
+
     step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
     matrix: FloatArray = np.maximum(expm(generator(rates_hz, directions) * step_s), 0.0)
     matrix /= matrix.sum(axis=1, keepdims=True)

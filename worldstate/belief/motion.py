@@ -1,10 +1,9 @@
-"""The motion belief of one entity: a modified-polar extended Kalman filter over filterpy."""
+"""The motion belief of one entity: an extended Kalman filter in modified polar coordinates."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
@@ -60,31 +59,22 @@ class MotionBelief:
         return math.sqrt(self.covariance[RADIAL_RATE, RADIAL_RATE])
 
 
-class _PolarEngine(ExtendedKalmanFilter):  # type: ignore[misc]
-    """filterpy's filter with the closed-form motion in place of its linear one."""
-
-    def __init__(self, belief: MotionBelief, measured: int = 1) -> None:
-        super().__init__(dim_x=4, dim_z=measured)
-        self.x = belief.mean  # 1-D: a column state and a flat measurement would broadcast to a matrix
-        self.P = belief.covariance
-        self.step_s = 0.0
-
-    def predict_x(self, u: float = 0) -> None:
-        self.x = propagate(self.x, self.step_s)
-
-
 def predict(belief: MotionBelief, step_s: float, acceleration_psd: float) -> MotionBelief:
-    """Return the belief after `step_s` of constant velocity and white acceleration (m^2/s^3)."""
+    r"""Return the belief after `step_s` of constant velocity and white acceleration (m^2/s^3).
+
+    .. math:: m \leftarrow f(m), \quad P \leftarrow F P F^T + Q
+    """
     start = belief.mean.copy()
     if step_s > 0.0:
         start[RADIAL_RATE] = max(start[RADIAL_RATE], -_CLOSEST_SHARE / step_s)
-    engine = _PolarEngine(MotionBelief(start, belief.covariance))
-    range_m = min(max(math.exp(belief.mean[LOG_RANGE]), _NEAREST_M), _FARTHEST_M)
-    engine.step_s = step_s
-    engine.F = jacobian(start, step_s)
-    engine.Q = process_noise(acceleration_psd, range_m, step_s)
-    engine.predict()
-    return _belief(engine.x, engine.P)
+    # Clipped before exp: approach rates that contradict each other drive log r, which nobody measures, so far
+    # that exp overflows.
+    log_range = min(max(float(belief.mean[LOG_RANGE]), math.log(_NEAREST_M)), math.log(_FARTHEST_M))
+    flow = jacobian(start, step_s)
+    covariance = flow @ belief.covariance @ flow.T + process_noise(
+        acceleration_psd, math.exp(log_range), step_s
+    )
+    return _belief(propagate(start, step_s), covariance)
 
 
 def relax(
@@ -127,27 +117,23 @@ def log_azimuth_likelihood(belief: MotionBelief, azimuth_rad: float, std_rad: fl
 def _update(belief: MotionBelief, row: int, value: float, std: float, weight: float) -> MotionBelief:
     r"""Probabilistic data association with one measurement, linear in one component.
 
-    .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T
+    .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
+        \quad K = P^- h / (h^T P^- h + R)
     """
     if weight <= 0.0:
         return belief
-    engine = _PolarEngine(belief)
-    pick = np.zeros((1, 4))
-    pick[0, row] = 1.0
-    engine.update(
-        np.array([value]),
-        HJacobian=lambda state: pick,
-        Hx=lambda state: state[row : row + 1],
-        R=np.array([[std**2]]),
-        residual=_wrapped if row == AZIMUTH else np.subtract,
-    )
-    step = engine.x - belief.mean
-    covariance = weight * engine.P + (1.0 - weight) * belief.covariance
+    residual = value - float(belief.mean[row])
+    if row == AZIMUTH:
+        residual = wrap_angle(residual)
+    gain = belief.covariance[:, row] / (belief.covariance[row, row] + std**2)
+    # Joseph's form stays positive definite where P - K H P loses it to rounding: a sharp bearing on a belief
+    # that is sharp already.
+    keep = np.eye(4)
+    keep[:, row] -= gain
+    updated = keep @ belief.covariance @ keep.T + std**2 * np.outer(gain, gain)
+    step = gain * residual
+    covariance = weight * updated + (1.0 - weight) * belief.covariance
     return _belief(belief.mean + weight * step, covariance + weight * (1.0 - weight) * np.outer(step, step))
-
-
-def _wrapped(z: FloatArray, expected: FloatArray) -> FloatArray:
-    return wrap_angle(z - expected)
 
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> MotionBelief:
