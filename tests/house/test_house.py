@@ -3,9 +3,13 @@
 import subprocess
 import sys
 import tomllib
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+import worldstate
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -40,9 +44,53 @@ def test_layers_hold():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("module", ["worldstate", "worldstate.cli.main"])
-def test_import_stays_light(module):
-    heavy = {"matplotlib.pyplot", "gtsam", "sklearn", "cv2"}
-    script = f"import sys, {module}; print(*sorted({heavy!r} & set(sys.modules)))"
+HEAVY = {"scipy.stats", "scipy.signal", "sklearn", "filterpy", "gtsam", "matplotlib", "cv2", "networkx"}
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import worldstate",
+        "import worldstate; worldstate.WorldFilter",
+        "import worldstate; worldstate.WorldFilter().predict(0.1).state",
+        "import worldstate.cli.main",
+    ],
+)
+def test_import_stays_light(statement):
+    script = f"import sys; {statement}; print(*sorted({HEAVY!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def exporting_packages():
+    found = [import_module(name) for name in sorted(packages_in_tree())]
+    return {package.__name__: package for package in found if hasattr(package, "__all__")}
+
+
+def test_every_exported_name_is_the_one_of_its_home():
+    packages = exporting_packages()
+    homes = {}
+    for name, package in packages.items():
+        assert list(package.__all__) == sorted(set(package.__all__)), name
+        for exported in package.__all__:
+            value = getattr(package, exported)
+            # A submodule of the same name would take its place once somebody imports that.
+            assert not isinstance(value, ModuleType), f"{name}.{exported}"
+            homes.setdefault(exported, value)
+            assert value is homes[exported], f"{name}.{exported} is another thing elsewhere"
+            home = sys.modules[getattr(value, "__module__", None) or name]
+            assert getattr(home, exported, value) is value
+    assert sum(len(package.__all__) for package in packages.values()) <= 250
+    assert 20 <= len(packages["worldstate"].__all__) <= 30
+
+
+def test_everything_can_be_imported_at_once():
+    names = {}
+    exec("from worldstate import *", names)
+    assert set(exporting_packages()["worldstate"].__all__) <= set(names)
+
+
+@pytest.mark.parametrize("command", [["-m", "worldstate"], ["-m", "worldstate.cli.main"]])
+def test_it_runs_as_a_module_and_names_its_version(command):
+    done = subprocess.run([sys.executable, *command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["worldstate", worldstate.__version__]

@@ -4,9 +4,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import version
 
 from worldstate.ground.errors import WorldstateError
+from worldstate.ground.version import __version__
 
 # Modules are imported when the parser is built; each keeps its heavy imports inside `run`.
 COMMANDS = (
@@ -35,7 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Keep a structured world-state alive from sound when vision fails.",
         epilog="example: worldstate demo --out out/demo",
     )
-    parser.add_argument("--version", action="version", version=f"worldstate {version('worldstate')}")
+    parser.add_argument("--version", action="version", version=f"worldstate {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name in COMMANDS:
         import_module(f"worldstate.cli.{name}").add_parser(subparsers)

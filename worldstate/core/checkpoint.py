@@ -15,7 +15,9 @@ from worldstate.belief.motion import MotionBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.state import ANSWERS, Priors, Record
+from worldstate.ground.reading import Record
+from worldstate.state import Priors
+from worldstate.state.entity import ANSWERS
 
 from .memory import Memory
 

@@ -11,9 +11,10 @@ from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.reading import Record, check_schema
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Measurement
-from worldstate.state import Context, Record, WorldState, check_schema
+from worldstate.state import Context, WorldState
 
 from .checkpoint import (
     SCHEMA_NAME,

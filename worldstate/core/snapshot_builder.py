@@ -9,7 +9,8 @@ from worldstate.belief.motion import MotionBelief
 from worldstate.belief.polar import AZIMUTH_RATE, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
-from worldstate.state import EGO, Classification, Context, Entity, Relation, RiskCue, Visibility
+from worldstate.state import Classification, Context, Entity, Relation, RiskCue, Visibility
+from worldstate.state.relation import EGO
 
 from .memory import Memory, priors_of
 from .step import FilterModel

@@ -1,1 +1,5 @@
 """What users do with recordings of their own: train, calibrate, inspect, draw."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ from worldstate.cli.common.progress import progress_bar, track
 
 if TYPE_CHECKING:
     from worldstate.abduction.signature.signature_io import AnySignature
-    from worldstate.adapters.simulation import Preset
+    from worldstate.adapters.simulation.scene.presets import Preset
     from worldstate.studies.streets.decision_rules import TwinScore
     from worldstate.studies.streets.realism import Realism
     from worldstate.studies.streets.recording_features import TwinRecording
@@ -152,7 +152,7 @@ def _signature(arguments: argparse.Namespace) -> "AnySignature":
 def _levels(arguments: argparse.Namespace) -> "Preset":
     from dataclasses import replace
 
-    from worldstate.adapters.simulation import DEFAULT_PRESET, preset
+    from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
 
     levels = preset(arguments.preset or DEFAULT_PRESET)
     return levels if arguments.far_rate is None else replace(levels, far_rate=arguments.far_rate)

@@ -12,7 +12,7 @@ from worldstate.cli.common.output import print_summary
 if TYPE_CHECKING:
     import numpy as np
 
-    from worldstate.adapters.simulation import SimulationSettings
+    from worldstate.adapters.simulation.scene.settings import SimulationSettings
 
 VAN_OVER_CAR_DB = 6.0
 
@@ -41,25 +41,27 @@ def simulate_approach(root: Path, seed: int) -> Path:
     """Write one recording of a van that `seed` puts at a site and on a side; return its folder."""
     import numpy as np
 
-    from worldstate.adapters import simulation
+    from worldstate.adapters.simulation.dataset.dataset import write_log, write_recording
+    from worldstate.adapters.simulation.dataset.recording import simulate_recording
     from worldstate.cli.common.progress import progress_bar
 
     rng = np.random.default_rng(seed)
     settings = _delivery_van(rng)
     root.mkdir(parents=True, exist_ok=True)
     with progress_bar(f"simulating {settings.duration_s:g} s at {settings.site.name}", None):
-        recording = simulation.simulate_recording(settings, rng)
-        row = simulation.write_recording(root, recording)
-    simulation.write_log(root, [row])
+        recording = simulate_recording(settings, rng)
+        row = write_recording(root, recording)
+    write_log(root, [row])
     return root / row.folder
 
 
 def _delivery_van(rng: "np.random.Generator") -> "SimulationSettings":
     """Return an easy approach: a van, louder than a car, at 20 to 29 km/h without braking."""
-    from worldstate.adapters import simulation
+    from worldstate.adapters.simulation.scene.junction import SITES
+    from worldstate.adapters.simulation.scene.settings import draw_settings
 
-    site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
-    drawn = simulation.draw_settings(site, side, rng)
+    site, side = str(rng.choice(SITES)), str(rng.choice(("left", "right")))
+    drawn = draw_settings(site, side, rng)
     louder = replace(drawn.preset, vehicle_level_db=drawn.preset.vehicle_level_db + VAN_OVER_CAR_DB)
     return replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
 

@@ -104,14 +104,14 @@ def _scene(
 
 
 def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
-    from importlib.metadata import version
+    from worldstate.ground.version import __version__
 
     return {
         "data": arguments.input.name,
         "videos": str(videos),
         "detector": detector_name(arguments),
         "seed": str(arguments.seed),
-        "worldstate": version("worldstate"),
+        "worldstate": __version__,
     }
 
 

@@ -55,7 +55,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.simulation import DatasetSettings, write_dataset
+    from worldstate.adapters.simulation.dataset.dataset import write_dataset
+    from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
     static = arguments.static
     settings = DatasetSettings(

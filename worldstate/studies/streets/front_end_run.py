@@ -12,7 +12,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.listen import unoccluded_sector
-from worldstate.adapters.simulation import SimulatedRecording
+from worldstate.adapters.simulation.dataset.recording import SimulatedRecording
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M
 from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental

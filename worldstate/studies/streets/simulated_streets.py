@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
+from worldstate.adapters.simulation.dataset.dataset import write_recording
 from worldstate.adapters.simulation.dataset.plan import Plan
+from worldstate.adapters.simulation.dataset.recording import simulate_recording
 from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.adapters.simulation.scene.settings import draw_settings
 from worldstate.ground.parallel import in_processes
 
 from .front_end_run import run_front_end

@@ -17,14 +17,10 @@ from worldstate.adapters.datasets.feature_extraction import WINDOW_S
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.datasets.sample_windows import window_ends_s
-from worldstate.adapters.simulation import (
-    SITES,
-    Preset,
-    SimulationSettings,
-    draw_settings,
-    preset,
-    simulate_recording,
-)
+from worldstate.adapters.simulation.dataset.recording import simulate_recording
+from worldstate.adapters.simulation.scene.junction import SITES
+from worldstate.adapters.simulation.scene.presets import Preset, preset
+from worldstate.adapters.simulation.scene.settings import SimulationSettings, draw_settings
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,

@@ -14,7 +14,8 @@ import numpy as np
 
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
-from worldstate.adapters.simulation import SITES, Preset
+from worldstate.adapters.simulation.scene.junction import SITES
+from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.operations.training.training import TrainingMethod, fit_signature, seen_by
 
 from .simulated_streets import VERSION

@@ -1,0 +1,32 @@
+from .abduction.co_evidence import Absent as Absent
+from .abduction.co_evidence import Present as Present
+from .abduction.co_evidence import Unqueried as Unqueried
+from .abduction.cueing.cueing_policy import CueingPolicy as CueingPolicy
+from .abduction.evidence import SignatureEvidence as SignatureEvidence
+from .adapters.acoustic import AcousticAdapter as AcousticAdapter
+from .adapters.camera.detections import DetectionFrame as DetectionFrame
+from .adapters.camera.pinhole import PinholeCamera as PinholeCamera
+from .adapters.files.model_file import load_model as load_model
+from .adapters.listen import listen as listen
+from .adapters.listen import listen_steps as listen_steps
+from .adapters.listen import open_source as open_source
+from .belief.settings import FilterSettings as FilterSettings
+from .core.filter import WorldFilter as WorldFilter
+from .core.filter import uncalibrated_policy as uncalibrated_policy
+from .frontend.array.microphone_array import MicrophoneArray as MicrophoneArray
+from .ground.errors import WorldstateError as WorldstateError
+from .ground.values import NotUsable as NotUsable
+from .ground.values import nanoseconds as nanoseconds
+from .measurement.measurement import Approach as Approach
+from .measurement.measurement import Bearing as Bearing
+from .measurement.measurement import Measurement as Measurement
+from .measurement.measurement import Sighting as Sighting
+from .measurement.protocols import CoEvidenceChannel as CoEvidenceChannel
+from .measurement.protocols import MeasurementAdapter as MeasurementAdapter
+from .state.context import Context as Context
+from .state.cue import RiskCue as RiskCue
+from .state.entity import Entity as Entity
+from .state.relation import Relation as Relation
+from .state.world_state import WorldState as WorldState
+
+__version__: str

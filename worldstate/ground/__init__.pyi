@@ -1,0 +1,9 @@
+from .errors import InputFileError as InputFileError
+from .errors import InvalidArgumentError as InvalidArgumentError
+from .errors import MissingExtraError as MissingExtraError
+from .errors import SchemaVersionError as SchemaVersionError
+from .errors import WorldstateError as WorldstateError
+from .values import NotUsable as NotUsable
+from .values import nanoseconds as nanoseconds
+from .values import seconds as seconds
+from .values import wrap_angle as wrap_angle
