@@ -7,7 +7,7 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test slow lint clean
+.PHONY: demo test slow lint docs clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -34,6 +34,16 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p worldstate
 	$(BIN)/lint-imports
+
+# Warnings are errors, and a page that would load something from the network is one too.
+$(VENV)/.docs: $(VENV)/bin/python pyproject.toml
+	$(BIN)/pip install -q --disable-pip-version-check -e '.[docs]'
+	touch $@ $(VENV)/.core
+
+docs: $(VENV)/.docs
+	$(BIN)/sphinx-build -q -W --keep-going -b html -d out/doctrees docs out/docs
+	@! grep -rnE '(src|srcset)="https?:|<link[^>]*href="https?:|url\(.?https?:|@import' out/docs --include='*.html' --include='*.css'
+	@echo out/docs/index.html
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info
