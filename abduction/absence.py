@@ -2,17 +2,14 @@ r"""Miss rate of a co-evidence channel, beta_c(theta, d), over azimuth and degra
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
 from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import FloatArray
-
-SCHEMA = "worldstate.MissRateTable"
-VERSION = "1.0.0"
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -55,6 +52,8 @@ class MissRateTable:
     (0.09, 1.0)
     """
 
+    LAYOUT: ClassVar = Layout("worldstate.MissRateTable", "1.0.0")
+
     azimuth_deg: tuple[float, ...]
     degradation: tuple[float, ...]
     beta: Rows
@@ -77,48 +76,6 @@ class MissRateTable:
         rows = self.beta if label is None else self.per_class.get(label, self.beta)
         along = [float(np.interp(level, self.degradation, row)) for row in rows]
         return float(np.interp(magnitude_deg, self.azimuth_deg, along))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values with the schema's name and version."""
-        return {
-            **schema_stamp(SCHEMA, VERSION),
-            "azimuth_deg": list(self.azimuth_deg),
-            "degradation": list(self.degradation),
-            "beta": _lists(self.beta),
-            "per_class": {label: _lists(rows) for label, rows in self.per_class.items()},
-        }
-
-    @classmethod
-    def from_dict(cls, data: object, source: object = "miss-rate table") -> "MissRateTable":
-        """Return the table that `to_dict` wrote; keys it does not know are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-        source : object
-            What the message calls it: a path.
-
-        Raises
-        ------
-        InputFileError
-            If something is missing, of the wrong type or out of range; it begins with `source`.
-        SchemaVersionError
-            If the major version is another one.
-        """
-        fields = check_schema(data, SCHEMA, VERSION, source)
-        classes = fields.get("per_class", {})
-        if not isinstance(classes, Mapping):
-            raise InputFileError(source, "per_class: expected an object")
-        try:
-            return cls(
-                read_numbers(fields.get("azimuth_deg"), "azimuth_deg"),
-                read_numbers(fields.get("degradation"), "degradation"),
-                read_rows(fields.get("beta"), "beta"),
-                {str(label): read_rows(rows, f"beta of {label}") for label, rows in classes.items()},
-            )
-        except InvalidArgumentError as error:
-            raise InputFileError(source, str(error)) from error
 
 
 def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:
@@ -153,7 +110,3 @@ def _check_rates(name: str, rows: Rows, shape: tuple[int, int]) -> None:
         raise InvalidArgumentError(f"{name}: expected miss rates in [0, 1]")
     if (np.diff(rates, axis=0) < 0).any() or (np.diff(rates, axis=1) < 0).any():
         raise InvalidArgumentError(f"{name}: expected miss rates that never fall with azimuth or degradation")
-
-
-def _lists(rows: Rows) -> list[list[float]]:
-    return [list(row) for row in rows]

@@ -1,13 +1,11 @@
 r"""A threshold that keeps a false-alarm rate while sound and street drift, without hazard labels."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_number
+from worldstate.ground.serialisation import Check
 
 SECONDS_PER_HOUR = 3600.0
 _EXTREME_LOGIT = 20.0
@@ -108,27 +106,6 @@ class AdaptiveBudget:
         shifted = 1.0 / (1.0 + math.exp(-max(min(logit, 2 * _EXTREME_LOGIT), -2 * _EXTREME_LOGIT)))
         return min(shifted, max(calibrated, self.highest))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    @classmethod
-    def from_dict(cls, data: object) -> "AdaptiveBudget":
-        """Return the budget that `to_dict` wrote; unknown keys are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
-        values = _mapping(data, "adaptive")
-        return cls(**{field.name: read_number(values.get(field.name), field.name) for field in fields(cls)})
-
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveThreshold:
@@ -146,9 +123,10 @@ class AdaptiveThreshold:
     0.25
     """
 
-    shift_nats: float = 0.0  # x_t
+    # x_t
+    shift_nats: Annotated[float, Check("at most 100 nats", lambda x: abs(x) <= 100.0)] = 0.0
     # Age of an alarm of which it is not known yet whether anything comes; None where there is none.
-    pending_s: float | None = None
+    pending_s: Annotated[float, Check("an age", lambda age: 0.0 <= age <= 1e9)] | None = None
     alarm: bool = False  # Whether the rule was in alarm at the last hop
 
     def advance(
@@ -181,27 +159,6 @@ class AdaptiveThreshold:
             return replace(self._shifted(budget, 1.0), pending_s=0.0, alarm=alarm)
         return replace(self, pending_s=age_s, alarm=alarm)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {"shift_nats": self.shift_nats, "pending_s": self.pending_s, "alarm": self.alarm}
-
-    @classmethod
-    def from_dict(cls, data: object) -> "AdaptiveThreshold":
-        """Return the state that `to_dict` wrote."""
-        values = _mapping(data, "threshold")
-        pending, alarm = values.get("pending_s"), values.get("alarm")
-        if not isinstance(alarm, bool):
-            raise InvalidArgumentError("threshold.alarm: expected true or false")
-        shift = in_range("shift_nats", read_number(values.get("shift_nats"), "shift_nats"), -100.0, 100.0)
-        age = None if pending is None else in_range("pending_s", read_number(pending, "pending_s"), 0.0, 1e9)
-        return cls(shift, age, alarm)
-
     def _shifted(self, budget: AdaptiveBudget, events: float) -> "AdaptiveThreshold":
         shift = self.shift_nats + budget.step_nats * events
         return replace(self, shift_nats=min(max(shift, -budget.most_down_nats), budget.most_up_nats))
-
-
-def _mapping(value: object, name: str) -> Mapping[str, object]:
-    if not isinstance(value, Mapping):
-        raise InvalidArgumentError(f"{name}: expected an object, got {type(value).__name__}")
-    return value

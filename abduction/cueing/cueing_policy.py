@@ -3,20 +3,17 @@
 The threshold of a policy is set in `neyman_pearson`, its map to risk in `risk_map`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_number, read_numbers
 from worldstate.ground.typing import BoolArray, FloatArray
 
 from .adaptive_threshold import AdaptiveBudget
-from .risk_map import RiskMap, risk_map_from_dict
+from .risk_map import RiskMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,45 +135,6 @@ class CueingPolicy:
     def rule(self) -> SustainedRule:
         """Return the sustained rule at its start."""
         return SustainedRule(self.sustain_hops)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "gamma": self.gamma,
-            "sustain_hops": self.sustain_hops,
-            "alpha": self.alpha,
-            "reference_prior": list(self.reference_prior),
-            "risk_map": self.risk_map.to_dict(),
-            "miss_rate": self.miss_rate,
-            "adaptive": None if self.adaptive is None else self.adaptive.to_dict(),
-        }
-
-    @classmethod
-    def from_dict(cls, data: object) -> "CueingPolicy":
-        """Return the policy that `to_dict` wrote; unknown keys are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
-        if not isinstance(data, Mapping):
-            raise InvalidArgumentError("policy: expected an object")
-        adaptive = data.get("adaptive")
-        return cls(
-            gamma=read_number(data.get("gamma"), "gamma"),
-            sustain_hops=_check_sustain_hops(data.get("sustain_hops")),
-            alpha=read_number(data.get("alpha"), "alpha"),
-            reference_prior=read_numbers(data.get("reference_prior"), "reference_prior"),
-            risk_map=risk_map_from_dict(data.get("risk_map")),
-            miss_rate=read_number(data.get("miss_rate"), "miss_rate"),
-            adaptive=None if adaptive is None else AdaptiveBudget.from_dict(adaptive),
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,33 +1,19 @@
 """Calibrated risk: monotone maps from the statistic to the frequency of a hidden hazard."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, overload
+from typing import ClassVar, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_number, read_numbers
+from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import BoolArray, FloatArray
 
 from .platt import fit_sigmoid, sigmoid
 
 SMALL_SAMPLE = 200
-
-
-class RiskMap(Protocol):
-    """A monotone map of the statistic into [0, 1]."""
-
-    @overload
-    def __call__(self, statistic: float) -> float: ...
-    @overload
-    def __call__(self, statistic: FloatArray) -> FloatArray: ...
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +25,8 @@ class IsotonicMap:
     >>> IsotonicMap((0.2, 0.6), (0.0, 1.0))(0.3).__round__(3)
     0.25
     """
+
+    LAYOUT: ClassVar = Layout(constants={"kind": "isotonic"})
 
     statistics: tuple[float, ...]  # Knots, not falling
     risks: tuple[float, ...]  # Risk at each knot, in [0, 1], not falling
@@ -60,10 +48,6 @@ class IsotonicMap:
         risk = np.interp(statistic, self.statistics, self.risks)
         return float(risk) if np.ndim(statistic) == 0 else risk
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {"kind": "isotonic", "statistics": list(self.statistics), "risks": list(self.risks)}
-
 
 @dataclass(frozen=True, slots=True)
 class PlattMap:
@@ -76,6 +60,8 @@ class PlattMap:
     >>> PlattMap(-1.0, 0.0)(0.3).__round__(3)
     0.3
     """
+
+    LAYOUT: ClassVar = Layout(constants={"kind": "platt"})
 
     slope: float  # a, not positive
     offset: float  # b
@@ -94,9 +80,8 @@ class PlattMap:
         risk = sigmoid(_logit(np.asarray(statistic, dtype=np.float64)), self.slope, self.offset)
         return float(risk) if np.ndim(statistic) == 0 else risk
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {"kind": "platt", "slope": self.slope, "offset": self.offset}
+
+RiskMap: TypeAlias = IsotonicMap | PlattMap
 
 
 def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
@@ -186,25 +171,6 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
     """
     worth = np.size(statistics) if independent is None else independent
     return fit_platt(statistics, hazards) if worth < SMALL_SAMPLE else fit_isotonic(statistics, hazards)
-
-
-def risk_map_from_dict(data: object) -> RiskMap:
-    """Return the map that `to_dict` wrote.
-
-    Examples
-    --------
-    >>> risk_map_from_dict({"kind": "platt", "slope": -1.0, "offset": 0.0})
-    PlattMap(slope=-1.0, offset=0.0)
-    """
-    if not isinstance(data, Mapping):
-        raise InvalidArgumentError("risk_map: expected an object")
-    kind = data.get("kind")
-    if kind == "isotonic":
-        knots = read_numbers(data.get("statistics"), "statistics")
-        return IsotonicMap(knots, read_numbers(data.get("risks"), "risks"))
-    if kind == "platt":
-        return PlattMap(read_number(data.get("slope"), "slope"), read_number(data.get("offset"), "offset"))
-    raise InvalidArgumentError("risk_map: expected kind isotonic or platt")
 
 
 def _logit(statistic: FloatArray) -> FloatArray:

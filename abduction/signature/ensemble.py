@@ -9,17 +9,17 @@ over experts and over the window and its mirror image, sides exchanged:
 so that mirroring the world exchanges left and right to the bit.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from operator import attrgetter
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import finite_array
+from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_numbers
+from worldstate.ground.serialisation import Layout, Via
 from worldstate.ground.typing import FloatArray
 
 from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
@@ -37,7 +37,6 @@ from .published_signature import (
 from .site_reference import KINDS, SiteReference, log_levels
 
 MOST_EXPERTS = 32
-KIND = "ensemble"
 MIRRORED_CLASSES = [{LEFT: RIGHT, RIGHT: LEFT}.get(column, column) for column in range(len(CLASSES))]
 
 
@@ -70,22 +69,19 @@ class EnsembleModel:
     array([[0.25, 0.25, 0.25, 0.25]])
     """
 
+    LAYOUT: ClassVar = Layout(constants={"kind": "ensemble", "classes": list(CLASSES)})
+
     experts: tuple[Expert, ...]
     class_prior: FloatArray
-    home: SiteReference
+    home: Annotated[SiteReference, Via(FloatArray, attrgetter("row"), SiteReference.from_row)]
     empty: FloatArray
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
             raise InvalidArgumentError(f"experts: expected 1 to {MOST_EXPERTS}, got {len(self.experts)}")
-        prior = finite_array("class_prior", self.class_prior, (len(CLASSES),)).copy()
-        if (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
+        freeze_arrays(self, class_prior=(len(CLASSES),), empty=(self.n_features,))
+        if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
-        prior.flags.writeable = False
-        object.__setattr__(self, "class_prior", prior)
-        empty = finite_array("empty", self.empty, (self.n_features,)).copy()
-        empty.flags.writeable = False
-        object.__setattr__(self, "empty", empty)
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
         views = expert_views(VIEWS, self.home.mean[None], self.home.row[None])
@@ -192,43 +188,6 @@ class EnsembleModel:
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values; reading them back gives the same model to the bit."""
-        return {
-            "kind": KIND,
-            "classes": list(CLASSES),
-            "class_prior": self.class_prior.tolist(),
-            "home": self.home.row.tolist(),
-            "empty": self.empty.tolist(),
-            "experts": [expert.to_dict() for expert in self.experts],
-        }
-
-    @classmethod
-    def from_dict(cls, data: object) -> "EnsembleModel":
-        """Return the model that `to_dict` wrote; unknown keys are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
-        if not isinstance(data, Mapping) or data.get("classes") != list(CLASSES):
-            raise InvalidArgumentError(f"signature: expected an object of classes {', '.join(CLASSES)}")
-        experts = data.get("experts")
-        if not isinstance(experts, list) or len(experts) > MOST_EXPERTS:
-            raise InvalidArgumentError(f"experts: expected a list of at most {MOST_EXPERTS}")
-        return cls(
-            tuple(Expert.from_dict(expert) for expert in experts),
-            np.array(read_numbers(data.get("class_prior"), "class_prior")),
-            SiteReference.from_row(read_numbers(data.get("home"), "home")),
-            np.array(read_numbers(data.get("empty"), "empty")),
-        )
 
     def _split(self, X: ArrayLike) -> tuple[FloatArray, FloatArray]:
         n_features = self.n_features

@@ -1,14 +1,12 @@
 """One linear expert of an ensemble, and the views of a window that an expert may have."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from worldstate.ground.checks import finite_array
+from worldstate.ground.checks import freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_numbers, read_rows
 from worldstate.ground.typing import FloatArray
 
 from .mirror import SEGMENTS
@@ -41,11 +39,7 @@ class Expert:
         if self.view not in VIEWS:
             raise InvalidArgumentError(f"view: expected one of {', '.join(VIEWS)}, got {self.view!r:.40}")
         inputs = np.size(self.mean)
-        shapes = {"mean": (inputs,), "scale": (inputs,), "weights": (4, inputs), "intercepts": (4,)}
-        for name, shape in shapes.items():
-            value = finite_array(name, getattr(self, name), shape).copy()
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+        freeze_arrays(self, mean=(inputs,), scale=(inputs,), weights=(4, inputs), intercepts=(4,))
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
 
@@ -57,22 +51,6 @@ class Expert:
         Shapes: seen (n, inputs).
         """
         return log_softmax((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        names = ("mean", "scale", "weights", "intercepts")
-        return {"view": self.view} | {name: getattr(self, name).tolist() for name in names}
-
-    @classmethod
-    def from_dict(cls, data: object) -> "Expert":
-        """Return the expert that `to_dict` wrote; unknown keys are ignored."""
-        if not isinstance(data, Mapping):
-            raise InvalidArgumentError("expert: expected an object")
-        rows = read_rows(data.get("weights"), "weights")
-        if len({len(row) for row in rows}) != 1:
-            raise InvalidArgumentError("weights: expected rows of one length")
-        vectors = {k: np.array(read_numbers(data.get(k), k)) for k in ("mean", "scale", "intercepts")}
-        return cls(view=str(data.get("view")), weights=np.array(rows), **vectors)
 
 
 def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:

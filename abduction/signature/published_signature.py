@@ -5,18 +5,17 @@ and the pairs are coupled into posteriors of front, left, none and right. Dividi
 the training set leaves likelihoods, which is what eq. (6) takes.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.cueing.platt import sigmoid
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import finite_array
+from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_numbers, read_rows
+from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import FloatArray
 
 from .pairwise_coupling import class_pairs, couple
@@ -27,7 +26,6 @@ FRONT, LEFT, NONE, RIGHT = range(4)
 # Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
 EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
 PAIRS = len(class_pairs(len(CLASSES)))
-VECTORS = ("mean", "scale", "intercepts", "slopes", "offsets", "class_prior")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +65,8 @@ class SignatureModel:
     array([[0.25, 0.25, 0.25, 0.25]])
     """
 
+    LAYOUT: ClassVar = Layout(constants={"classes": list(CLASSES)})
+
     mean: FloatArray
     scale: FloatArray
     coefficients: FloatArray
@@ -76,20 +76,9 @@ class SignatureModel:
     class_prior: FloatArray
 
     def __post_init__(self) -> None:
-        features = np.size(self.mean)
-        shapes: dict[str, tuple[int, ...]] = {
-            "mean": (features,),
-            "scale": (features,),
-            "coefficients": (PAIRS, features),
-            "intercepts": (PAIRS,),
-            "slopes": (PAIRS,),
-            "offsets": (PAIRS,),
-            "class_prior": (len(CLASSES),),
-        }
-        for name, shape in shapes.items():
-            value = finite_array(name, getattr(self, name), shape).copy()
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+        features, pairs = (np.size(self.mean),), (PAIRS,)
+        freeze_arrays(self, mean=features, scale=features, coefficients=(PAIRS, *features), intercepts=pairs)
+        freeze_arrays(self, slopes=pairs, offsets=pairs, class_prior=(len(CLASSES),))
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
         if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
@@ -196,33 +185,6 @@ class SignatureModel:
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
         return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values; reading them back gives the same model to the bit."""
-        numbers = {name: getattr(self, name).tolist() for name in (*VECTORS, "coefficients")}
-        return {"classes": list(CLASSES)} | numbers
-
-    @classmethod
-    def from_dict(cls, data: object) -> "SignatureModel":
-        """Return the model that `to_dict` wrote; unknown keys are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
-        if not isinstance(data, Mapping) or data.get("classes") != list(CLASSES):
-            raise InvalidArgumentError(f"signature: expected an object of classes {', '.join(CLASSES)}")
-        rows = read_rows(data.get("coefficients"), "coefficients")
-        if len({len(row) for row in rows}) != 1:
-            raise InvalidArgumentError("coefficients: expected rows of one length")
-        vectors = {name: np.array(read_numbers(data.get(name), name)) for name in VECTORS}
-        return cls(coefficients=np.array(rows), **vectors)
 
 
 def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatArray:

@@ -14,16 +14,13 @@ hits at junctions new to a standing ego; a quarter of the level costs none, and 
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.checks import finite_array, freeze_arrays, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_number, read_numbers
 from worldstate.ground.typing import FloatArray
 
 from .ensemble import EnsembleModel
@@ -84,13 +81,11 @@ class SiteEstimate:
     (array([0., 1.]), 0.1)
     """
 
-    level: FloatArray = field()
+    level: FloatArray
     heard_s: float = 0.0
 
     def __post_init__(self) -> None:
-        level = finite_array("level", self.level, (None,)).copy()
-        level.flags.writeable = False
-        object.__setattr__(self, "level", level)
+        freeze_arrays(self, level=(None,))
         in_range("heard_s", self.heard_s, 0.0, math.inf, open_high=True)
 
     @classmethod
@@ -163,26 +158,3 @@ class SiteEstimate:
         level = difference.mean()
         offset = settings.level_gain * level + settings.pattern_gain * (difference - level)
         return model.home.shifted(self.heard_s / (self.heard_s + settings.prior_s) * offset)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values for a checkpoint; reading them back goes on to the bit."""
-        return {"level": self.level.tolist(), "heard_s": self.heard_s}
-
-    @classmethod
-    def from_dict(cls, data: object) -> "SiteEstimate":
-        """Return the estimate that `to_dict` wrote; unknown keys are ignored.
-
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If something is missing, of the wrong type or out of range.
-        """
-        if not isinstance(data, Mapping):
-            raise InvalidArgumentError("site: expected an object")
-        level = np.array(read_numbers(data.get("level"), "level"))
-        return cls(level, read_number(data.get("heard_s"), "heard_s"))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array
+from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
@@ -35,10 +35,7 @@ class SiteReference:
     quiet: FloatArray
 
     def __post_init__(self) -> None:
-        for name in KINDS:
-            value = finite_array(name, getattr(self, name), (np.size(self.mean),)).copy()
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+        freeze_arrays(self, **dict.fromkeys(KINDS, (np.size(self.mean),)))
 
     @property
     def row(self) -> FloatArray:

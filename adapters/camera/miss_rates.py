@@ -16,6 +16,7 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.reading import decode_json
 from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
 
 from .camera_health import CameraHealth, Health
@@ -157,7 +158,7 @@ class MissRates:
             "repeats": self.repeats,
             "health": None if self.health is None else self.health.to_dict(),
             "families": {name: _counts_to_dict(counts) for name, counts in self.families.items()},
-            "table": self.table.to_dict(),
+            "table": encode(self.table),
         }
 
     @classmethod

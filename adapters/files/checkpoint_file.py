@@ -10,6 +10,7 @@ from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.reading import decode_json
+from worldstate.ground.serialisation import decode, encode
 
 from .atomic import write_text
 
@@ -40,7 +41,7 @@ class Checkpoint:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values: the filter's checkpoint with the site beside its memory."""
-        return self.world.to_dict() | {"site": None if self.site is None else self.site.to_dict()}
+        return self.world.to_dict() | {"site": None if self.site is None else encode(self.site)}
 
     @classmethod
     def from_dict(cls, data: object) -> "Checkpoint":
@@ -55,7 +56,7 @@ class Checkpoint:
         """
         world = WorldFilter.from_dict(data)
         site = data.get("site") if isinstance(data, Mapping) else None
-        return cls(world, None if site is None else SiteEstimate.from_dict(site))
+        return cls(world, None if site is None else decode(SiteEstimate, site, "site"))
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:

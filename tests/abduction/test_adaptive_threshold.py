@@ -17,6 +17,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRul
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.core.filter import WorldFilter, uncalibrated_policy
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
@@ -68,8 +69,8 @@ def test_the_false_alarms_counted_keep_the_budget_unless_the_upper_bound_is_met(
 @given(budgets, hops, hops)
 def test_written_and_read_back_it_continues_the_same(budget, first, second):
     state = play(budget, first)[-1]
-    again = AdaptiveThreshold.from_dict(json.loads(json.dumps(state.to_dict())))
-    kept = AdaptiveBudget.from_dict(json.loads(json.dumps(budget.to_dict())))
+    again = decode(AdaptiveThreshold, json.loads(json.dumps(encode(state))), "file")
+    kept = decode(AdaptiveBudget, json.loads(json.dumps(encode(budget))), "file")
     assert (again, kept) == (state, budget)
     assert play(kept, second, again)[-1] == play(budget, second, state)[-1]
 
@@ -142,13 +143,13 @@ def test_numbers_out_of_range_are_refused(bad):
 )  # fmt: skip
 def test_damaged_state_is_refused(damaged):
     with pytest.raises(InvalidArgumentError):
-        AdaptiveThreshold.from_dict(damaged)
+        decode(AdaptiveThreshold, damaged, "file")
     with pytest.raises(InvalidArgumentError):
-        AdaptiveBudget.from_dict(damaged)
-    policy = uncalibrated_policy().to_dict()
+        decode(AdaptiveBudget, damaged, "file")
+    policy = encode(uncalibrated_policy())
     if damaged is not None:
         with pytest.raises(InvalidArgumentError):
-            CueingPolicy.from_dict(policy | {"adaptive": damaged})
+            decode(CueingPolicy, policy | {"adaptive": damaged}, "file")
 
 
 def evidence_at(hop, log_odds, answer):

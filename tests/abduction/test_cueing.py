@@ -16,6 +16,7 @@ from worldstate.abduction.cueing.cueing_policy import (
 from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 
 # Few distinct values, so that ties are common.
 scores = st.sampled_from(np.linspace(0, 1, 9).tolist())
@@ -96,7 +97,7 @@ def test_the_published_rule_takes_the_argmax():
 @pytest.mark.parametrize("risk_map", [IsotonicMap((0.1, 0.9), (0.0, 1.0)), PlattMap(-2.0, 0.3)])
 def test_a_policy_reads_back_what_it_wrote(risk_map):
     policy = CueingPolicy(0.78, 3, 0.02, PRIOR, risk_map, 1.0)
-    assert CueingPolicy.from_dict(policy.to_dict()) == policy
+    assert decode(CueingPolicy, encode(policy), "file") == policy
 
 
 def test_policies_are_found_by_budget():
@@ -126,6 +127,6 @@ def test_policies_are_found_by_budget():
     ],
 )
 def test_damaged_policies_are_refused(change):
-    data = CueingPolicy(0.78, 3, 0.02, PRIOR, PlattMap(-1.0, 0.0)).to_dict()
+    data = encode(CueingPolicy(0.78, 3, 0.02, PRIOR, PlattMap(-1.0, 0.0)))
     with pytest.raises(InvalidArgumentError):
-        CueingPolicy.from_dict(data | change)
+        decode(CueingPolicy, data | change, "file")

@@ -21,6 +21,7 @@ from worldstate.abduction.signature.published_training import (
 )
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 
 
 def windows(rng, n=240, spread=1.3):
@@ -64,8 +65,8 @@ def test_agrees_with_libsvm_on_windows_not_trained_on(trained, libsvm):
 @pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_with_libsvm_s_sigmoids_only_its_tolerance_is_left(trained, libsvm):
     scaler, machine = libsvm
-    numbers = trained[2].to_dict() | {"slopes": machine.probA_.tolist(), "offsets": machine.probB_.tolist()}
-    same = SignatureModel.from_dict(numbers)
+    numbers = encode(trained[2]) | {"slopes": machine.probA_.tolist(), "offsets": machine.probB_.tolist()}
+    same = decode(SignatureModel, numbers, "file")
     X, _ = windows(np.random.default_rng(8), n=1000)
     # libsvm's iteration stops at an error of 0.005 / 4.
     np.testing.assert_allclose(same.predict_proba(X), machine.predict_proba(scaler.transform(X)), atol=5e-3)
@@ -143,12 +144,12 @@ def test_the_mirror_swaps_sides_and_is_its_own_inverse():
 def test_the_same_seed_gives_the_same_model():
     X, y = windows(np.random.default_rng(4))
     first, second = (PublishedClassifier(np.random.default_rng(5)).fit(X, y).model_ for _ in range(2))
-    assert first.to_dict() == second.to_dict()
+    assert encode(first) == encode(second)
 
 
 def test_a_model_reads_back_to_the_bit(trained):
     X, _, model = trained
-    again = SignatureModel.from_dict(model.to_dict())
+    again = decode(SignatureModel, encode(model), "file")
     np.testing.assert_array_equal(again.predict_proba(X), model.predict_proba(X))
 
 

@@ -17,6 +17,7 @@ from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.operations.training.site_references import with_site_references
 
 
@@ -146,13 +147,13 @@ def test_quiet_is_the_mean_of_the_quietest_third():
 
 def test_a_model_reads_back_to_the_bit(trained):
     X, _, model = trained
-    again = EnsembleModel.from_dict(json.loads(json.dumps(model.to_dict(), allow_nan=False)))
+    again = decode(EnsembleModel, json.loads(json.dumps(encode(model), allow_nan=False)), "file")
     np.testing.assert_array_equal(again.predict_proba(X), model.predict_proba(X))
 
 
 def test_nothing_is_drawn(trained):
     X, y, model = trained
-    assert SiteEnsembleClassifier().fit(X, y).model_.to_dict() == model.to_dict()
+    assert encode(SiteEnsembleClassifier().fit(X, y).model_) == encode(model)
 
 
 def test_likelihoods_stay_finite_far_from_all_that_was_seen(trained):

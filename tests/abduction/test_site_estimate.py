@@ -18,6 +18,7 @@ from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.operations.training.feature_evaluation import out_of_fold
 from worldstate.operations.training.methods import site_ensemble
 from worldstate.operations.training.site_references import with_site_references
@@ -81,8 +82,8 @@ def test_a_checkpoint_goes_on_to_the_bit(model):
     first, whole = SiteSignature(model), SiteSignature(model)
     for window in windows[:10]:
         first.evidence(window)
-    saved = json.loads(json.dumps(first.estimate.to_dict(), allow_nan=False))
-    second = SiteSignature(model, estimate=SiteEstimate.from_dict(saved))
+    saved = json.loads(json.dumps(encode(first.estimate), allow_nan=False))
+    second = SiteSignature(model, estimate=decode(SiteEstimate, saved, "file"))
     answers = [whole.evidence(window) for window in windows]
     assert [second.evidence(window) for window in windows[10:]] == answers[10:]
 
@@ -105,7 +106,7 @@ def test_bad_windows_are_refused_and_teach_nothing(model, bad):
 )
 def test_a_damaged_checkpoint_is_refused(data):
     with pytest.raises(InvalidArgumentError):
-        SiteEstimate.from_dict(data)
+        decode(SiteEstimate, data, "file")
 
 
 TABLE = FOLDER and FOLDER / NAME

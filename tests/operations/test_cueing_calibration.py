@@ -20,6 +20,7 @@ from worldstate.abduction.posterior import statistic
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Measurement, Sighting
 from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
@@ -211,7 +212,7 @@ def test_the_command_replaces_the_policies_and_keeps_the_signature(streams_file,
     assert summary["warnings"]
     assert summary["hazard_free_hours"] == pytest.approx(12 * 291 / 36000)
     before, after = read_model(), read_model(out)
-    assert after.signature.to_dict() == before.signature.to_dict()
+    assert encode(after.signature) == encode(before.signature)
     assert {(p.alpha, p.miss_rate) for p in after.policies.policies} == {
         (a, b) for a in (0.01, 0.1) for b in (0.0, 1.0)
     }

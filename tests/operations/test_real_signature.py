@@ -12,6 +12,7 @@ from released_data import TABLE as NAME
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.cli.studies import evaluate_features
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.operations.training.methods import row_of
 from worldstate.operations.training.training import TrainingSettings, train_model
 from worldstate.studies.features.comparison import comparison, run_passes
@@ -121,7 +122,7 @@ def test_no_row_of_the_data_ships_and_the_official_test_recordings_hold():
     figures = report(table.only(ids), [predict_held_out(model, table.only(ids), alpha=0.02)])
     assert figures["accuracy"] >= 0.88
     assert figures["auroc_pooled_absent"] >= 0.975
-    written = {f"{value:.6f}" for value in leaves(model.signature.to_dict())}
+    written = {f"{value:.6f}" for value in leaves(encode(model.signature))}
     for row in np.concatenate([table.features, np.log(table.features)]):
         assert len(written & {f"{value:.6f}" for value in row}) < 10
 

@@ -16,6 +16,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.reading import Record
+from worldstate.ground.serialisation import decode, encode
 from worldstate.state import Priors
 from worldstate.state.entity import ANSWERS
 
@@ -42,7 +43,7 @@ def memory_to_dict(memory: Memory) -> dict[str, Any]:
         "last": [{"source": source, "stamp_ns": stamp_ns} for source, stamp_ns in memory.last_ns],
         "predicted": None if memory.predicted is None else memory.predicted.to_dict(),
         "instant": None if memory.instant is None else _instant_to_dict(memory.instant),
-        "threshold": memory.threshold.to_dict(),
+        "threshold": encode(memory.threshold),
     }
 
 
@@ -63,7 +64,7 @@ def memory_from_record(record: Record, directions: tuple[str, ...], policy: Cuei
         predicted=record.maybe("predicted", lambda key: Priors.from_record(record.record(key))),
         instant=record.maybe("instant", lambda key: _instant_from_record(record.record(key), directions)),
         threshold=_or(
-            record.maybe("threshold", lambda key: AdaptiveThreshold.from_dict(record.record(key).raw)),
+            record.maybe("threshold", lambda key: decode(AdaptiveThreshold, record.record(key).raw, key)),
             AdaptiveThreshold(),
         ),
     )
@@ -85,10 +86,7 @@ def settings_from_record(record: Record) -> FilterSettings:
 
 def policy_from_record(record: Record) -> CueingPolicy:
     """Return the policy that its `to_dict` wrote."""
-    try:
-        return CueingPolicy.from_dict(record.raw)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InvalidArgumentError(f"{record.where}: expected a cueing policy ({error!r})") from error
+    return decode(CueingPolicy, record.raw, record.where)
 
 
 def _trail_to_dict(trail: BeliefLag) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.reading import Record, check_schema
+from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Context, WorldState
@@ -222,7 +223,7 @@ class WorldFilter:
         return {
             "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
             "context": self.context.to_dict(),
-            "policy": self.policy.to_dict(),
+            "policy": encode(self.policy),
             "settings": settings_to_dict(self.settings),
             "start_ns": self.start_ns,
             "memory": memory_to_dict(self._memory),

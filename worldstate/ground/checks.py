@@ -44,6 +44,14 @@ def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None])
         raise InvalidArgumentError(f"{name}: expected shape ({wanted}), got {got}")
 
 
+def freeze_arrays(instance: object, **shapes: Sequence[int | None]) -> None:
+    """Put read-only copies in place of the named arrays of a frozen dataclass, once they are checked."""
+    for name, shape in shapes.items():
+        value = finite_array(name, getattr(instance, name), shape).copy()
+        value.flags.writeable = False
+        object.__setattr__(instance, name, value)
+
+
 def in_range(
     name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False
 ) -> float:
