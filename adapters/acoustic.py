@@ -4,15 +4,13 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from numpy.typing import ArrayLike
-
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel, Side
@@ -32,7 +30,7 @@ class Signature(Protocol):
     0.0
     """
 
-    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+    def evidence(self, feature: FloatArray, /) -> SignatureEvidence:
         """Return log-likelihoods of one feature vector."""
         ...
 

@@ -15,13 +15,22 @@ import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.core.filter import WorldFilter, uncalibrated_policy
-from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
-from worldstate.measurement.measurement import Approach, Bearing, Measurement, Sighting
-from worldstate.measurement.protocols import CoEvidenceChannel
-from worldstate.state import WorldState
+from worldstate import (
+    Absent,
+    Approach,
+    Bearing,
+    CoEvidenceChannel,
+    Measurement,
+    NotUsable,
+    Present,
+    Sighting,
+    SignatureEvidence,
+    Unqueried,
+    WorldFilter,
+    WorldState,
+    nanoseconds,
+    uncalibrated_policy,
+)
 
 DIRECTIONS = ("left", "right")
 
@@ -68,7 +77,7 @@ class Beacon:
     @property
     def azimuth_rad(self) -> float:
         """Claimed azimuth, left positive."""
-        return wrap_angle(math.atan2(self.y_m, self.x_m))
+        return math.atan2(self.y_m, self.x_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +155,7 @@ class BeaconAdapter:
             source=self.source,
         )
 
-    def _ask(self, beacon: Beacon, bearing: Bearing) -> CoEvidence:
+    def _ask(self, beacon: Beacon, bearing: Bearing) -> Absent | Present | Unqueried:
         expected = EXPECTED_LABELS.get(beacon.station, ())
         if self._vision is None or not expected:
             return Unqueried("no camera, or nothing that it should see")
@@ -177,7 +186,7 @@ class ScriptedCamera:
         bearing: Bearing | NotUsable,
         expected_labels: Collection[str] | None = None,
         side: str | None = None,
-    ) -> CoEvidence:
+    ) -> Absent | Present | Unqueried:
         """Answer for ten degrees around the bearing."""
         if isinstance(bearing, NotUsable) or abs(bearing.azimuth_rad) > 0.62:
             # A hidden vehicle is beyond the edge: what could be seen of it stands in line of sight.

@@ -7,11 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.core.filter import WorldFilter
-from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Measurement
+from worldstate import (
+    Absent,
+    Measurement,
+    NotUsable,
+    Present,
+    SignatureEvidence,
+    Unqueried,
+    WorldFilter,
+    nanoseconds,
+)
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beacon.py"
 
@@ -106,12 +111,11 @@ def test_beacons_and_sound_share_one_filter(v2x):
     assert {source for source, _ in both.memory.last_ns} == {"acoustic", "v2x"}
 
 
-def test_the_example_needs_nothing_of_sound_and_reaches_into_no_private_part():
-    tree = ast.parse(EXAMPLE.read_text(encoding="utf-8"))
+@pytest.mark.parametrize("example", ["v2x_beacon.py", "own_loop.py"])
+def test_the_examples_import_from_one_module(example):
+    tree = ast.parse((EXAMPLE.parent / example).read_text(encoding="utf-8"))
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    names = {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
-    assert not any("frontend" in module or "acoustic" in module for module in imported)
-    assert not any(name.startswith("_") for name in names)
+    assert {module for module in imported if module.startswith("worldstate")} == {"worldstate"}
 
 
 def test_it_runs_as_a_program(v2x, capsys):

@@ -1,0 +1,35 @@
+"""The example of a loop of one's own: own array, own detector, own signature model."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_loop.py"
+
+
+@pytest.fixture(scope="module")
+def own_loop():
+    spec = importlib.util.spec_from_file_location("own_loop", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_heard_hidden_on_the_left_then_seen_with_the_same_id(own_loop):
+    at = {state.stamp_ns / 1e9: state for state in own_loop.run()}
+    assert at[1.4].entities == ()
+    (hidden,), (seen,) = at[3.5].entities, at[4.5].entities
+    assert (hidden.status, hidden.direction, seen.status) == ("hidden", "left", "visible")
+    assert hidden.id == seen.id
+    assert at[1.4].risk < 0.5 < 0.9 < at[3.5].risk
+    assert at[4.5].risk < 0.1
+    assert [cue.advisory for cue in at[3.5].cues] == [True, False]
+    assert seen.azimuth_rad == pytest.approx(own_loop.azimuth_at(4.5), abs=0.03)
+
+
+def test_it_prints_states(own_loop, capsys):
+    own_loop.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert "hidden at +" in lines[4]
+    assert "visible at" in lines[-1]
