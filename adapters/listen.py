@@ -17,11 +17,12 @@ from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.array_file import read_array_xml
 from worldstate.adapters.files.model_file import load_model
 from worldstate.core.filter import WorldFilter
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
@@ -126,7 +127,7 @@ def open_source(
     path : path
         Multichannel sound file, or a recording folder in the OVAD layout.
     array : path or MicrophoneArray, optional
-        Acoular XML; the built-in 56-microphone roof array where not given.
+        Acoular XML; that of the data set where not given, OVAD's where it names none.
     detections : path or DetectionLog, optional
         Camera detections per frame; those of the recording folder where not given.
     model : path, optional
@@ -167,7 +168,7 @@ def open_source(
     found = detections if detections is not None else recording and recording.detections_path
     return Source(
         audio_path=recording.audio_path if recording else path,
-        array=_array(array),
+        array=choose_array(path, _array(array), name=array),
         detections=found if found is None or isinstance(found, DetectionLog) else read_detections(found),
         model=signature,
         policy=policies.policies[0] if alpha is None else policies.for_alpha(alpha),
@@ -195,10 +196,10 @@ def _degradation(recording: Recording | None, rates: MissRates | None) -> float 
     return video_degradation(open_video(path), rates) if path.is_file() else 0.0
 
 
-def _array(array: Path | str | MicrophoneArray | None) -> MicrophoneArray:
-    if array is None:
-        return roof_array_56()
-    return array if isinstance(array, MicrophoneArray) else read_array_xml(array)
+def _array(array: Path | str | MicrophoneArray | None) -> MicrophoneArray | None:
+    if array is None or isinstance(array, MicrophoneArray):
+        return array
+    return read_array_xml(array)
 
 
 def listen(path: Path | str, **options: object) -> Iterator[WorldState]:

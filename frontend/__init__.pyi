@@ -8,6 +8,7 @@ from .approach.tone import Tone as Tone
 from .approach.tone import estimate_tone as estimate_tone
 from .array.microphone_array import MicrophoneArray as MicrophoneArray
 from .array.microphone_array import roof_array_56 as roof_array_56
+from .array.ovad_array import ovad_array as ovad_array
 from .bounds.cramer_rao import bearing_crb_rad2 as bearing_crb_rad2
 from .bounds.cramer_rao import delay_crb_s2 as delay_crb_s2
 from .bounds.cramer_rao import radial_speed_crb_m2_s2 as radial_speed_crb_m2_s2

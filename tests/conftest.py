@@ -10,7 +10,7 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.users.demo import simulate_approach
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.ovad_array import ovad_array
 
 # Two processes on two cores beside other work: how long an example takes says nothing of the code.
 settings.register_profile("shared_machine", deadline=None)
@@ -36,5 +36,5 @@ class Approach:
 @pytest.fixture(scope="session")
 def approach(tmp_path_factory) -> Approach:
     root = tmp_path_factory.mktemp("approach")
-    write_array_xml(root / "mics.xml", roof_array_56())
+    write_array_xml(root / "mics.xml", ovad_array())
     return Approach(simulate_approach(root / "recording", seed=1), root / "mics.xml")

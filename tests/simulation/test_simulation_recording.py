@@ -208,7 +208,7 @@ def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp
     write_dataset(tmp_path / "two", wanted, jobs=2, progress=seen.append)
     assert seen == rows
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
-    assert len(files) == 2 * 3 + 2 + 1
+    assert len(files) == 2 * 3 + 2 + 2  # and the log and the array
     for name in files:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 

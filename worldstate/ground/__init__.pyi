@@ -1,6 +1,7 @@
 from .errors import InputFileError as InputFileError
 from .errors import InvalidArgumentError as InvalidArgumentError
 from .errors import MissingExtraError as MissingExtraError
+from .errors import OutOfDomainError as OutOfDomainError
 from .errors import SchemaVersionError as SchemaVersionError
 from .errors import WorldstateError as WorldstateError
 from .values import NotUsable as NotUsable

@@ -13,6 +13,10 @@ class InvalidArgumentError(WorldstateError):
     """An argument has the wrong shape, range or type; the message names it."""
 
 
+class OutOfDomainError(WorldstateError):
+    """An array, a sample rate or a feature is not what a model or a data set was made with."""
+
+
 class InputFileError(WorldstateError):
     """A file is missing, damaged or not what was expected; the message begins with its name."""
 

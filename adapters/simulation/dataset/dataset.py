@@ -14,13 +14,21 @@ import numpy as np
 import soundfile
 
 from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.adapters.datasets.ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, LOG_NAME
+from worldstate.adapters.datasets.ovad_layout import (
+    ARRAY_NAME,
+    AUDIO_NAME,
+    COLUMNS,
+    DETECTION_NAMES,
+    LOG_NAME,
+)
+from worldstate.adapters.files.array_file import read_array_xml, write_array_xml
 from worldstate.adapters.files.atomic import atomic_path, write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
 from worldstate.adapters.simulation.scene.presets import preset
 from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
@@ -63,6 +71,7 @@ def write_dataset(
     root: str | Path,
     settings: DatasetSettings | None = None,
     *,
+    array: MicrophoneArray | None = None,
     jobs: int = 1,
     progress: Callable[[LogRow], None] | None = None,
 ) -> list[LogRow]:
@@ -76,6 +85,8 @@ def write_dataset(
         Folder to write to; made if it is not there. Simulated recordings of the same name are replaced.
     settings : DatasetSettings, optional
         What to write; four recordings of junctions if not given.
+    array : MicrophoneArray, optional
+        What listens; the data set names it in `array.xml`. Default `ovad_array`.
     jobs : int
         Processes, 1 to 256.
     progress : callable, optional
@@ -91,7 +102,7 @@ def write_dataset(
     InvalidArgumentError
         If a number is out of range.
     InputFileError
-        If something that was not simulated stands where a recording would go.
+        If something that was not simulated stands where a recording would go, or recordings of another array.
     MissingExtraError
         If video is wanted and OpenCV is not installed.
     """
@@ -100,7 +111,7 @@ def write_dataset(
     folder = Path(root)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in in_processes(partial(_simulate_one, folder, wanted), wanted.plans(), jobs):
+    for row in in_processes(partial(_simulate_one, folder, wanted, array), wanted.plans(), jobs):
         rows.append(row)
         if progress is not None:
             progress(row)
@@ -114,7 +125,7 @@ def write_recording(
     number: int = 0,
     frames: Iterable[ImageArray] | None = None,
 ) -> LogRow:
-    """Write one recording below `root`, whole or not at all.
+    """Write one recording below `root`, whole or not at all, and the array of the data set beside it.
 
     Parameters
     ----------
@@ -135,12 +146,13 @@ def write_recording(
     Raises
     ------
     InputFileError
-        If something that was not simulated stands there.
+        If something that was not simulated stands there, or the data set is of another array.
     """
     in_range("number", number, 0, 9999)
     row = _log_row(recording, number)
     target = Path(root) / row.folder
     target.parent.mkdir(parents=True, exist_ok=True)
+    _name_array(Path(root) / ARRAY_NAME, recording.array)
     _clear(target)
     with atomic_path(target) as temporary:
         temporary.mkdir()
@@ -172,11 +184,11 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     write_text(Path(root) / LOG_NAME, text.getvalue())
 
 
-def _simulate_one(root: Path, wanted: DatasetSettings, plan: Plan) -> LogRow:
+def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray | None, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
     settings = replace(drawn, preset=preset(wanted.preset))
-    recording = simulate_recording(settings, rng)
+    recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = camera_frames(settings, recording, rng.spawn(1)[0]) if wanted.video else None
     return write_recording(root, recording, plan.number, frames)
@@ -188,6 +200,15 @@ def _log_row(recording: SimulatedRecording, number: int) -> LogRow:
     location = PLACES.index(environment) if environment in PLACES else UNKNOWN_PLACE
     identity = f"{APPROACHES.index(approach) + 1}_{location:02d}_{number:04d}"
     return LogRow(identity, environment, approach, recording.t0_frame)
+
+
+def _name_array(path: Path, array: MicrophoneArray) -> None:
+    if not path.exists():
+        write_array_xml(path, array)
+    elif not np.array_equal(read_array_xml(path).positions_m, array.positions_m):
+        raise InputFileError(
+            path, "expected the array of these recordings; another one needs a folder of its own"
+        )
 
 
 def _clear(target: Path) -> None:

@@ -29,7 +29,8 @@ from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.scatter import scattering
 from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -58,6 +59,8 @@ class SimulatedRecording:
         is unqueried there.
     truth : dict
         Settings, trajectory, line of sight and azimuth per frame; see `truth.describe`.
+    array : MicrophoneArray
+        What listened, in the order of the channels.
     """
 
     audio: Float32Array
@@ -65,6 +68,7 @@ class SimulatedRecording:
     t0_frame: int
     detections: tuple[Frame, ...]
     truth: dict[str, Any]
+    array: MicrophoneArray
 
 
 def simulate_recording(
@@ -83,7 +87,7 @@ def simulate_recording(
     rng : numpy.random.Generator
         Source of randomness; the same state gives the same recording.
     array : MicrophoneArray, optional
-        Default `roof_array_56`; its centre stands 1.7 m above the road.
+        Default `ovad_array`; its centre stands 1.7 m above the road.
 
     Returns
     -------
@@ -98,8 +102,9 @@ def simulate_recording(
     ((28799, 56), 6, 5)
     """
     to_sound, to_camera = rng.spawn(2)
+    array = ovad_array() if array is None else array
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
-        audio = _listen(settings, roof_array_56() if array is None else array, to_sound)
+        audio = _listen(settings, array, to_sound)
     camera, frames = PinholeCamera(), _frame_times(settings)
     seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
     return SimulatedRecording(
@@ -108,6 +113,7 @@ def simulate_recording(
         t0_frame=_t0_frame(settings, frames, seen, camera),
         detections=_detections(settings, seen, frames, camera, to_camera),
         truth=describe(settings, frames, seen, camera),
+        array=array,
     )
 
 

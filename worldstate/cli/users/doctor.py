@@ -47,16 +47,17 @@ def run(arguments: argparse.Namespace) -> int:
     import json
 
     from worldstate.adapters.audio.sound_file import open_audio
+    from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.ovad import Recording
     from worldstate.adapters.files.array_file import read_array_xml
-    from worldstate.frontend.array.microphone_array import roof_array_56
     from worldstate.operations.arrays.array_figure import write_array_figure
 
     from .doctor_report import as_json, as_text
 
     path: Path = arguments.input
     sound = Recording.open(path).audio_path if path.is_dir() else path
-    array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
+    given = None if arguments.array is None else read_array_xml(arguments.array)
+    array = choose_array(path, given, name=arguments.array)
     with open_audio(sound, expect_channels=array.n_microphones, strict=False) as audio:
         health = examine(audio, array, arguments.duration, arguments.duration_error)
         if arguments.json:

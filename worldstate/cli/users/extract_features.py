@@ -43,7 +43,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
     parser.add_argument(
-        "--array", type=Path, metavar="XML", help="microphones (default: the 56-microphone roof array)"
+        "--array", type=Path, metavar="XML", help="microphones (default: array.xml of DATASET, else OVAD's)"
     )
 
 
@@ -51,12 +51,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     import numpy as np
 
+    from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table
     from worldstate.adapters.datasets.feature_table import write_features
     from worldstate.adapters.files.array_file import read_array_xml
-    from worldstate.frontend.array.microphone_array import roof_array_56
 
-    array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
+    given = None if arguments.array is None else read_array_xml(arguments.array)
+    array = choose_array(arguments.dataset, given, name=arguments.array)
     windows, left_out = _windows(arguments)
     features = list(track(extract_features(windows, array), "extracting", len(windows)))
     table = feature_table(windows, features)

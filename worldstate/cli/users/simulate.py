@@ -14,9 +14,10 @@ PRESETS = ("street-5", "street-5-calm")
 DESCRIPTION = """\
 Simulate recordings of a vehicle with a roof array at blind junctions, in the OVAD layout: D/DataLog.csv and
 D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json and truth.json: ways, line of
-sight and time to visible of every vehicle. The ego stands (--static, SA1 to SB3) or drives up to the corner
-and is heard on its own roof (--dynamic, DA1 to DB3; no camera results there, as in OVAD). Every other
-recording is an approach, from the left and from the right in turn; the others are hazard-free.
+sight and time to visible of every vehicle. D/array.xml names the microphones. The ego stands (--static, SA1
+to SB3) or drives up to the corner and is heard on its own roof (--dynamic, DA1 to DB3; no camera results
+there, as in OVAD). Every other recording is an approach, from the left and from the right in turn; the others
+are hazard-free.
 The same seed gives the same bytes, whatever the number of jobs. --video adds what the camera sees,
 ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same.
 
@@ -47,6 +48,12 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     parser.add_argument(
         "--preset", choices=PRESETS, default=PRESETS[0], help="how busy the street is (default: %(default)s)"
     )
+    parser.add_argument(
+        "--array",
+        type=Path,
+        metavar="XML",
+        help="microphones that listen (default: OVAD's); D/array.xml names them",
+    )
     parser.add_argument("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
@@ -55,6 +62,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
+    from worldstate.adapters.files.array_file import read_array_xml
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
@@ -70,7 +78,13 @@ def run(arguments: argparse.Namespace) -> int:
         preset=arguments.preset,
     )
     with progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
-        rows = write_dataset(arguments.out, settings, jobs=arguments.jobs, progress=lambda row: bar.advance())
+        rows = write_dataset(
+            arguments.out,
+            settings,
+            array=None if arguments.array is None else read_array_xml(arguments.array),
+            jobs=arguments.jobs,
+            progress=lambda row: bar.advance(),
+        )
     summary = {
         "out": str(arguments.out),
         "recordings": len(rows),

@@ -16,7 +16,7 @@ from worldstate.adapters.simulation.dataset.recording import SimulatedRecording
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M
 from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
@@ -44,8 +44,8 @@ class _Silent:
 
 
 def run_front_end(recording: SimulatedRecording, name: str = "") -> TwinRecording:
-    """Listen to a recording of the 56-microphone roof array; `TwinRecording.judged` comes after."""
-    array = roof_array_56()
+    """Listen to a recording with its own array; `TwinRecording.judged` comes after."""
+    array = recording.array
     vision = VisionQuery(
         PinholeCamera(), detection_log(recording), line_of_sight=unoccluded_sector(Context())
     )

@@ -20,7 +20,7 @@ from .front_end_run import run_front_end
 from .recording_features import TwinRecording, load_twin, save_twin
 
 # What is heard of a recording depends on this code: a change of it is another number.
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from worldstate.adapters.simulation.dataset.recording import simulate_recording
 from worldstate.adapters.simulation.scene.junction import SITES
 from worldstate.adapters.simulation.scene.presets import Preset, preset
 from worldstate.adapters.simulation.scene.settings import SimulationSettings, draw_settings
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_NFFT,
@@ -41,7 +41,7 @@ DECIMATION = 4
 RATE_HZ = 47_998.0 / DECIMATION
 NFFT = FEATURE_NFFT // DECIMATION
 # Changes whenever a window of the same seed would be another one.
-LAYOUT = 2
+LAYOUT = 3
 ENTRY_S, DURATION_S = 1.65, 3.8
 FRAME_S = 1.0 / FRAME_RATE_HZ
 MAX_PER_CLASS = 1000
@@ -117,7 +117,7 @@ def _cut(audio: Float32Array, start_s: float) -> Float32Array:
 
 def window_feature(samples: Float32Array) -> FloatArray:
     """Compute the published feature of a window at `RATE_HZ`, shape (n, 56) -> (60,)."""
-    bins, array = band_bins(FEATURE_BAND_HZ, RATE_HZ, NFFT), roof_array_56()
+    bins, array = band_bins(FEATURE_BAND_HZ, RATE_HZ, NFFT), ovad_array()
     spectra = scipy.signal.stft(samples, nperseg=NFFT, axis=0)[2][bins.start : bins.stop]
     whitened = whiten(np.ascontiguousarray(spectra.transpose(2, 0, 1), np.complex64))
     length = len(whitened) // FEATURE_SEGMENTS
