@@ -53,9 +53,9 @@ class HopSpectra:
     Examples
     --------
     >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0.1], [0, -0.1, 0]])
-    >>> listener = HopSpectra(array, 48_000, FrontEndSettings())
+    >>> spectra = HopSpectra(array, 48_000, FrontEndSettings())
     >>> hop = np.random.default_rng(0).standard_normal((4800, 3)).astype(np.float32)
-    >>> listener.push(hop).power.shape
+    >>> spectra.push(hop).power.shape
     (181,)
     """
 
@@ -76,7 +76,7 @@ class HopSpectra:
         self._nfft = nfft
         self._n_frames = 0
         self.music = self._music(array.n_microphones, settings)
-        self._unwatched = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
+        self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
 
@@ -90,12 +90,12 @@ class HopSpectra:
         whitened = whiten(spectra, powers)
         energies = self._frame_energies(powers)
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
-        health = self._watch(samples, energies, matrices)
-        quiet = self._whitened(spectra, health.mask)
+        health = self._check_channels(samples, energies, matrices)
+        prewhitened = self._whitened(spectra, health.mask)
         if self.music is not None:
-            self._push_music(self.music, spectra, powers, quiet)
+            self._push_music(self.music, spectra, powers, prewhitened)
         health.mask.silence(whitened)
-        srp, pairs = self._sums(quiet, whitened, matrices, health.mask)
+        srp, pairs = self._sums(prewhitened, whitened, matrices, health.mask)
         centre = self._centre(len(spectra))
         return HopSums(len(spectra), centre, srp, pairs, energies.mean(axis=0), health)
 
@@ -104,9 +104,11 @@ class HopSpectra:
         total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
         return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
 
-    def _watch(self, samples: Float32Array, energies: FloatArray, matrices: Complex64Array) -> ArrayHealth:
+    def _check_channels(
+        self, samples: Float32Array, energies: FloatArray, matrices: Complex64Array
+    ) -> ArrayHealth:
         if self.monitor is None:
-            return self._unwatched
+            return self._unmonitored
         return self.monitor.push(samples, energies, matrices)
 
     def _whitened(self, spectra: Complex64Array, mask: ChannelMask) -> list[Steered]:
@@ -114,29 +116,33 @@ class HopSpectra:
         if self.ego_noise is None:
             return []
         mask.silence(spectra)
-        quiet = self.ego_noise.process(spectra)
-        for heard, _ in quiet:
+        prewhitened = self.ego_noise.process(spectra)
+        for heard, _ in prewhitened:
             mask.silence(heard)
-        return quiet
+        return prewhitened
 
     def _push_music(
-        self, music: MusicStage, spectra: Complex64Array, powers: Float32Array, quiet: list[Steered]
+        self, music: MusicStage, spectra: Complex64Array, powers: Float32Array, prewhitened: list[Steered]
     ) -> None:
         """MUSIC hears raw spectra, or whitened ones at the level of the raw ones."""
-        if not quiet or quiet[0][1] is self._beams:
+        if not prewhitened or prewhitened[0][1] is self._beams:
             music.push(spectra[:, self._srp])
         else:
-            heard, beams = quiet[0]
+            heard, beams = prewhitened[0]
             level = np.sqrt(powers[:, self._srp].mean(axis=2, keepdims=True))
             music.push(heard * level, beams)
 
     def _sums(
-        self, quiet: list[Steered], whitened: Complex64Array, matrices: Complex64Array, mask: ChannelMask
+        self,
+        prewhitened: list[Steered],
+        whitened: Complex64Array,
+        matrices: Complex64Array,
+        mask: ChannelMask,
     ) -> tuple[FloatArray, Complex128Array]:
         """Steered power and pair sums of one hop, as of all microphones."""
-        srp = quiet[0] if quiet else (whitened[:, self._srp], self._beams)
-        if len(quiet) > 1:
-            pairs = pair_sum(*quiet[1])
+        srp = prewhitened[0] if prewhitened else (whitened[:, self._srp], self._beams)
+        if len(prewhitened) > 1:
+            pairs = pair_sum(*prewhitened[1])
         else:
             pairs = pair_sum_of(mask.cross(matrices), self._feature_beams)
         power = steered_power(*srp) * mask.power_scale
@@ -171,9 +177,9 @@ class HopSpectra:
         heard = bins[part]
         engine = HarmonicCanceller(heard, sample_rate_hz, nfft, harmonics=chosen.harmonics)
         frequencies, speed = bin_frequencies_hz(heard, sample_rate_hz, nfft), settings.speed_of_sound_m_s
-        judge = ElevationSplit.of(array, frequencies, speed) if chosen.only_from_below else None
+        split = ElevationSplit.of(array, frequencies, speed) if chosen.only_below_horizon else None
         frames_per_s = 2.0 * sample_rate_hz / nfft
-        return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, judge)
+        return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, split)
 
     def _centre(self, n_new: int) -> float:
         """Middle of the new frames; frame t covers samples t N/2 .. t N/2 + N."""

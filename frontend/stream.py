@@ -92,10 +92,10 @@ class FrontEnd:
         self._azimuths = settings.azimuths_rad()
         self._elevations = settings.elevations_rad()
         self._azimuths.flags.writeable = self._elevations.flags.writeable = False
-        self._ambiguity, self._twin = array.ambiguity, mirror_reflection(array)
+        self._ambiguity, self._mirror = array.ambiguity, mirror_reflection(array)
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
         with one_blas_thread():
-            self._listener = HopSpectra(array, self.sample_rate_hz, settings)
+            self._spectra = HopSpectra(array, self.sample_rate_hz, settings)
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._tone = self._tone_stage()
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
@@ -124,13 +124,13 @@ class FrontEnd:
         """
         samples = self._checked(block)
         self._n_taken += len(samples)
-        if captured_ns is not None and self._listener.monitor is not None:
-            self._listener.monitor.clock.read(self._n_taken, captured_ns)
-        frames = (self._hear(hop) for hop in self._cutter.cut(samples))
+        if captured_ns is not None and self._spectra.monitor is not None:
+            self._spectra.monitor.clock.read(self._n_taken, captured_ns)
+        frames = (self._process_hop(hop) for hop in self._cutter.cut(samples))
         return [frame for frame in frames if frame is not None]
 
     def learn_ego_noise(self, none_probability: float) -> None:
-        """Say how likely it is that no source is there, so that what is heard is the own vehicle's noise.
+        """Say how likely it is that no source is there, so that what is got is the own vehicle's noise.
 
         It holds for every hop that ends from now on, until told otherwise; before the first call nothing is
         learned and nothing changes. A caller with a filter passes its posterior of "none" after every
@@ -172,9 +172,9 @@ class FrontEnd:
             engine.follow(fundamental_hz, tolerance)
 
     def _ego_noise(self) -> EgoNoise:
-        if self._listener.ego_noise is None:
+        if self._spectra.ego_noise is None:
             raise InvalidArgumentError("settings.ego_noise: expected EgoNoiseSettings, got None")
-        return self._listener.ego_noise
+        return self._spectra.ego_noise
 
     def _checked(self, block: ArrayLike) -> Float32Array:
         try:
@@ -201,9 +201,9 @@ class FrontEnd:
                 f"block: expected finite numbers up to {_LOUDEST:g}, got others in channels {channels}"
             )
 
-    def _hear(self, hop: Hop) -> AcousticFrame | None:
+    def _process_hop(self, hop: Hop) -> AcousticFrame | None:
         with one_blas_thread():
-            self._hops.append(self._listener.push(hop.samples))
+            self._hops.append(self._spectra.push(hop.samples))
             levels = self._meter.push(hop.samples, self._keep)
             if self._tone is not None:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
@@ -227,7 +227,7 @@ class FrontEnd:
             elevation_rad=self._elevation_rad(recent, bearing.azimuth_rad),
             peaks=peaks,
             ambiguity=self._ambiguity,
-            mirror_bearing_rad=mirror_azimuth_rad(self._twin, bearing.azimuth_rad),
+            mirror_bearing_rad=mirror_azimuth_rad(self._mirror, bearing.azimuth_rad),
             music=self._music(),
             band_log_energy=levels,
             looming=self._looming(hop.end),
@@ -250,7 +250,7 @@ class FrontEnd:
         hops = self._last(n_hops)
         total = np.sum([hop.power for hop in hops], axis=0)
         n_frames = sum(hop.n_frames for hop in hops)
-        power = normalised(total, n_frames, len(self._listener.srp_bins), self.array.n_microphones)
+        power = normalised(total, n_frames, len(self._spectra.srp_bins), self.array.n_microphones)
         return power.reshape(len(self._elevations), len(self._azimuths))
 
     def _elevation_rad(self, spectrum: FloatArray, azimuth_rad: float) -> float:
@@ -261,9 +261,9 @@ class FrontEnd:
         return find_peaks(column, self._elevations, max_peaks=1)[0].azimuth_rad
 
     def _music(self) -> MusicReading | NotUsable:
-        if self._listener.music is None:
+        if self._spectra.music is None:
             return _MUSIC_IS_OFF
-        return self._listener.music.read(self._hops[-1].health.mask)
+        return self._spectra.music.read(self._hops[-1].health.mask)
 
     def _tone_stage(self) -> ToneStage | None:
         chosen = self.settings
@@ -284,7 +284,7 @@ class FrontEnd:
         hops = self._last(self.settings.window_hops)
         length = len(hops) // FEATURE_SEGMENTS
         segments = [hops[i * length : (i + 1) * length] for i in range(FEATURE_SEGMENTS)]
-        n_bins, n_microphones = len(self._listener.feature_bins), self.array.n_microphones
+        n_bins, n_microphones = len(self._spectra.feature_bins), self.array.n_microphones
         return np.concatenate(
             [
                 segment_feature([h.pairs for h in s], sum(h.n_frames for h in s), n_bins, n_microphones)
@@ -296,7 +296,7 @@ class FrontEnd:
         settings = self.settings
         hops = self._last(settings.looming_hops)
         if len(hops) < settings.looming_hops:
-            return NotUsable(f"needs {settings.looming_hops} hops, heard {len(hops)}")
+            return NotUsable(f"needs {settings.looming_hops} hops, got {len(hops)}")
         # The same microphones throughout: one that fails within the window makes no step.
         keep = self._keep if self._keep.any() else slice(None)
         energies = np.array([hop.energies for hop in hops])[:, keep].mean(axis=1)

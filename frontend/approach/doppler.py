@@ -1,13 +1,12 @@
-r"""Radial speed from the Doppler shift of an engine line, where Doppler is usable at all.
+r"""Radial speed from the Doppler shift of an engine line, where it is identifiable.
 
 .. math:: f_r = f_0 / (1 + v_r / c), \qquad v_r > 0 \text{ receding},
 
-on the receiver's clock, v_r being that of the emission (retarded time). The frequency at rest f_0 of an
-unknown vehicle is unknown, and the engine's speed wanders: a change of the line proves nothing by itself. It
-is therefore read as Doppler only if the S-curve of a straight pass-by explains it, better than a line at rest
-and better than a smoothly drifting engine, to within the measured variance, if the harmonics agree, and if
-the line grows louder and fainter as the range of that pass-by says. In all other cases the answer is
-`NotUsable`.
+on the receiver's clock, with v_r at the time of emission. The frequency at rest f_0 of an unknown vehicle is
+unknown, and the speed of its engine varies: a change of the line by itself is no evidence of motion. It is
+read as Doppler only if the S-curve of a straight pass-by explains it better than a constant line and better
+than a smoothly drifting engine, to within the measured variance, if the harmonics agree, and if the level
+follows the range of that pass-by. In all other cases the result is `NotUsable`.
 """
 
 from dataclasses import dataclass
@@ -25,49 +24,49 @@ from worldstate.ground.values import NotUsable
 from .engine_line import HarmonicTrack
 from .pass_by import PARAMETERS, PassBy, fit_pass_by, radial_speed_gradient, radial_speed_m_s
 
-# A drifting engine: up to a cubic in time, which has as many parameters as the S-curve.
+# A drifting engine: polynomials up to a cubic, which has as many parameters as the S-curve and so is a fair
+# rival.
 DRIFT_DEGREES = (1, 2, 3)
-# A smaller change of level than this says nothing.
+# With a smaller change of the expected level the test of the level has no power: engines vary by as much.
 LEAST_SWING_DB = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class DopplerSettings:
-    """When Doppler counts as usable.
+    """Conditions under which a Doppler shift is accepted.
 
     Examples
     --------
-    >>> DopplerSettings(min_lines=3).min_lines
+    >>> DopplerSettings(min_partials=3).min_partials
     3
     """
 
-    min_windows: int = 12  # Fewest windows in the track
+    min_windows: int = 12  # Fewest windows in the track: three for each parameter of the S-curve
     min_share: float = 0.6  # Least share of windows in which the line was found
-    # Fewest harmonics (median over windows); with 1 a single tone will do and their agreement is not
-    # tested.
-    min_lines: int = 1
+    # Fewest harmonics (median over windows); with 1 a single tone is accepted, without a check of agreement.
+    min_partials: int = 1
     # Largest median reduced chi-squared of the harmonics against one fundamental.
     max_disagreement: float = 4.0
-    # Relative standard deviation added to every frequency: what even a steady engine does.
+    # Relative standard deviation added to every frequency: the jitter of even a steady engine.
     relative_floor: float = 3e-4
-    min_gain: float = 10.0  # By how much the S-curve's BIC must beat each rival's
+    min_gain: float = 10.0  # Least difference in BIC to each rival; 10 is "very strong" on the usual scale
     max_misfit: float = 4.0  # Largest reduced chi-squared of the S-curve
     # Slope of the line's level against -20 log10 of the fitted range, 1 in free field, where that range
     # changes by 3 dB or more. An engine that slows down at the kerb keeps its level.
     min_level_gain: float = 0.4
     max_level_gain: float = 2.5
-    # Least correlation of the two under the same condition. A gain in (-inf, inf) and a correlation of -1
-    # skip the test.
+    # Least correlation of the two under the same condition; a gain in (-inf, inf) and a correlation of -1
+    # switch the test off.
     min_level_correlation: float = 0.8
     max_std_m_s: float = 1.0  # Largest standard deviation of the radial speed (median over the track)
-    # Fastest vehicle. An engine that runs down while its vehicle passes reads as a faster one: in town, set
-    # what is driven there.
+    # Highest speed. An engine whose speed falls during the pass-by looks like a faster vehicle: in town, set
+    # the speed that is driven there.
     max_speed_m_s: float = 40.0
 
     def __post_init__(self) -> None:
         in_range("min_windows", self.min_windows, PARAMETERS + 2, np.inf)
         in_range("min_share", self.min_share, 0.0, 1.0)
-        in_range("min_lines", self.min_lines, 1, np.inf)
+        in_range("min_partials", self.min_partials, 1, np.inf)
         in_range("max_disagreement", self.max_disagreement, 0.0, np.inf, open_low=True)
         in_range("relative_floor", self.relative_floor, 0.0, 0.1)
         in_range("min_gain", self.min_gain, 0.0, np.inf)
@@ -78,20 +77,23 @@ class DopplerSettings:
 
 @dataclass(frozen=True, slots=True)
 class RadialSpeed:
-    """Radial speed of one vehicle over its track.
+    r"""Radial speed of one vehicle over its track.
+
+    .. math:: v_r(t) = \frac{d}{dt} |p(t)| \quad \text{at emission, positive while receding}
 
     Parameters
     ----------
-    time_s : (K,) float
-        Receiver's clock, as in the track.
-    radial_speed_m_s : (K,) float
-        v_r at emission, positive while receding.
-    variance_m2_s2 : (K,) float
-        Its variance, from the fit.
+    time_s : ndarray, shape (K,)
+        Receiver's clock, as in the track, seconds.
+    radial_speed_m_s : ndarray, shape (K,)
+        v_r at emission, m/s, positive while receding.
+    variance_m2_s2 : ndarray, shape (K,)
+        Its variance from the fit, (m/s) squared.
     rest_frequency_hz : float
-        f_0.
+        f_0, Hz.
     speed_m_s, closest_range_m, closest_time_s : float
-        v and d of the straight pass-by, and when its closest point is heard (receiver's clock).
+        Speed v (m/s) and smallest range d (m) of the straight pass-by, and the time (s) at which the sound of
+        the closest point arrives.
     misfit : float
         Reduced chi-squared of the S-curve.
 
@@ -118,44 +120,41 @@ def radial_speed(
     *,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> RadialSpeed | NotUsable:
-    r"""Read the radial speed off a tracked engine line, or say why it cannot be read.
+    r"""Estimate the radial speed from a tracked engine line, or return the reason why it is not identifiable.
 
-    The S-curve (f_0, v, tau_0, d) is compared with a line at rest and with engines that drift as a
-    polynomial, by
+    The S-curve with k = 4 parameters (f_0, v, tau_0, d) is compared with a constant line and with polynomial
+    drifts over the K windows by
 
-    .. math:: \mathrm{BIC} = \chi^2 + k \ln K.
+    .. math:: f_r = \frac{f_0}{1 + v_r / c}, \qquad \mathrm{BIC} = \chi^2 + k \ln K.
 
     Parameters
     ----------
     track : HarmonicTrack
         From `worldstate.frontend.approach.engine_line.track_fundamental`.
     settings : DopplerSettings, optional
-        When to answer.
+        Conditions under which the shift is accepted.
     speed_of_sound_m_s : float
-        c.
+        c, m/s.
 
     Returns
     -------
     RadialSpeed or NotUsable
-        The reason is one of: too few windows, too few harmonics, harmonics that disagree, a line that does
-        not move, one that drifts as well without Doppler, one that wanders more than any S-curve, or too
-        large a variance.
+        The reason is one of: too few windows, too few harmonics, harmonics that disagree, a constant line, a
+        line explained as well by drift, a line that no S-curve explains, a level that does not follow the
+        range, or too large a variance.
 
     Raises
     ------
     InvalidArgumentError
         If the track is not finite or its arrays differ in length.
 
-    Notes
-    -----
-    An engine whose speed falls along an S-curve while its vehicle passes reads as a faster vehicle: line and
-    level alone cannot tell the two apart (5 of 100 simulated run-downs by 10 % within a passage, none of 100
-    at the kerb).
+    Notes ----- An engine whose speed falls along an S-curve during the pass-by is read as a faster vehicle:
+    line and level cannot distinguish the two (5 of 100 simulated decelerations by 10 % within a passage, none
+    of 100 at the kerb).
 
-    References
-    ----------
-    "Evidence of Absence", section IV; the S-curve: see `pass_by`; BIC: G. Schwarz, "Estimating the
-    dimension of a model", Ann. Statist. 6, 1978.
+    References ---------- "Evidence of Absence", section IV; P. M. Morse and K. U. Ingard, *Theoretical
+    Acoustics*, 1968, section 11.2 (the S-curve); G. Schwarz, "Estimating the dimension of a model", Ann.
+    Statist. 6, 1978 (BIC).
 
     Examples
     --------
@@ -171,9 +170,9 @@ def radial_speed(
     """
     chosen = settings or DopplerSettings()
     time, frequency, variance = _checked(track)
-    poor = _too_poor(track, chosen)
-    if poor is not None:
-        return poor
+    insufficient = _insufficient(track, chosen)
+    if insufficient is not None:
+        return insufficient
     std = np.sqrt(variance + (chosen.relative_floor * frequency) ** 2)
     fit = fit_pass_by(time, frequency, std, chosen.max_speed_m_s, speed_of_sound_m_s)
     rejected = _rejected(time, frequency, std, fit, chosen)
@@ -197,7 +196,7 @@ def radial_speed_from_rest(
     *,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Radial speed and its variance where the frequency at rest is known.
+    r"""Estimate the radial speed and its variance where the frequency at rest is known.
 
     .. math:: v_r = c\,(f_0 / f - 1), \qquad
               \mathrm{var}(v_r) = (c / f)^2 \big[\mathrm{var}(f_0) + (f_0 / f)^2\,\mathrm{var}(f)\big]
@@ -205,21 +204,21 @@ def radial_speed_from_rest(
     Parameters
     ----------
     frequency_hz, variance_hz2 : array_like, same shape
-        Received line and its variance.
+        Received frequency, Hz, > 0, and its variance, Hz squared.
     rest_frequency_hz, rest_variance_hz2 : float
-        f_0 > 0 and its variance.
+        f_0, Hz, > 0, and its variance, Hz squared.
     speed_of_sound_m_s : float
-        c.
+        c, m/s.
 
     Returns
     -------
-    radial_speed_m_s, variance_m2_s2 : float arrays
-        Positive while receding.
+    radial_speed_m_s, variance_m2_s2 : ndarray
+        m/s, positive while receding, and (m/s) squared; of the shape of `frequency_hz`, at least 1-D.
 
     Raises
     ------
     InvalidArgumentError
-        On values out of range.
+        On other shapes, numbers that are not finite, or values out of range.
 
     References
     ----------
@@ -246,7 +245,7 @@ def _checked(track: HarmonicTrack) -> tuple[FloatArray, FloatArray, FloatArray]:
     time = finite_array("time_s", track.time_s, (None,))
     frequency = finite_array("frequency_hz", track.frequency_hz, time.shape)
     variance = finite_array("variance_hz2", track.variance_hz2, time.shape)
-    finite_array("lines", track.lines, time.shape)
+    finite_array("n_partials", track.n_partials, time.shape)
     finite_array("misfit", track.misfit, time.shape)
     finite_array("level_db", track.level_db, time.shape)
     if np.any(frequency <= 0) or np.any(variance < 0) or np.any(np.diff(time) <= 0):
@@ -254,13 +253,13 @@ def _checked(track: HarmonicTrack) -> tuple[FloatArray, FloatArray, FloatArray]:
     return time, frequency, variance
 
 
-def _too_poor(track: HarmonicTrack, settings: DopplerSettings) -> NotUsable | None:
+def _insufficient(track: HarmonicTrack, settings: DopplerSettings) -> NotUsable | None:
     found = len(track.time_s)
     if found < settings.min_windows or found < settings.min_share * track.windows:
         return NotUsable(f"no stable line: found in {found} of {track.windows} windows")
-    lines = float(np.median(track.lines))
-    if lines < settings.min_lines:
-        return NotUsable(f"{lines:g} harmonics, fewer than {settings.min_lines}")
+    count = float(np.median(track.n_partials))
+    if count < settings.min_partials:
+        return NotUsable(f"{count:g} harmonics, fewer than {settings.min_partials}")
     disagreement = float(np.median(track.misfit))
     if disagreement > settings.max_disagreement:
         return NotUsable(f"the harmonics disagree: reduced chi-squared {disagreement:.1f}")
@@ -270,7 +269,7 @@ def _too_poor(track: HarmonicTrack, settings: DopplerSettings) -> NotUsable | No
 def _rejected(
     time: FloatArray, frequency: FloatArray, std: FloatArray, fit: PassBy, settings: DopplerSettings
 ) -> NotUsable | None:
-    """Return the reason why the S-curve is not the explanation, if there is one."""
+    """Return the reason for which the S-curve is rejected, if there is one."""
     price = np.log(len(time))
     curve = fit.chi_squared + PARAMETERS * price
     at_rest = _polynomial_chi_squared(time, frequency, std, 0) + price
@@ -293,15 +292,15 @@ def _polynomial_chi_squared(time: FloatArray, frequency: FloatArray, std: FloatA
 
 
 def _wrong_level(level_db: FloatArray, speed: RadialSpeed, settings: DopplerSettings) -> NotUsable | None:
-    """Return the reason if the loudness of the line does not follow the range of the pass-by."""
+    """Return the reason if the level of the line does not follow the range of the pass-by."""
     emission = speed.time_s - speed.closest_time_s
     expected = -20.0 * np.log10(np.hypot(speed.closest_range_m, speed.speed_m_s * emission))
     if np.ptp(expected) < LEAST_SWING_DB:
         return None
     centred = expected - expected.mean()
-    heard = level_db - level_db.mean()
-    gain = float(centred @ heard / (centred @ centred))
-    correlation = gain * float(np.linalg.norm(centred) / max(np.linalg.norm(heard), np.finfo(float).tiny))
+    measured = level_db - level_db.mean()
+    gain = float(centred @ measured / (centred @ centred))
+    correlation = gain * float(np.linalg.norm(centred) / max(np.linalg.norm(measured), np.finfo(float).tiny))
     follows = settings.min_level_gain <= gain <= settings.max_level_gain
     if follows and correlation >= settings.min_level_correlation:
         return None

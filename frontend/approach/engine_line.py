@@ -1,11 +1,9 @@
-r"""The fundamental of an engine line over time, from its whole comb of harmonics.
+r"""Track the fundamental of an engine from its harmonics.
 
-Three steps: the comb scores every candidate in every window and the most evident track is taken (`comb`);
-each tooth's frequency is measured along that track (`lines`); all teeth are combined into a fundamental with
-its variance. Their reduced chi-squared is the harmonic-consistency check: near one if the lines are multiples
-of one fundamental.
-
-Sources: at the head of `comb` and `lines`.
+Three steps: the harmonic sum scores every candidate in every window and the most evident track is taken
+(`harmonic_sum`); the frequency of each partial is measured along that track (`partials`); all partials are
+combined into the fundamental with its variance. Their reduced chi-squared is the harmonic-consistency check:
+near one if the partials are multiples of one fundamental.
 """
 
 from dataclasses import dataclass
@@ -23,7 +21,7 @@ from .partials import Fundamental, Windows, measure_fundamental
 
 __all__ = ["HarmonicSettings", "HarmonicTrack", "track_fundamental"]
 
-# Each pass measures along the track, and the slope, of the one before.
+# Each pass measures along the track and the slope of the one before; a fourth changes nothing visible.
 PASSES = 3
 # Longest signal at one call: an hour at 48 kHz is 1.7e8 samples.
 MAX_SAMPLES = 200_000_000
@@ -31,7 +29,7 @@ MAX_SAMPLES = 200_000_000
 
 @dataclass(frozen=True, slots=True)
 class HarmonicTrack:
-    """A fundamental over time; windows without a usable tooth are left out.
+    """Fundamental over time; windows without a usable partial are left out.
 
     Examples
     --------
@@ -42,47 +40,50 @@ class HarmonicTrack:
 
     time_s: FloatArray  # Centre of each window from the first sample, on the receiver's clock
     frequency_hz: FloatArray  # Fundamental
-    variance_hz2: FloatArray  # Of the fundamental, from the SNR of its teeth, widened where they disagree
-    lines: IndexArray  # Teeth that entered
-    # Reduced chi-squared of harmonic consistency; 0 with a single tooth, which proves nothing.
+    variance_hz2: (
+        FloatArray  # Of the fundamental, from the SNR of its partials, increased where they disagree
+    )
+    n_partials: IndexArray  # Number of partials used
+    # Reduced chi-squared of harmonic consistency; 0 with a single partial, which has no check.
     misfit: FloatArray
-    level_db: FloatArray  # Power of all teeth, 10 log10, relative to samples of unit mean square
-    windows: int  # Number of windows looked at; K of them could be used
+    level_db: FloatArray  # Power of all partials, 10 log10, relative to samples of unit mean square
+    windows: int  # Number of windows analysed, K of them usable
 
 
 def track_fundamental(
     samples: ArrayLike, sample_rate_hz: float, settings: HarmonicSettings | None = None
 ) -> HarmonicTrack:
-    r"""Track the fundamental of the strongest harmonic comb in one channel.
+    r"""Track the fundamental of the strongest harmonic series in one channel.
 
     .. math:: f^{(0)} = \arg\max_{f_1 .. f_K} \sum_k Q_k(f_k), \qquad
               f_k = \frac{\sum_h h f_{k,h} / \sigma_{k,h}^2}{\sum_h h^2 / \sigma_{k,h}^2}
 
-    with the evidence Q of `comb.best_path` and the teeth f_h of `lines.measure_fundamental`.
+    with the evidence :math:`Q_k(f) = \sum_h [\ln(1 + P_k(h f) / \nu_k(h f)) - q]` of the harmonics over the
+    noise floor :math:`\nu` and the frequencies :math:`f_{k,h}` of the partials with variances
+    :math:`\sigma_{k,h}^2`.
 
     Parameters
     ----------
-    samples : (n,) float
+    samples : array_like, shape (n,)
         One microphone or one beam, at least one window long.
     sample_rate_hz : float
-        At least three times the highest tooth.
+        Samples per second, at least three times the highest partial.
     settings : HarmonicSettings, optional
-        Defaults suit a car's engine.
+        Range of the fundamental, windows and thresholds; the defaults suit a car's engine.
 
     Returns
     -------
     HarmonicTrack
-        Possibly empty: nothing stands out of the noise.
+        Frequencies in Hz at the centres of the windows; empty where nothing exceeds the noise.
 
     Raises
     ------
     InvalidArgumentError
         On a wrong shape, too few samples, non-finite values or too low a sample rate.
 
-    References
-    ----------
-    A. M. Noll 1969 (the comb), A. J. Viterbi 1967 (the track), D. C. Rife and R. R. Boorstyn 1974 (the
-    teeth): see `worldstate.frontend.approach.harmonic_sum` and `worldstate.frontend.approach.partials`.
+    References ---------- A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum,
+    the harmonic sum spectrum and a maximum likelihood estimate", 1969; A. J. Viterbi, IEEE Trans. IT 13, 1967
+    (the track); D. C. Rife and R. R. Boorstyn, IEEE Trans. IT 20, 1974 (the variance of a partial).
 
     Examples
     --------
@@ -105,7 +106,7 @@ def track_fundamental(
     windows = Windows(frames, shape, floor, rate)
     for _ in range(PASSES):
         found = measure_fundamental(windows, fundamental, _slope(time, fundamental), chosen)
-        fundamental = np.where(found.lines > 0, found.frequency_hz, fundamental)
+        fundamental = np.where(found.n_partials > 0, found.frequency_hz, fundamental)
     return _track(time, found, shape)
 
 
@@ -121,7 +122,7 @@ def _checked(
 
 
 def _decimated(x: FloatArray, rate: float, highest: float) -> tuple[FloatArray, float]:
-    """Filter (zero phase) and thin to no less than three times the highest tooth."""
+    """Decimate with zero phase to at least three times the highest partial."""
     factor = int(rate // (3.0 * highest))
     if factor <= 1:
         return x, rate
@@ -129,14 +130,14 @@ def _decimated(x: FloatArray, rate: float, highest: float) -> tuple[FloatArray, 
 
 
 def _track(time: FloatArray, found: Fundamental, shape: FloatArray) -> HarmonicTrack:
-    used = found.lines > 0
+    used = found.n_partials > 0
     # A tone of amplitude A peaks at (A sum(w) / 2)^2 and has mean square A^2 / 2.
     mean_square = 2.0 * found.power[used] / shape.sum() ** 2
     return HarmonicTrack(
         time_s=time[used],
         frequency_hz=found.frequency_hz[used],
         variance_hz2=found.variance_hz2[used],
-        lines=found.lines[used],
+        n_partials=found.n_partials[used],
         misfit=found.misfit[used],
         level_db=10.0 * np.log10(mean_square),
         windows=len(used),

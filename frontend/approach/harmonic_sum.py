@@ -1,11 +1,11 @@
-r"""The comb: which fundamental do the harmonics of each window speak for, and along which track.
+r"""Harmonic sum: the evidence of every candidate fundamental, and its most evident track.
 
-A candidate f in window k is scored by the evidence of its teeth over the noise floor,
+A candidate f in window k is scored by the power P of its partials over the noise floor,
 
 .. math:: Q_k(f) = \sum_h \big[\ln(1 + P_k(h f) / \nu_k(h f)) - q\big],
 
-where the price q per tooth keeps f / 2, half of whose teeth are empty, from winning over f. The track is the
-most evident one whose rate of change is limited.
+where the price q per partial keeps f / 2, half of whose partials are empty, from winning over f. The track is
+the most evident one whose rate of change is limited.
 
 Source: A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum, the harmonic sum
 spectrum and a maximum likelihood estimate", 1969; the track by A. J. Viterbi's algorithm, 1967.
@@ -19,6 +19,7 @@ from scipy import ndimage
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray, IndexArray
 
+# The Hann window loses 1.4 dB half way between two unpadded bins; with four times as many 0.1 dB.
 ZERO_PADDING = 4
 # Median of an exponential variable over its mean: from a median of powers to the noise power.
 MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
@@ -26,7 +27,7 @@ MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 
 @dataclass(frozen=True, slots=True)
 class HarmonicSettings:
-    """What fundamental to look for, and how finely.
+    """Range of the fundamental, windows and thresholds of the harmonic sum.
 
     Examples
     --------
@@ -36,17 +37,17 @@ class HarmonicSettings:
 
     low_hz: float = 25.0  # Range of the fundamental; a firing frequency is 20 to 200 Hz
     high_hz: float = 200.0
-    band_high_hz: float = 1200.0  # Highest tooth used
-    max_harmonics: int = 20  # Most teeth used; 1 follows a single tone
+    band_high_hz: float = 1200.0  # Highest partial used
+    max_harmonics: int = 20  # Largest number of partials used; 1 tracks a single tone
     # Analysis window (Hann) and its step. The fundamental must be resolved: low_hz > 4 / window_s.
     window_s: float = 0.25
     hop_s: float = 0.1
     max_rate_hz: float = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
-    # q, nats per tooth. An empty tooth has 0.6 nats of evidence on average: a lower price lets f / 2 win, a
-    # much higher one 2 f where upper harmonics are missing.
-    tooth_price: float = 1.0
+    # q, nats per partial. An empty partial has 0.6 nats of evidence on average: a lower price lets f / 2 win,
+    # a much higher one 2 f where upper harmonics are missing.
+    partial_price: float = 1.0
     floor_width_hz: float = 250.0  # Width of the running median that estimates the noise floor
-    tooth_snr: float = 15.0  # Power over the floor from which a tooth enters the combined estimate
+    partial_snr: float = 15.0  # Power over the floor from which a partial enters the combined estimate
 
     def __post_init__(self) -> None:
         in_range("low_hz", self.low_hz, 4.0 / self.window_s, np.inf)
@@ -56,25 +57,20 @@ class HarmonicSettings:
         in_range("window_s", self.window_s, 0.0, 10.0, open_low=True)
         in_range("hop_s", self.hop_s, 0.0, self.window_s, open_low=True)
         in_range("max_rate_hz", self.max_rate_hz, 0.0, 10.0, open_low=True)
-        in_range("tooth_price", self.tooth_price, 0.0, np.inf)
+        in_range("partial_price", self.partial_price, 0.0, np.inf)
         in_range("floor_width_hz", self.floor_width_hz, 4.0 / self.window_s, np.inf)
-        in_range("tooth_snr", self.tooth_snr, 1.0, np.inf)
+        in_range("partial_snr", self.partial_snr, 1.0, np.inf)
 
 
 def spectrum_and_floor(
     frames: FloatArray, rate: float, settings: HarmonicSettings
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Powers of zero-padded windows and the noise under them, both (K, bins), up to the highest tooth.
+    r"""Return the power of zero-padded windows and its noise floor, (K, bins) each, to the highest partial.
 
     .. math:: P_k[b] = \Big| \sum_n x_k[n]\, e^{-j 2\pi b n / 4N} \Big|^2, \qquad
               \nu_k[b] = \frac{1}{\ln 2}\, \mathrm{median}_{b'}\, P_k[b'] \text{ around } b
 
-    Shapes: frames (K, n), returns (K, bins).
-
-    References
-    ----------
-    H. Rohling, "Radar CFAR thresholding in clutter and multiple target situations", IEEE Trans. AES 19, 1983
-    (ordered statistics as a floor); ln 2 is the median of an exponential variable of mean one.
+    Shapes: frames (K, n).
 
     Examples
     --------
@@ -86,7 +82,8 @@ def spectrum_and_floor(
     size = ZERO_PADDING * frames.shape[1]
     keep = int(np.ceil(settings.band_high_hz * 1.02 * size / rate)) + 2
     power = np.abs(np.fft.rfft(frames, size)[:, :keep]) ** 2
-    # The padded bins are interpolated: the median needs only every fourth.
+    # A running median as the floor (ordered statistics, as in Rohling 1983): a mean would rise under a
+    # partial. The padded bins are interpolations: every fourth is enough for the median.
     width = round(settings.floor_width_hz * frames.shape[1] / rate) | 1
     floor = ndimage.median_filter(power[:, ::ZERO_PADDING], size=(1, width), mode="nearest")
     grid = np.arange(keep)
@@ -96,12 +93,12 @@ def spectrum_and_floor(
 
 
 def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> FloatArray:
-    r"""Most evident track of the fundamental on a logarithmic grid, (K,) in Hz.
+    r"""Return the most evident track of the fundamental on a logarithmic grid, shape (K,), Hz.
 
     .. math:: \hat f = \arg\max_{f_1 .. f_K} \sum_k \Big[ Q_k(f_k) - \frac{(i_k - i_{k-1})^2}{r^2} \Big],
               \qquad |i_k - i_{k-1}| \le r
 
-    with Q of the module's head, i_k the place of f_k on the grid, and r the largest change in a hop.
+    with Q above, i_k the index of f_k on the grid, and r the largest change from window to window.
 
     Shapes: ratio (K, bins).
 
@@ -112,19 +109,19 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
     >>> bool(np.abs(best_path(ratio, 1.0, HarmonicSettings()) / 60.0 - 1).max() < 2e-3)
     True
     """
-    # Half a resolution at the highest tooth, so that no tooth falls between two candidates.
+    # Half a resolution at the highest partial, so that no partial falls between two candidates.
     step = 0.5 / (settings.window_s * settings.band_high_hz)
     count = int(np.log(settings.high_hz / settings.low_hz) / step) + 2
     grid = np.geomspace(settings.low_hz, settings.high_hz, count)
-    evidence = _comb_evidence(ratio, grid, bin_hz, settings)
+    evidence = _harmonic_evidence(ratio, grid, bin_hz, settings)
     reach = max(1, int(np.ceil(settings.max_rate_hz * settings.hop_s / step)))
     return np.asarray(grid[_viterbi(evidence, reach)])
 
 
-def _comb_evidence(
+def _harmonic_evidence(
     ratio: FloatArray, grid: FloatArray, bin_hz: float, settings: HarmonicSettings
 ) -> FloatArray:
-    gain = np.log1p(ratio) - settings.tooth_price
+    gain = np.log1p(ratio) - settings.partial_price
     evidence = np.zeros((len(ratio), len(grid)))
     for h in range(1, settings.max_harmonics + 1):
         inside = h * grid <= settings.band_high_hz
@@ -133,7 +130,7 @@ def _comb_evidence(
 
 
 def _viterbi(evidence: FloatArray, reach: int) -> IndexArray:
-    """Index of the best path whose steps are at most `reach`; a full step costs one nat."""
+    """Return the indices of the best path with steps of at most `reach`; a full step costs one nat."""
     offsets = np.arange(-reach, reach + 1)
     cost = (offsets / reach) ** 2
     columns = np.arange(evidence.shape[1])

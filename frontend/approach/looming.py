@@ -1,20 +1,19 @@
-r"""Acoustic looming: the rate at which a sound grows gives the reciprocal time-to-arrival.
+r"""Acoustic looming: the reciprocal time to arrival from the growth of the sound level.
 
 For a point source at range d the band energy E goes as 1/d^2, eq. (2):
 
 .. math:: \frac{d}{dt} \log E = -2 \frac{\dot d}{d} = \frac{2}{\mathrm{TTA}}
 
-Neither source level, distance nor a constant attenuation matters. Two readings of one window:
+It depends on neither the source level nor the distance nor a constant attenuation. One window is read twice:
 
-* the slope of log E over the window, which is 2 / TTA somewhere near its middle;
-* the straight line through E^(-1/2), which is proportional to d itself: exact at constant speed, and read
+* the slope of log E over the window, which is 2 / TTA somewhere near its middle; * the straight line through
+E^(-1/2), which is proportional to d itself: exact at constant speed, and evaluated
   at the END of the window.
 
-Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise that does not come from the
-source, and diffraction round a corner, bias either of them: what is measured then is the approach of the
-sound, not of the vehicle.
+Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise from elsewhere and diffraction
+round a corner bias both: what is measured is then the approach of the sound, not of the vehicle.
 
-How well it can be known is set by chance in the sound itself, which no number of microphones averages: n
+The accuracy is limited by the randomness of the sound itself, which no number of microphones averages out: n
 energies over T seconds, each of scatter s = (bandwidth x interval)^(-1/2), give TTA with a relative error of
 about (s / 2) (TTA / T + 1/2) sqrt(12 / n). Noise from 0.3 to 20 kHz, 1 to 3 s away, scattered by 4.0 % when
 read from one second and by 1.5 % when read from two: `FrontEndSettings.looming_hops` is that choice.
@@ -34,16 +33,20 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
+# Two parameters and a scatter of their own need two degrees of freedom.
 MIN_POINTS = 4
 # Scatter of log E about the fit, nats (3 dB), beyond which energy is not that of one approaching source.
 MAX_LOG_STD = 0.7
-# The range at the end of the window must be this many standard deviations from zero.
+# The fitted range at the end of the window must be this many standard deviations from zero: nearer to it the
+# quotient 1/TTA has no useful variance.
 _MIN_RANGE_SIGMA = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Looming:
-    """Approach rate read from growing sound.
+    r"""Approach rate from the growth of the sound level.
+
+    .. math:: \frac{1}{\mathrm{TTA}} = -\frac{\dot d}{d}, \qquad \frac{d}{dt} \log E = \frac{2}{\mathrm{TTA}}
 
     Parameters
     ----------
@@ -70,14 +73,14 @@ class Looming:
 
 
 def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Looming | NotUsable:
-    r"""Fit both readings to one window of band energies.
+    r"""Estimate 1/TTA from one window of band energies, eq. (2).
 
     .. math:: E^{-1/2}(t) \propto a + b\, t, \quad
               \frac{1}{\mathrm{TTA}} = -\frac{b}{a} \text{ at } t = 0, \qquad
               \frac{d}{dt} \log E = \frac{2}{\mathrm{TTA}}
 
-    The line through :math:`E^{-1/2}` is weighted by the square of the exponential fit, for log E scatters
-    evenly and E^(-1/2) in proportion to itself.
+    The line through :math:`E^{-1/2}` is weighted by the square of the exponential fit, because log E scatters
+    evenly and E^(-1/2) in proportion to its value.
 
     Parameters
     ----------
@@ -86,14 +89,14 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
     log_energy : array_like, shape (n,)
         Natural logarithm of the band energy.
     floor_std : float
-        Scatter of `log_energy` that chance alone explains, 1 / sqrt(bandwidth x interval) for noise-like
-        sound: the standard errors assume no less than this, > 0.
+        Standard deviation of `log_energy` by chance alone, nats, > 0: 1 / sqrt(bandwidth x interval) for
+        noise-like sound. The standard errors assume at least this.
 
     Returns
     -------
     Looming or NotUsable
-        Not usable when the energies scatter by more than 3 dB about the fit, or when the line reaches range
-        zero within the error of the window.
+        Rates in 1/s. Not usable if the energies scatter by more than 3 dB about the fit, or if the fitted
+        range reaches zero within its error.
 
     Raises
     ------
@@ -102,8 +105,8 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
 
     References
     ----------
-    "Evidence of Absence", eq. (2), after D. Lee 1976: see `looming`. The line is derived
-    here: E goes as the inverse square of the range, which changes evenly at constant speed.
+    "Evidence of Absence", eq. (2); D. Lee, "A theory of visual control of braking based on information about
+    time-to-collision", Perception 5, 1976. The line through :math:`E^{-1/2}` is derived here.
 
     Examples
     --------
@@ -121,7 +124,7 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
         raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, got {times}")
     centred = energies - energies.mean()
     exponential = _fit_line(times, centred, np.ones_like(times))
-    # The exponential fit is a smooth stand-in for E^(-1/2): its scatter may not weight itself.
+    # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.
     model = np.exp(-0.5 * (exponential.level + exponential.slope * times))
     straight = _fit_line(times, np.exp(-0.5 * centred), model)
     scatter = 2.0 * straight.scatter
@@ -146,7 +149,7 @@ def _read(exponential: "_Line", straight: "_Line", log_std: float, range_std: fl
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """Value = level + slope t; variances for relative errors of unit variance."""
+    """Line ``value = level + slope t`` with variances for relative errors of unit variance."""
 
     slope: float
     level: float

@@ -1,13 +1,13 @@
-r"""The teeth of a comb: frequency and variance of each, and the fundamental that they agree on.
+r"""Frequency and variance of each partial, and the fundamental that they agree on.
 
-Each tooth is demodulated by the track found so far and its slope, so that a gliding one stays sharp, and its
-frequency climbs to the maximum of the windowed periodogram by a Newton step. To first order in the noise,
-with n counted from the centre of the window w,
+Each partial is demodulated by the track found so far and its slope, so that a gliding one stays narrow, and
+its frequency is moved to the maximum of the windowed periodogram by a Newton step. To first order in the
+noise, with n counted from the centre of the window w,
 
 .. math:: \sigma_h^2 = \frac{1}{2\,\mathrm{SNR}} \frac{(\sum w)^2}{\sum w^2}
           \frac{\sum w^2 n^2}{(\sum w n^2)^2}, \qquad \mathrm{SNR} = \text{peak power over floor}.
 
-All teeth together give
+The partials are combined by
 
 .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
           \chi^2 = \frac{1}{H - 1} \sum_h \frac{(f_h - h \hat f)^2}{\sigma_h^2}.
@@ -23,13 +23,13 @@ from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
 from .harmonic_sum import ZERO_PADDING, HarmonicSettings
 
-# Largest correction, in resolutions 1 / window, that one Newton step may make to a tooth.
+# Largest correction by one Newton step, in resolutions 1 / window: beyond it lies the edge of the main lobe.
 REACH = 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class Fundamental:
-    """What the teeth of K windows say together.
+    """Fundamental of K windows, combined from their partials.
 
     Examples
     --------
@@ -38,23 +38,17 @@ class Fundamental:
     array([60.])
     """
 
-    # Fundamental and its variance, widened where the teeth disagree; no meaning without teeth.
+    # Fundamental and its variance, increased where the partials disagree; undefined without partials.
     frequency_hz: FloatArray
     variance_hz2: FloatArray
-    lines: IndexArray  # Teeth that entered
-    misfit: FloatArray  # Reduced chi-squared of the teeth; 0 with fewer than two
-    power: FloatArray  # Sum of the teeth's powers above the floor, in the units of the spectrum
+    n_partials: IndexArray  # Number of partials used
+    misfit: FloatArray  # Reduced chi-squared of the partials; 0 with fewer than two
+    power: FloatArray  # Sum of the partials's powers above the floor, in the units of the spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Samples of every window with the noise floor of their spectra.
-
-    Examples
-    --------
-    >>> Windows(np.zeros((1, 3)), np.hanning(3), np.ones((1, 2)), rate_hz=8000.0).n
-    array([-1.,  0.,  1.])
-    """
+    """Samples of every window with the noise floor of their spectra."""
 
     frames: FloatArray  # Samples, not windowed
     shape: FloatArray  # The window
@@ -70,7 +64,7 @@ class Windows:
 def measure_fundamental(
     windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray, settings: HarmonicSettings
 ) -> Fundamental:
-    r"""Refine a track of the fundamental from all its teeth.
+    r"""Refine a track of the fundamental by all its partials.
 
     .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
               \mathrm{var}(\hat f) = \frac{\max(\chi^2, 1)}{\sum_h h^2 / \sigma_h^2}
@@ -86,31 +80,31 @@ def measure_fundamental(
     array([60.3])
     """
     most = min(settings.max_harmonics, int(settings.band_high_hz / fundamental_hz.min()))
-    teeth = np.arange(1, most + 1)
+    partials = np.arange(1, most + 1)
     n, rate = windows.n, windows.rate_hz
     turn = np.outer(fundamental_hz, n / rate) + 0.5 * np.outer(slope_hz_s, (n / rate) ** 2)
     back = np.exp(-2j * np.pi * turn)
     demodulated = np.asarray(windows.shape * windows.frames, dtype=np.complex128)
     measured = []
-    for h in teeth:
+    for h in partials:
         demodulated *= back
-        measured.append(_tooth(windows, demodulated, h * fundamental_hz, settings))
+        measured.append(_partial(windows, demodulated, h * fundamental_hz, settings))
     frequency, variance, power = (np.stack(part, axis=1) for part in zip(*measured, strict=True))
-    return _combined(frequency, variance, power, teeth)
+    return _combined(frequency, variance, power, partials)
 
 
-def _tooth(
+def _partial(
     windows: Windows,
     demodulated: Complex128Array,
     expected_hz: FloatArray,
     settings: HarmonicSettings,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Frequency, variance and power of a tooth in every window; infinite and 0 where it is of no use."""
+    """Return frequency, variance and power of a partial per window; infinite variance if too weak."""
     n, turns = windows.n, windows.rate_hz / (2 * np.pi)
     shift, peak = _newton_shift(demodulated, n)
     floor = _floor_at(windows, expected_hz)
     snr = peak / floor
-    use = (snr >= settings.tooth_snr) & (np.abs(shift) < 2 * np.pi * REACH / len(n))
+    use = (snr >= settings.partial_snr) & (np.abs(shift) < 2 * np.pi * REACH / len(n))
     use &= expected_hz <= settings.band_high_hz
     variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * turns**2
     return expected_hz + shift * turns, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
@@ -122,7 +116,7 @@ def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
 
 
 def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Newton step from d = 0, rad per sample, to the maximum of |sum z exp(-j d n)|^2, and its height."""
+    """Newton step from d = 0, rad per sample, to the maximum of |sum z exp(-j d n)|^2, and the maximum."""
     s0, s1, s2 = (demodulated @ np.stack([np.ones_like(n), n, n**2], axis=1)).T
     height = np.abs(s0) ** 2
     slope = 2.0 * (s0.conj() * s1).imag
@@ -140,13 +134,13 @@ def _line_variance(window: FloatArray, n: FloatArray) -> float:
 
 
 def _combined(
-    frequency: FloatArray, variance: FloatArray, power: FloatArray, teeth: IndexArray
+    frequency: FloatArray, variance: FloatArray, power: FloatArray, partials: IndexArray
 ) -> Fundamental:
-    """Weigh all teeth, (K, H), into one fundamental per window."""
+    """Combine all partials, (K, H), into one fundamental per window by their inverse variances."""
     weight = 1.0 / variance
     count = np.count_nonzero(weight, axis=1)
-    information = np.maximum((weight * teeth**2).sum(axis=1), np.finfo(float).tiny)
-    fundamental = (weight * teeth * frequency).sum(axis=1) / information
-    squares = (weight * (frequency - np.outer(fundamental, teeth)) ** 2).sum(axis=1)
+    information = np.maximum((weight * partials**2).sum(axis=1), np.finfo(float).tiny)
+    fundamental = (weight * partials * frequency).sum(axis=1) / information
+    squares = (weight * (frequency - np.outer(fundamental, partials)) ** 2).sum(axis=1)
     misfit = np.where(count > 1, squares / np.maximum(count - 1, 1), 0.0)
     return Fundamental(fundamental, np.maximum(misfit, 1.0) / information, count, misfit, power.sum(axis=1))

@@ -1,10 +1,10 @@
-r"""The frequency curve of a tone that drives past in a straight line, on the receiver's clock.
+r"""Frequency of a tone that passes by on a straight line, on the receiver's clock.
 
 At emission time tau a source of speed v, closest at range d when tau = tau_0, has
 
 .. math:: r(\tau) = \sqrt{d^2 + v^2 (\tau - \tau_0)^2}, \qquad v_r = v^2 (\tau - \tau_0) / r,
 
-and is heard at :math:`t = \tau + r(\tau)/c` with frequency :math:`f_r = f_0 / (1 + v_r / c)`. With
+and arrives at :math:`t = \tau + r(\tau)/c` with frequency :math:`f_r = f_0 / (1 + v_r / c)`. With
 :math:`T = t - \tau_0` the emission time is closed-form,
 
 .. math:: \tau - \tau_0 = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}.
@@ -19,24 +19,20 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from worldstate.ground.typing import FloatArray
 
+# Limits of the fit: a slower source has no visible S-curve, a farther one is not heard.
 SLOWEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 0.3, 300.0
-# Starting points of the fit: places of the closest approach along the track, speeds and ranges.
+# Starting points of the fit, because chi-squared has local minima: times of the closest approach as shares of
+# the track, and pairs of speed and range.
 START_PLACES = (-0.1, 0.15, 0.35, 0.5, 0.65, 0.85, 1.1)
 START_SHAPES = ((8.0, 4.0), (20.0, 10.0))
 PARAMETERS = 4
-# All starts are followed a little way, the best of them to the end.
+# All starts are followed for a few evaluations, the best two to convergence.
 ROUGH_EVALUATIONS, EVALUATIONS, FINALISTS = 12, 300, 2
 
 
 @dataclass(frozen=True, slots=True)
 class PassBy:
-    """A fitted pass-by.
-
-    Examples
-    --------
-    >>> PassBy(np.array([100.0, 12.0, 2.0, 5.0]), np.eye(4), chi_squared=36.0).values[1].item()
-    12.0
-    """
+    """Parameters of a fitted pass-by with their covariance."""
 
     values: FloatArray  # f_0 in Hz, v in m/s, tau_0 in seconds on the receiver's clock, d in metres
     covariance: FloatArray  # Of these, from the information of the fit
@@ -46,7 +42,7 @@ class PassBy:
 def radial_speed_m_s(
     time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float, sound_m_s: float
 ) -> FloatArray:
-    r"""Radial speed at emission of what is heard at each time, positive while receding, shape of `time_s`.
+    r"""Return the radial speed at emission of the sound that arrives at `time_s`, positive while receding.
 
     .. math:: v_r = \frac{v^2 s}{\sqrt{d^2 + v^2 s^2}}, \qquad
               s = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}, \quad T = t - \tau_0
@@ -77,11 +73,6 @@ def fit_pass_by(
 
     Shapes: time_s, frequency_hz, std_hz (K,).
 
-    References
-    ----------
-    S. M. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*, 1993, chapter 8 (least
-    squares).
-
     Examples
     --------
     >>> t = np.linspace(0.0, 4.0, 40)
@@ -94,8 +85,8 @@ def fit_pass_by(
     high = np.array([1.4 * frequency_hz.max(), max_speed_m_s, time_s[-1] + 2 * duration + 1, FARTHEST_M])
 
     def residuals(values: FloatArray) -> FloatArray:
-        heard = values[0] / (1 + _radial_speed(time_s, values, sound_m_s) / sound_m_s)
-        return np.asarray((heard - frequency_hz) / std_hz)
+        received = values[0] / (1 + _radial_speed(time_s, values, sound_m_s) / sound_m_s)
+        return np.asarray((received - frequency_hz) / std_hz)
 
     scale = np.array([frequency_hz.mean() * 0.01, 5.0, 0.5, 5.0])
 
@@ -112,7 +103,7 @@ def fit_pass_by(
 
 
 def radial_speed_gradient(time_s: FloatArray, values: FloatArray, sound_m_s: float) -> FloatArray:
-    r"""Differentiate the radial speed by (f_0, v, tau_0, d), (K, 4), centrally.
+    r"""Differentiate the radial speed by (f_0, v, tau_0, d) with central differences, shape (K, 4).
 
     .. math:: \frac{\partial v_r}{\partial p_i} \approx \frac{v_r(p + h_i) - v_r(p - h_i)}{2 h_i}, \qquad
               h_i = 10^{-5} \max(1, |p_i|)

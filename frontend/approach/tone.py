@@ -1,9 +1,8 @@
 r"""Maximum-likelihood frequency of a single tone.
 
-Rife and Boorstyn: in white noise the likelihood of a complex tone is greatest where the periodogram is. A
-coarse search on a zero-padded FFT finds the lobe, Gauss-Newton steps on (in-phase, quadrature, frequency)
-climb it. A real tone is fitted as what it is, a cosine and a sine, so that its own negative frequency does
-not bias it.
+In white noise the likelihood of a complex tone has its maximum where the periodogram has. A coarse search on
+a zero-padded FFT finds the main lobe, Gauss-Newton steps in (in-phase, quadrature, frequency) find the
+maximum. A real tone is fitted as a cosine and a sine, so that its negative frequency does not bias it.
 
 Source: D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations",
 IEEE Trans. IT 20, 1974.
@@ -22,30 +21,35 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray
 from worldstate.ground.values import wrap_angle
 
+# Three parameters are fitted; with fewer samples the residual says little about the noise.
 FEWEST_SAMPLES = 8
 # A grid of a quarter of the resolution puts the coarse peak within an eighth of it: well inside the main
 # lobe.
 ZERO_PADDING = 4
+# From an eighth of the resolution three steps reach rounding; the rest is a margin for low SNR.
 STEPS = 8
+# Ridge of the 2 x 2 normal equations, which are singular for a tone at 0 Hz.
 _ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, slots=True)
 class Tone:
-    """One tone and what is left of the signal without it.
+    r"""One tone in white noise.
+
+    .. math:: x_n = A \cos(2\pi f n / f_s + \varphi) + \epsilon_n
 
     Parameters
     ----------
     frequency_hz : float
-        Negative only for a complex signal.
+        f, Hz; negative only for a complex signal.
     amplitude : float
-        Peak amplitude A.
+        Peak amplitude A, unit of the samples.
     phase_rad : float
-        At the first sample: A cos(2 pi f t + phase), or A exp(j(2 pi f t + phase)).
+        Phase at the first sample: A cos(2 pi f t + phase), or A exp(j(2 pi f t + phase)).
     snr : float
         eta: A^2 / (2 sigma^2) for a real signal; A^2 / sigma^2 for a complex one, sigma^2 per quadrature.
     frequency_std_hz : float
-        From the bound at this SNR, Hz.
+        Cramer-Rao bound at this SNR, Hz.
 
     Examples
     --------
@@ -76,19 +80,18 @@ def estimate_tone(
 
     Parameters
     ----------
-    samples : (n,) real or complex
-        At least 8; white noise around the tone.
+    samples : array_like, shape (n,)
+        Real or complex, n >= 8; the noise around the tone is taken for white.
     sample_rate_hz : float
-        > 0.
+        Samples per second, > 0.
     low_hz, high_hz : float, optional
-        Band searched. By default all of it; for real samples one resolution, rate / n, is left out at 0 and
-        at rate / 2, where a real tone cannot be told from an offset.
+        Band searched, Hz. By default all frequencies; for real samples one resolution, rate / n, is left out
+        at 0 and at rate / 2, where a real tone is not distinguishable from an offset.
 
     Returns
     -------
     Tone
-        Its SNR says whether to believe it: below a threshold (about 15 dB for :math:`\eta N`) the highest
-        peak is noise.
+        With its SNR: below a threshold (about 15 dB for :math:`\eta N`) the highest peak is noise.
 
     Raises
     ------
@@ -99,9 +102,8 @@ def estimate_tone(
     -----
     Bound: `worldstate.frontend.bounds.cramer_rao.tone_crb_hz2`.
 
-    References
-    ----------
-    D. C. Rife and R. R. Boorstyn 1974: see `worldstate.frontend.approach.tone`.
+    References ---------- D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time
+    observations", IEEE Trans. IT 20, 1974.
 
     Examples
     --------
@@ -119,7 +121,7 @@ def estimate_tone(
     real = not np.iscomplexobj(samples)
     low, high = _checked_band(low_hz, high_hz, rate, rate / len(y) if real else -0.5 * rate)
     omega = 2 * np.pi / rate * _coarse_peak(y, rate, low, high)
-    # The frequencies of complex samples form a circle: a search of all of it has no ends to stop at.
+    # The frequencies of complex samples form a circle: a search of the whole circle has no limits.
     endless = not real and low_hz is None and high_hz is None
     bounds = (-np.inf, np.inf) if endless else (2 * np.pi * low / rate, 2 * np.pi * high / rate)
     return _tone(y.real if real else y, *climb(y.real if real else y, omega, bounds), rate)
@@ -148,14 +150,9 @@ def climb(
     .. math:: \omega \leftarrow \omega + \frac{\mathrm{Re}\, g^H r}{g^H g}, \qquad
               r = P^\perp y, \quad g = P^\perp \frac{\partial H}{\partial \omega} \hat a, \quad \hat a = H^+ y
 
-    with P the projection off the columns of H, as in `estimate_tone`.
+    with P the projection off the columns of H, as in `estimate_tone` (variable projection).
 
     Shapes: y (n,).
-
-    References
-    ----------
-    G. Golub and V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems
-    whose variables separate", SIAM J. Numer. Anal. 10, 1973 (variable projection).
 
     Examples
     --------
@@ -175,7 +172,7 @@ def climb(
 
 
 def tone_wave(omega: float, count: int) -> ComplexArray:
-    r"""Give a complex wave, n counted from the centre, as a product of two short ones: few exponentials.
+    r"""Return a complex wave, n counted from the centre, as a product of two short ones to save exponentials.
 
     .. math:: z_n = e^{j \omega (n - (N - 1) / 2)}
 

@@ -1,12 +1,12 @@
-r"""The engine line of a stream: one tone a hop, fitted by maximum likelihood at a rate that suits it.
+r"""The engine line of a stream: one tone per hop, fitted by maximum likelihood after decimation.
 
-A few microphones around the middle of the array are averaged: at engine frequencies they stand within a
-fraction of a wavelength, so that a tone adds up from wherever it comes. `decimator` keeps the band, at some
-1200 samples a second. In the last second the highest peak over the noise around it is looked for, under a
-Hann window, so that neither harmonics nor rumble leak there, and climbed as in `tone`.
+A few microphones near the centre of the array are averaged: at engine frequencies they lie within a fraction
+of a wavelength, so that a tone from any direction adds up. `decimator` keeps the band, at some 1200 samples
+per second. In the last second the peak with the highest ratio to the noise around it is searched under a Hann
+window, so that neither harmonics nor rumble leak into it, and refined as in `tone`.
 
 The noise floor is the median power around the line: the standard deviation is the bound of Rife and Boorstyn
-at the signal-to-noise ratio in place, whatever the colour of the noise.
+at the local signal-to-noise ratio, whatever the colour of the noise.
 """
 
 from dataclasses import dataclass
@@ -26,16 +26,18 @@ from worldstate.ground.values import NotUsable
 from .harmonic_sum import MEDIAN_OF_EXPONENTIAL
 from .tone import climb
 
+# Firing frequencies of road vehicles, idling motorcycle single to a car at high revolutions.
 ENGINE_BAND_HZ = (20.0, 400.0)
 # Bins per resolution (a grid this fine starts the climb within its lobe), resolutions per block of the coarse
 # floor, and the ring of resolutions around the line whose median is its floor: beyond its own side lobes.
 _PADDING = 2
 _BLOCK = 24
 _RING = (5, 40)
-# Peak over floor, A^2 N / 4 sigma^2; 15.6 dB for eta N. White noise exceeds it in one window of a thousand.
+# Least ratio of the peak to the floor, A^2 N / 4 sigma^2, or 15.6 dB for eta N: white noise exceeds it in one
+# window of a thousand.
 _EVIDENT = 18.0
-# Share of a resolution that the climb may be wrong by: a tone whose eta N is 80 dB is known to as much.
-# From a parabola's vertex two steps do; where nothing converges, nothing stands out.
+# Tolerance of the refinement as a share of a resolution, the bound for eta N of 80 dB. From the vertex of a
+# parabola two steps suffice; where three do not converge there is no tone.
 _TOLERANCE, _STEPS = 1e-4, 3
 # Lowest frequency, periods in the window: below, a tone cannot be told from an offset.
 _FEWEST_PERIODS = 4.0
@@ -43,7 +45,7 @@ _FEWEST_PERIODS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class ToneReading:
-    """A tone that stands out of the noise.
+    """A tone above the noise.
 
     Examples
     --------
@@ -52,15 +54,15 @@ class ToneReading:
     """
 
     frequency_hz: float  # Mean over the window, by the stream's own sample rate
-    # From the bound at this SNR; a line that wanders within the window is known worse.
+    # Bound at this SNR; larger in truth for a line that varies within the window.
     frequency_std_hz: float
     snr: float  # eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from the noise around the line
     mean_square: float  # A^2 / 2 of the averaged microphones, squared units of the samples
-    age_s: float  # How long before the end of the hop the middle of the window was, seconds
+    age_s: float  # From the middle of the window to the end of the hop, seconds
 
 
 class ToneStage:
-    """Remembers the band of one averaged channel over the window; memory does not grow.
+    """Keep the decimated band of one averaged channel over the window and fit a tone; memory does not grow.
 
     Examples
     --------
@@ -92,23 +94,22 @@ class ToneStage:
         self._rate = self._decimator.rate_hz
         self._n_pushed = 0
         self._n_out = 0
-        self._heard: FloatArray = np.zeros(_window(window_s * sample_rate_hz, self._decimator))
-        self._spectrum = _Spectrum(len(self._heard), self._rate, band_hz)
+        self._band_samples: FloatArray = np.zeros(_window(window_s * sample_rate_hz, self._decimator))
+        self._spectrum = _Spectrum(len(self._band_samples), self._rate, band_hz)
 
     def push(self, samples: Float32Array, mask: ChannelMask) -> None:
         r"""Take the samples of a hop (n, M), of which the microphones of a mask count.
 
         .. math:: y[m] = \sum_n h[n]\, \frac1{|C|} \sum_{i \in C} x_i[m D + n]
 
-        Shapes: samples (n, M).
         """
-        # over the microphones C next to the middle.
+        # C are the usable microphones nearest to the centre.
         if not np.array_equal(mask.keep, self._keep):
             self._weights, self._keep = self._mean_of(mask.keep)
         new = self._decimator.push(samples @ self._weights)
         self._n_pushed += len(samples)
         self._n_out += len(new)
-        self._heard = np.concatenate([self._heard, new])[len(new) :]
+        self._band_samples = np.concatenate([self._band_samples, new])[len(new) :]
 
     def read(self) -> ToneReading | NotUsable:
         r"""Fit the line of the window that ends with the last hop.
@@ -119,38 +120,38 @@ class ToneStage:
 
         where :math:`\eta N / 2 > 18`.
         """
-        if self._n_out < len(self._heard):
-            return NotUsable(f"needs {len(self._heard) / self._rate:.2f} s of sound")
-        if not self._heard.any():
+        if self._n_out < len(self._band_samples):
+            return NotUsable(f"needs {len(self._band_samples) / self._rate:.2f} s of sound")
+        if not self._band_samples.any():
             return NotUsable("silence")
-        sound = self._heard - self._spectrum.offset(self._heard)
+        sound = self._band_samples - self._spectrum.offset(self._band_samples)
         power = self._spectrum.power(sound)
         begin, band = self._spectrum.peak(power), self._spectrum.omega_range
         omega, amplitude = climb(sound, begin, band, _TOLERANCE, _STEPS)
         snr = 0.5 * abs(amplitude) ** 2 / self._spectrum.floor_near(power, omega)
         if not 0.5 * snr * len(sound) > _EVIDENT:
-            return NotUsable("no tone stands out of the noise")
+            return NotUsable("no tone above the noise")
         std = float(np.sqrt(tone_crb_hz2(snr, len(sound), self._rate)))
         frequency = omega * self._rate / (2.0 * np.pi)
         return ToneReading(frequency, std, snr, 0.5 * abs(amplitude) ** 2, self._age_s())
 
     def _mean_of(self, keep: BoolArray) -> tuple[Float32Array, BoolArray]:
-        """Weights of the nearest living microphones; of the nearest, where none lives."""
-        living = self._nearest[keep[self._nearest]] if keep.any() else self._nearest
-        chosen = living[: self._n_channels]
+        """Return weights of the usable microphones nearest to the centre, and their mask."""
+        usable = self._nearest[keep[self._nearest]] if keep.any() else self._nearest
+        chosen = usable[: self._n_channels]
         weights = np.zeros(len(keep), np.float32)
         weights[chosen] = 1.0 / len(chosen)
         return weights, keep.copy()
 
     def _age_s(self) -> float:
-        """From the middle of the window to the last sample pushed."""
-        middle = self._n_out - 0.5 * (len(self._heard) + 1)
+        """Return the time from the middle of the window to the last sample pushed."""
+        middle = self._n_out - 0.5 * (len(self._band_samples) + 1)
         centre = middle * self._decimator.factor + 0.5 * self._decimator.n_taps
         return float((self._n_pushed - centre) / self._sample_rate_hz)
 
 
 def _window(n_samples: float, decimator: Decimator) -> int:
-    """How many outputs are sure to lie within so many input samples."""
+    """Return the number of outputs that always fit into this many input samples."""
     count = int((n_samples - decimator.n_taps) // decimator.factor)
     if count < 2 * _PADDING * _RING[1]:
         raise InvalidArgumentError(
@@ -173,7 +174,7 @@ class _Spectrum:
         self._band = slice(int(np.ceil(low / self._step)), int(high / self._step) + 1)
 
     def offset(self, sound: FloatArray) -> float:
-        """Mean under the window, to which no tone of a few periods contributes."""
+        """Mean under the window, to which a tone of a few periods does not contribute."""
         return float(self._window @ sound) / float(self._window.sum())
 
     def power(self, sound: FloatArray) -> FloatArray:
@@ -181,7 +182,7 @@ class _Spectrum:
         return np.asarray(np.square(spectrum.real) + np.square(spectrum.imag))
 
     def peak(self, power: FloatArray) -> float:
-        """Radians a sample where the power stands highest over that of its block."""
+        """Return the frequency (rad per sample) of the highest power over its block median."""
         inside = power[self._band]
         width = min(_PADDING * _BLOCK, len(inside))
         n_blocks = len(inside) // width
@@ -193,7 +194,7 @@ class _Spectrum:
         return self._step * (index + _vertex(float(near[0]), float(near[1]), float(near[2])))
 
     def floor_near(self, power: FloatArray, omega: float) -> float:
-        """Mean square of white noise as strong as that around a line."""
+        """Return the mean square of white noise that would have the median power around a line."""
         centre = round(omega / self._step)
         inner, outer = (_PADDING * r for r in _RING)
         below = power[max(centre - outer, 1) : max(centre - inner, 1)]
@@ -203,11 +204,11 @@ class _Spectrum:
 
 
 def _vertex(left: float, middle: float, right: float) -> float:
-    """Where a parabola through three points is highest, from the second, in steps; at most half a step."""
+    """Vertex of a parabola through three points, in steps from the second, at most half a step."""
     bend = left - 2.0 * middle + right
     return min(max(0.5 * (left - right) / bend, -0.5), 0.5) if bend < 0.0 else 0.0
 
 
 def _least(power: FloatArray) -> float:
-    """Noise that single precision makes by itself."""
+    """Return the rounding noise of single-precision input."""
     return float(np.finfo(np.float32).eps ** 2 * power.max()) + np.finfo(np.float64).tiny

@@ -62,9 +62,9 @@ class MicrophoneArray:
             )
         spacings = nearest_spacings_m(positions)
         if spacings.min() == 0.0:
-            twins = np.flatnonzero(spacings == 0.0).tolist()
+            coincident = np.flatnonzero(spacings == 0.0).tolist()
             raise InvalidArgumentError(
-                f"positions_m: expected different places, got microphones {twins} in one"
+                f"positions_m: expected different places, got microphones {coincident} in one"
             )
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)

@@ -77,7 +77,7 @@ class EgoNoiseSettings:
     feature : bool
         Compute the published feature from prewhitened sound too. Off, because its classifier was trained
         without.
-    only_from_below : bool
+    only_below_horizon : bool
         Use what was learned as far as it comes from under the array. Off, everything that is learned is
         whitened, the street's own noise too.
 
@@ -99,7 +99,7 @@ class EgoNoiseSettings:
     refresh_hops: int = 4
     harmonics: int = 40
     feature: bool = False
-    only_from_below: bool = True
+    only_below_horizon: bool = True
 
     def __post_init__(self) -> None:
         in_range("forgetting_s", self.forgetting_s, 0.1, 1e5)

@@ -1,4 +1,4 @@
-"""Who is there: channels that are silent or crackle now, always, or now and then."""
+"""Detect silent and intermittent channels from per-hop flags."""
 
 import numpy as np
 
@@ -6,25 +6,26 @@ from worldstate.ground.typing import BoolArray
 
 from .channel_health import ChannelFault, Fault, faults_where
 
+# Five seconds: an intermittent contact comes back within that, and one bad hop is forgotten soon enough.
 _MEMORY_HOPS = 50
-# A hop without any change on any channel is a gap of the transport; after a second the array is dead.
+# A hop without any change on any channel is a dropout of the transport; after a second the array is dead.
 _SILENCE_HOPS = 10
 
 
 class ChannelActivity:
-    """Hops in which a channel was of no use, over the last five seconds.
+    """Flags of unusable hops of every channel over the last five seconds.
 
     Examples
     --------
-    >>> presence = ChannelActivity(3)
+    >>> activity = ChannelActivity(3)
     >>> for hop in range(4):
-    ...     bad = presence.push(np.array([False, True, hop % 2 == 0]))
-    >>> [(fault.channel, fault.fault.value, fault.value) for fault in presence.faults()]
+    ...     bad = activity.push(np.array([False, True, hop % 2 == 0]))
+    >>> [(fault.channel, fault.fault.value, fault.value) for fault in activity.faults()]
     [(1, 'dead', 1.0), (2, 'intermittent', 0.5)]
     """
 
-    # Bad until now since one moment means dead; bad in several stretches, or once and well again,
-    # intermittent. A single bad hop is masked and forgotten.
+    # One stretch of bad hops that lasts until now is dead; several, or one that has ended, are intermittent.
+    # A single bad hop is masked and not reported: a slammed door is no fault.
 
     def __init__(self, n_channels: int) -> None:
         self._bad = np.zeros((_MEMORY_HOPS, n_channels), bool)
@@ -34,16 +35,12 @@ class ChannelActivity:
         self._share = np.zeros(n_channels)
 
     def push(self, bad: BoolArray) -> BoolArray:
-        """Take one flag per channel (M,); give it back.
-
-        Shapes: bad (M,).
-        """
+        """Take one flag per channel, shape (M,), and return it."""
         self._n_silent = 0
         return self._remember(bad)
 
     def all_silent(self) -> BoolArray:
-        """Take a hop in which all are silent, which for a second is held against nobody."""
-        # ``bad = (n >= 10)`` for all channels, n being the hops of silence in a row.
+        """Take a hop in which all channels are silent; return flags that are set after one second of this."""
         self._n_silent += 1
         silent = np.full(self._bad.shape[1], self._n_silent >= _SILENCE_HOPS)
         return self._remember(silent) if silent.any() else silent
@@ -52,10 +49,10 @@ class ChannelActivity:
         self._bad[self._n_hops % _MEMORY_HOPS] = bad
         self._n_hops += 1
         if bad.any() or self._share.any():
-            self._judge(bad)
+            self._classify(bad)
         return bad
 
-    def _judge(self, bad: BoolArray) -> None:
+    def _classify(self, bad: BoolArray) -> None:
         n = min(self._n_hops, _MEMORY_HOPS)
         newest = self._n_hops % _MEMORY_HOPS
         ordered = self._bad[:n] if n < _MEMORY_HOPS else np.roll(self._bad, -newest, axis=0)
@@ -72,11 +69,9 @@ class ChannelActivity:
         return np.asarray(self._dead | self._intermittent)
 
     def faults(self) -> list[ChannelFault]:
-        r"""Say which channels are dead or intermittent.
+        r"""Return the dead and the intermittent channels with their share of bad hops.
 
         .. math:: q_m = \frac1n \sum_{i=1}^{n} b_{i,m}, \qquad n \le 50
-
-        with b the bad hops: dead where they are one stretch that lasts until now, else intermittent.
         """
         if not self._share.any():
             return []

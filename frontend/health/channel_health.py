@@ -1,4 +1,4 @@
-"""What can be wrong with the microphones of an array, as values."""
+"""Faults of channels and the health of an array, as values."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -25,13 +25,13 @@ class Fault(StrEnum):
     DEAD = "dead"
     """Constant, or 30 dB below the median channel."""
     INTERMITTENT = "intermittent"
-    """Comes and goes, or crackles."""
+    """Silent or crackling in several stretches of hops."""
     NOISY = "noisy"
-    """Its sound has nothing to do with that of the others."""
+    """Incoherent with the prediction from the other channels."""
     INVERTED = "inverted"
-    """Fits its place with the wrong sign: crossed leads."""
+    """Fits its position with the opposite sign: crossed leads."""
     SWAPPED = "swapped"
-    """Its sound fits another place than its own."""
+    """Fits the position of another microphone better than its own."""
     CLIPPED = "clipped"
     """Samples pile up at one extreme value."""
     OFFSET = "offset"
@@ -41,7 +41,7 @@ class Fault(StrEnum):
 
 
 MASKED_FAULTS = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.SWAPPED})
-"""Faults that cost a channel its vote. The others leave its phase, which is all that PHAT reads."""
+"""Faults for which a channel is left out. The others leave its phase intact, which is all that PHAT uses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,12 @@ class ChannelFault:
     fault : Fault
         What is wrong.
     value : float
-        How wrong. Dead and intermittent: share of the last five seconds. Noisy and inverted: coherence with
-        what the others predict at its place, in units of the median channel's. Swapped: gain of that
-        coherence, -2 to 2. Clipped: share of samples. Offset: in units of the peak-to-peak sound. Level: dB.
+        Size of the fault. Dead and intermittent: share of the last five seconds. Noisy and inverted:
+        coherence with the prediction from the other channels, over the median channel's. Swapped: gain in
+        that coherence at the other position, -2 to 2. Clipped: share of samples. Offset: mean over the
+        peak-to-peak value. Level: dB relative to the median channel.
     looks_like : int or None
-        Swapped: the channel whose place it fits.
+        Swapped: the channel whose position it fits.
 
     Examples
     --------
@@ -75,24 +76,23 @@ class ChannelFault:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayHealth:
-    """State of an array at the end of a hop.
+    """Health of an array at the end of a hop.
 
     Parameters
     ----------
     mask : ChannelMask
         Microphones that count in this hop.
     faults : tuple of ChannelFault
-        What is wrong now, by channel; one channel may have several.
-    gaps : tuple of Dropout
-        The last few places where samples are missing, silent or repeated.
-    n_gaps : int
+        Present faults by channel; a channel may have several.
+    dropouts : tuple of Dropout
+        The last 16 places in the stream where samples are missing, constant or repeated.
+    n_dropouts : int
         Number of such places since the start.
     coherence : float or NotUsable
-        Median over the channels of their coherence with what the others predict. Not usable until the
-        first second is heard and where nothing coherent sounds: then swapped, inverted and noisy channels go
-        unseen.
+        Median over the channels of the coherence with the prediction from the others. Not usable in the
+        first second and without a coherent sound; swapped, inverted and noisy channels are then not found.
     sample_rate : RateEstimate or NotUsable
-        Rate of the samples by the caller's clock.
+        Sample rate measured against the caller's clock.
 
     Examples
     --------
@@ -103,38 +103,43 @@ class ArrayHealth:
 
     mask: ChannelMask
     faults: tuple[ChannelFault, ...]
-    gaps: tuple[Dropout, ...]
-    n_gaps: int
+    dropouts: tuple[Dropout, ...]
+    n_dropouts: int
     coherence: float | NotUsable
     sample_rate: RateEstimate | NotUsable
 
     @classmethod
-    def unknown(cls, n_channels: int, reason: str = "nothing heard yet") -> "ArrayHealth":
-        """Nothing is known against any microphone.
+    def unknown(cls, n_channels: int, reason: str = "no hop so far") -> "ArrayHealth":
+        """Return the health of an array of which nothing is known: all channels kept.
 
         Parameters
         ----------
         n_channels : int
             M.
         reason : str
-            Why there is no estimate of the sample rate.
+            Why there is no estimate of the sample rate and of the coherence.
 
         Returns
         -------
         ArrayHealth
-            All channels kept.
+            Without faults.
+
+        Examples
+        --------
+        >>> ArrayHealth.unknown(3).mask.keep
+        array([ True,  True,  True])
         """
         nothing = NotUsable(reason)
         return cls(ChannelMask.all_of(n_channels), (), (), 0, nothing, nothing)
 
     @property
     def is_healthy(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there is no fault, no dropout and no wrong sample rate."""
         rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
-        return not (self.faults or self.n_gaps or rate_is_wrong)
+        return not (self.faults or self.n_dropouts or rate_is_wrong)
 
     def with_fault(self, *kinds: Fault) -> IndexArray:
-        """Channels that have one of these faults, ascending.
+        """Return the channels that have one of these faults, ascending.
 
         Parameters
         ----------
@@ -155,13 +160,5 @@ class ArrayHealth:
 
 
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:
-    """List one fault of several channels, (M,) each.
-
-    Shapes: found (M,), values (M,).
-
-    Examples
-    --------
-    >>> faults_where(Fault.DEAD, np.array([False, True]), np.array([0.0, 1.0]))
-    [ChannelFault(channel=1, fault=<Fault.DEAD: 'dead'>, value=1.0, looks_like=None)]
-    """
+    """List one kind of fault for all channels in which it was found; both arrays have shape (M,)."""
     return [ChannelFault(int(m), fault, float(values[m])) for m in np.flatnonzero(found)]

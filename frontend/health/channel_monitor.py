@@ -1,4 +1,4 @@
-"""Watching the microphones of a stream, hop by hop, against each other."""
+"""Monitor the channels of a stream, hop by hop, against each other."""
 
 import numpy as np
 
@@ -14,26 +14,32 @@ from .geometry_check import GeometryCheck
 from .running_mean import RunningMean
 from .sample_clock import SampleClock
 
-# Mean square of the band against the median channel's below which a channel counts as silent: -30 dB.
+# Mean square of the band, relative to the median channel, below which a channel is silent: -30 dB, far below
+# the few dB by which usable microphones differ.
 _SILENT = 1e-3
-# The same within one frame: no interference of sounds goes so deep.
+# The same within one frame, -50 dB: destructive interference does not reach that over a whole band.
 _DROPPED = 1e-5
-# A peak-to-peak that grows so much more than the other channels' is a crackle: seven times the usual noise.
+# A channel whose peak-to-peak value grows by this factor more than that of the others crackles; a loud event
+# raises all of them.
 _CRACKLE = 4.0
 # A mean above a tenth of the peak-to-peak sound (0.7 of its standard deviation), judged after two seconds.
 _OFFSET = 0.1
 _SETTLED_HOPS = 20
+# Gains within one array differ by 1 to 3 dB; 10 dB is a wrong setting or a covered capsule.
 _LEVEL_DB = 10.0
+# Share of samples at full scale from which clipping is audible in the spectra; a lone peak is less.
 _CLIPPED_SHARE = 1e-4
-_KEPT_GAPS = 16
+# Enough for a report; the count goes on beyond them.
+_KEPT_DROPOUTS = 16
+# Samples taken as one row by `_extremes`: a minimum along long rows is several times faster.
 _ROWS = 16
 _TINY = np.finfo(np.float64).tiny
-# Slow statistics are judged once in so many hops.
+# Statistics with a memory of seconds are evaluated once a second.
 _EVERY_HOPS = 10
 
 
 class ChannelMonitor:
-    """Statistics of every channel and what they say; memory does not grow.
+    """Collect the statistics of all channels and report their faults; memory does not grow.
 
     Examples
     --------
@@ -55,15 +61,15 @@ class ChannelMonitor:
     ) -> None:
         n = array.n_microphones
         self.clock = SampleClock(sample_rate_hz)
-        self._presence = ChannelActivity(n)
-        self._usual = RunningMean((3, n))
-        self._own: list[ChannelFault] = []
+        self._activity = ChannelActivity(n)
+        self._means = RunningMean((3, n))
+        self._single_channel: list[ChannelFault] = []
         self._n_hops = 0
-        self._rails = ClippingCounter(n)
-        self._gap_finder = DropoutFinder(n)
-        self._gaps: tuple[Dropout, ...] = ()
-        self._n_gaps = 0
-        self._places = GeometryCheck(array, frequencies_hz, speed_of_sound_m_s)
+        self._clipping = ClippingCounter(n)
+        self._dropout_finder = DropoutFinder(n)
+        self._dropouts: tuple[Dropout, ...] = ()
+        self._n_dropouts = 0
+        self._geometry_check = GeometryCheck(array, frequencies_hz, speed_of_sound_m_s)
 
     def push(
         self,
@@ -71,7 +77,7 @@ class ChannelMonitor:
         energies: FloatArray,
         matrices: Complex64Array,
     ) -> ArrayHealth:
-        r"""Take one hop, say which channels count in it and why.
+        r"""Take one hop; return the channels to keep and the faults.
 
         .. math:: \langle E_{tm} / \tilde E_t \rangle_t < 10^{-3}, \qquad
                   \min_t E_{tm} / \tilde E_t < 10^{-5}, \qquad
@@ -79,70 +85,75 @@ class ChannelMonitor:
 
         Shapes: samples (n, M), energies (frames, M), matrices (K, M, M).
         """
-        # A channel counts unless it has one of `MASKED_FAULTS` or is silent, breaks off or crackles in this
-        # hop: with its mean squares E over those of the median living channel and its peak-to-peak s over the
-        # usual one,
+        # E is the mean square of a frame and channel, E~ that of the median channel, s the peak-to-peak value
+        # and s-bar its running mean: a channel is left out of the hop if it is silent, breaks off or crackles
+        # in it, or if it has one of `MASKED_FAULTS`.
         lowest, highest = _extremes(samples)
         span = highest - lowest
         alive = span > 0.0
-        self._rails.push(samples, lowest, highest)
-        self._remember(self._gap_finder.push(samples, alive))
+        self._clipping.push(samples, lowest, highest)
+        self._remember(self._dropout_finder.push(samples, alive))
         bad = self._judge_hop(samples, energies, span)
-        self._places.push(matrices, len(energies), ~self._presence.suspects)
+        self._geometry_check.push(matrices, len(energies), ~self._activity.suspects)
         return self._report(bad)
 
-    def _remember(self, gaps: list[Dropout]) -> None:
-        self._n_gaps += len(gaps)
-        self._gaps = (*self._gaps, *gaps)[-_KEPT_GAPS:]
+    def _remember(self, dropouts: list[Dropout]) -> None:
+        self._n_dropouts += len(dropouts)
+        self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
 
     def _judge_hop(self, samples: Float32Array, energies: FloatArray, span: Float32Array) -> BoolArray:
-        """Which channels are silent or crackle in this hop."""
+        """Flag the channels that are silent or crackle in this hop."""
         alive = span > 0.0
         if not alive.any():
-            return self._presence.all_silent()
+            return self._activity.all_silent()
         typical = np.maximum(np.median(energies[:, alive], axis=1, keepdims=True), _TINY)
         level = (energies / typical).mean(axis=0)
         bad = ~alive | (level < _SILENT) | (energies < _DROPPED * typical).any(axis=0)
-        usual_span = self._usual.mean[0]
-        known = alive & (usual_span > 0.0)
+        mean_span = self._means.mean[0]
+        known = alive & (mean_span > 0.0)
         if known.any():
-            growth = np.divide(span, usual_span, out=np.zeros(len(span)), where=known)
+            growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
             bad |= growth > _CRACKLE * np.median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)
-        self._usual.add(np.stack([span, np.log(np.maximum(level, _SILENT)), share @ samples]), ~bad)
-        return self._presence.push(bad)
+        self._means.add(np.stack([span, np.log(np.maximum(level, _SILENT)), share @ samples]), ~bad)
+        return self._activity.push(bad)
 
     def _report(self, bad: BoolArray) -> ArrayHealth:
         if self._n_hops % _EVERY_HOPS == 0:
-            self._own = self._own_faults()
+            self._single_channel = self._single_channel_faults()
         self._n_hops += 1
-        faults = [*self._presence.faults(), *self._places.faults(), *self._own]
+        faults = [*self._activity.faults(), *self._geometry_check.faults(), *self._single_channel]
         faults.sort(key=lambda fault: (fault.channel, fault.fault))
         keep = ~bad
         for fault in faults:
             keep[fault.channel] &= fault.fault not in MASKED_FAULTS
         rate = self.clock.estimate()
         return ArrayHealth(
-            ChannelMask(keep), tuple(faults), self._gaps, self._n_gaps, self._places.coherence, rate
+            ChannelMask(keep),
+            tuple(faults),
+            self._dropouts,
+            self._n_dropouts,
+            self._geometry_check.coherence,
+            rate,
         )
 
-    def _own_faults(self) -> list[ChannelFault]:
-        """Faults that a channel shows without the others, dead ones left out."""
-        usable = ~self._presence.suspects
-        clipped = self._rails.clipped_share()
-        span, level, mean = self._usual.mean
+    def _single_channel_faults(self) -> list[ChannelFault]:
+        """Faults seen on a channel by itself: clipping, offset, level."""
+        usable = ~self._activity.suspects
+        clipped = self._clipping.clipped_share()
+        span, level, mean = self._means.mean
         offset = np.abs(mean) / np.maximum(span, np.finfo(np.float32).tiny)
-        heard = self._usual.count >= _SETTLED_HOPS
+        settled = self._means.count >= _SETTLED_HOPS
         level_db = 10.0 / np.log(10.0) * level
         return [
             *faults_where(Fault.CLIPPED, clipped > _CLIPPED_SHARE, clipped),
-            *faults_where(Fault.OFFSET, usable & heard & (offset > _OFFSET), offset),
-            *faults_where(Fault.LEVEL, usable & heard & (np.abs(level_db) > _LEVEL_DB), level_db),
+            *faults_where(Fault.OFFSET, usable & settled & (offset > _OFFSET), offset),
+            *faults_where(Fault.LEVEL, usable & settled & (np.abs(level_db) > _LEVEL_DB), level_db),
         ]
 
 
 def _extremes(samples: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Lowest and highest sample of every channel, (M,) each; long rows are faster than short ones."""
+    """Lowest and highest sample of every channel, (M,) each."""
     rows, n_channels = len(samples) // _ROWS * _ROWS, samples.shape[1]
     wide, rest = samples[:rows].reshape(-1, _ROWS * n_channels), samples[rows:]
     lowest = np.concatenate([wide.min(axis=0, initial=np.inf).reshape(-1, n_channels), rest]).min(axis=0)

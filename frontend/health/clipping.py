@@ -1,14 +1,15 @@
-"""Clipping: samples that pile up at one extreme value of a channel, wherever that value is."""
+"""Clipping: samples that accumulate at one extreme value of a channel, whatever that value is."""
 
 import numpy as np
 
 from worldstate.ground.typing import Float32Array, FloatArray
 
-# Width of the shell below an extreme that an unclipped distribution fills more than the extreme itself.
+# Width of the interval below an extreme, in halves of the span: an unclipped sound has more samples there
+# than at the extreme itself.
 _SHELL = np.float32(0.1)
-# A step to the next value, in halves of the span, above which quantisation looks like clipping.
+# Step to the next value, in halves of the span, from which coarse quantisation would be taken for clipping.
 _COARSE = np.float32(0.02)
-# Fewer samples at the extreme are chance.
+# Fewer samples at the extreme occur by chance.
 _MIN_COUNT = 16
 
 
@@ -19,16 +20,16 @@ class ClippingCounter:
     --------
     >>> sound = np.random.default_rng(0).standard_normal((4800, 2)).astype(np.float32)
     >>> sound[:, 1] = sound[:, 1].clip(-1.5, 1.5)
-    >>> rails = ClippingCounter(2)
+    >>> clipping = ClippingCounter(2)
     >>> for _ in range(2):
-    ...     rails.push(sound, sound.min(axis=0), sound.max(axis=0))
-    >>> rails.clipped_share().round(2)
+    ...     clipping.push(sound, sound.min(axis=0), sound.max(axis=0))
+    >>> clipping.clipped_share().round(2)
     array([0.  , 0.06])
     """
 
-    # An unclipped sound meets its extreme once, and more often the values just below it; a clipped one
-    # stays at it. Only hops that reach an extreme again are counted, so that a clean stream costs nothing;
-    # a new extreme starts the count anew, because what was below it was no rail.
+    # An unclipped sound reaches its extreme once and the values just below it more often; a clipped one stays
+    # at it. Only hops that reach the extreme again are counted, so that a clean stream costs nothing; a new
+    # extreme restarts the count, because the old one was no clipping level.
 
     def __init__(self, n_channels: int) -> None:
         self._n_samples = 0
@@ -44,7 +45,7 @@ class ClippingCounter:
 
         Shapes: samples (n, M), lowest, highest (M,).
         """
-        # and likewise of -x, s being the span of the hop.
+        # Counted for x and for -x; s is the span of the hop.
         self._n_samples += len(samples)
         span = highest - lowest
         self._side(0, np.float32(1.0), samples, highest, span)
@@ -74,7 +75,7 @@ class ClippingCounter:
             below[reached] += n_below * fine
 
     def clipped_share(self) -> FloatArray:
-        r"""Share of all samples that stand at a rail, (M,); 0 for channels without one.
+        r"""Share of all samples at a clipping level, shape (M,); 0 for channels without one.
 
         .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
         """

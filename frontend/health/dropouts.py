@@ -1,7 +1,7 @@
-"""Places where a stream is not what the microphones heard: samples missing, silent or repeated.
+"""Dropouts of the transport: samples that are missing, constant or repeated.
 
-All microphones of a recorder share its buffers, so that a fault of the transport shows in all channels at the
-same sample, which no sound does.
+All channels of a recorder share its buffers, so that a fault of the transport appears in all of them at the
+same sample; no sound does that.
 """
 
 from collections import Counter
@@ -13,21 +13,23 @@ from numpy.typing import NDArray
 
 from worldstate.ground.typing import BoolArray, Float32Array, IndexArray
 
-GapKind = Literal["still", "splice", "repeat"]
+DropoutKind = Literal["still", "splice", "repeat"]
 
-# Channels looked at, evenly picked: a few say what all would.
+# Channels examined, evenly picked: a dropout is at the same sample in all of them.
 _PICKED = 8
-# Samples without any change on any channel: so many, and more than coarse quantisation makes by chance.
+# Shortest run of constant samples, and the chance at which quantised sound may produce a run by itself.
 _SHORTEST_STILL = 16
 _STILL_CHANCE = 1e-12
-# Splice: mean squared jump over the channels, in units of each channel's own, a single one counting 25 at
-# most; clean simulated streets stay below 7.5 and most cuts are above 15.
+# Splice: mean squared prediction error over the channels, each relative to its own mean and at most 5^2, so
+# that one click is no splice; clean simulated streets stay below 7.5 and most cuts are above 15.
 _JUMP_CEILING = 5.0
 _JUMP_LIMIT = 12.0
-# ... and against the hop's own jumps: white sound from straight ahead jumps together, too.
+# The same relative to the other jumps of the hop: white sound from broadside jumps in all channels, too.
 _JUMP_CONTRAST = 3.0
+# With fewer channels the mean over them scatters beyond these limits.
 _MIN_SPLICE_CHANNELS = 6
-# Repeat: samples whose hash has five zeros in one place are compared with those of the last second or two.
+# Repeat: samples whose hash has five zero bits, one in 32, are compared with those of the last one or two
+# seconds; four that agree in their lag are no chance.
 _ANCHOR_BITS = np.uint64(31)
 _MIN_ANCHORS = 4
 _GENERATION_HOPS = 10
@@ -36,7 +38,7 @@ _TINY = np.finfo(np.float32).tiny
 
 @dataclass(frozen=True, slots=True)
 class Dropout:
-    """A place where the stream is broken.
+    """A place where the stream is interrupted.
 
     Examples
     --------
@@ -45,15 +47,15 @@ class Dropout:
     """
 
     # "still": no channel changes; "splice": the sound jumps, samples are missing; "repeat": the samples
-    # have been there before.
-    kind: GapKind
-    sample: int  # Where, from the start of the stream
-    # Length, that of a repeat to some ten samples; None for a splice, whose length leaves no trace.
+    # came before.
+    kind: DropoutKind
+    sample: int  # First sample, from the start of the stream
+    # Length, that of a repeat to about ten samples; None for a splice, whose length is not known.
     n_samples: int | None
 
 
 class DropoutFinder:
-    """Find gaps hop by hop.
+    """Find dropouts hop by hop.
 
     Examples
     --------
@@ -70,35 +72,32 @@ class DropoutFinder:
         self._repeats = RepeatFinder()
 
     def push(self, samples: Float32Array, alive: BoolArray) -> list[Dropout]:
-        """Take the samples (n, M) of a hop and the channels that are not constant in it.
-
-        Shapes: samples (n, M), alive (M,).
-        """
+        """Take the samples (n, M) of a hop and the channels (M,) that are not constant in it."""
         start = self._n_seen - len(self._tail)
         sound = self._picked(samples, alive)
         self._tail = samples[-2:].copy()
         self._n_seen += len(samples)
         change = sound[:, 1:] - sound[:, :-1]
         still = np.asarray((change == 0.0).all(axis=0))
-        gaps = self._still.push(still[-len(samples) :], self._n_seen)
+        dropouts = self._still.push(still[-len(samples) :], self._n_seen)
         if len(sound) >= _MIN_SPLICE_CHANNELS:
-            gaps += find_splices(change, start + 1, still)
-        gaps += self._repeats.push(sound[:, -len(samples) :], self._n_seen)
-        return sorted(gaps, key=lambda gap: gap.sample)
+            dropouts += find_splices(change, start + 1, still)
+        dropouts += self._repeats.push(sound[:, -len(samples) :], self._n_seen)
+        return sorted(dropouts, key=lambda dropout: dropout.sample)
 
     def _picked(self, samples: Float32Array, alive: BoolArray) -> Float32Array:
-        """Give a few living channels, channel by channel: what follows runs along time."""
+        """Return a few live channels, shape (channels, n), the end of the last hop in front."""
         every = max(-(-int(np.count_nonzero(alive)) // _PICKED), 1)
         picks = slice(None, None, every) if alive.all() else np.flatnonzero(alive)[::every]
-        heard = samples.T[picks]
-        sound = np.empty((len(heard), len(self._tail) + len(samples)), np.float32)
+        picked = samples.T[picks]
+        sound = np.empty((len(picked), len(self._tail) + len(samples)), np.float32)
         sound[:, : len(self._tail)] = self._tail.T[picks]
-        sound[:, len(self._tail) :] = heard
+        sound[:, len(self._tail) :] = picked
         return sound
 
 
 class StillRuns:
-    """Runs of samples in which nothing changes, across hops; one that opens the stream is no gap.
+    """Find runs of samples in which no channel changes, across hops; a run at the start is none.
 
     Examples
     --------
@@ -110,19 +109,17 @@ class StillRuns:
 
     def __init__(self) -> None:
         self._length = 0
-        self._heard = False
+        self._has_changed = False
         self._n_still, self._n_moving = 0, 0
 
     def push(self, still: BoolArray, end: int) -> list[Dropout]:
-        r"""Take one flag per sample, the last being sample `end` - 1; give the runs that end here.
+        r"""Take one flag per sample, the last being sample `end` - 1; return the runs that end here.
 
         .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
-
-        Shapes: still (n,).
         """
-        # A run is a gap from the length L that still samples by chance, a share q of all, hardly make:
+        # L is the length that constant samples by chance, a share q of all, reach once in 1e12.
         if not (still.any() or self._length):
-            self._heard = True
+            self._has_changed = True
             self._n_moving += len(still)
             return []
         moving = np.flatnonzero(~still)
@@ -133,15 +130,17 @@ class StillRuns:
         edges = np.concatenate([[-1 - self._length], moving])
         lengths = np.diff(edges) - 1
         found = np.flatnonzero(lengths >= self._shortest(lengths))
-        gaps = [Dropout("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
-        if not self._heard:
-            gaps = [gap for gap in gaps if gap.sample > 0 and gap.sample >= first + moving[0]]
-        self._heard = True
+        dropouts = [Dropout("still", int(first + edges[i]), int(lengths[i]) + 1) for i in found]
+        if not self._has_changed:
+            dropouts = [
+                dropout for dropout in dropouts if dropout.sample > 0 and dropout.sample >= first + moving[0]
+            ]
+        self._has_changed = True
         self._length = int(len(still) - 1 - moving[-1])
-        return gaps
+        return dropouts
 
     def _shortest(self, lengths: IndexArray) -> float:
-        """Length that single samples which do not change, as often as they come, hardly make."""
+        """Shortest run that is not explained by the share of constant samples met so far."""
         self._n_still += int(lengths[lengths < _SHORTEST_STILL].sum())
         self._n_moving += len(lengths)
         share = self._n_still / (self._n_still + self._n_moving)
@@ -149,18 +148,13 @@ class StillRuns:
 
 
 def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dropout]:
-    r"""Find samples at which the sound of all channels at once is not what its last samples foretell.
+    r"""Find samples at which the linear prediction fails in all channels at once.
 
     .. math:: e[n] = d[n] - \rho\, d[n-1], \quad \rho = \frac{\sum d[n]\, d[n-1]}{\sum d[n]^2}, \qquad
               J[n] = \Big\langle \min\Big(\frac{\max(e[n]^2, e[n+1]^2)}{\langle e^2 \rangle}, 25\Big)
               \Big\rangle_{channels},
 
     Shapes: change (channels, n), still (n,).
-
-    References
-    ----------
-    J. Makhoul, "Linear prediction: a tutorial review", Proc. IEEE 63, 1975 (the error). Derived here: the
-    mean over channels, as a splice is at the same sample in all of them and no sound is.
 
     Examples
     --------
@@ -169,13 +163,12 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
     >>> find_splices(change, 1, np.zeros(3899, bool))
     [Dropout(kind='splice', sample=2000, n_samples=None)]
     """
-    # With d the differences, e their prediction errors and J the jump of two samples,
-    #
-    # a splice is where J is above 12, and above three times the fifth largest of the hop.
+    # d are the differences of successive samples, e their prediction errors and J the jump over two samples:
+    # a splice has J above 12 and above three times the fifth largest of the hop.
     error = _prediction_error(change)
     np.square(error, out=error)
     error /= np.maximum(error.mean(axis=1, keepdims=True), _TINY)
-    # What no ceiling lowers is the most that a jump can be: a clean hop ends here.
+    # An upper limit of J, without the ceiling: a clean hop ends here.
     if 2.0 * float(error.mean(axis=0).max()) < _JUMP_LIMIT:
         return []
     np.minimum(error, _JUMP_CEILING**2, out=error)
@@ -188,8 +181,8 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
 
 
 def _prediction_error(change: Float32Array) -> Float32Array:
-    """Remainder of the best prediction of every difference from the one before, one rule for all channels."""
-    # A product or two reach from one channel into the next: nothing among thousands.
+    """Error of the best first-order prediction of the differences, one coefficient for all channels."""
+    # Taken over the flat array: the few products that cross from one channel to the next do not matter.
     flat = change.ravel()
     power, product = float(flat @ flat), float(flat[1:] @ flat[:-1])
     rule = np.float32(product / power if power > 0.0 else 0.0)
@@ -197,7 +190,7 @@ def _prediction_error(change: Float32Array) -> Float32Array:
 
 
 class RepeatFinder:
-    """Samples that were there before, found by hashes of single samples over several channels.
+    """Find samples that are repeated, by hashes of single samples over several channels.
 
     Examples
     --------
@@ -207,9 +200,9 @@ class RepeatFinder:
     ([], 'repeat')
     """
 
-    # Sound never repeats to the last bit on eight channels. Only samples whose hash has five zeros in one
-    # place are kept, so that the same samples are kept when they come again. Memory does not grow: two
-    # generations of a second each.
+    # Sound never repeats to the last bit on eight channels. Only hashes with five zero bits are kept (Manber,
+    # "Finding similar files in a large file system", 1994), so that the same samples are kept when they
+    # return. Memory does not grow: two generations of one second each.
 
     def __init__(self) -> None:
         odd = np.random.default_rng(0).integers(1, 2**62, _PICKED, dtype=np.uint64)
@@ -227,13 +220,6 @@ class RepeatFinder:
                   \hat\ell = \mathrm{mode}\{n - n' : h[n] = h[n']\}
 
         with the bits b of a sample, odd random factors a, and only those n at which five bits of h are zero.
-
-        Shapes: sound (channels, n).
-
-        References
-        ----------
-        U. Manber, "Finding similar files in a large file system", USENIX Winter Conference, 1994
-        (fingerprints kept where some of their bits are zero).
         """
         if len(sound) < 2:
             return []

@@ -1,11 +1,11 @@
-"""A running mean per channel that leaves out the hops in which a channel was of no use."""
+"""A running mean per channel over its usable hops."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.ground.typing import BoolArray
 
-# Time constant, hops: three seconds.
+# Time constant, hops: three seconds follow the traffic and average over single events.
 _HOPS = 30
 
 
@@ -14,10 +14,10 @@ class RunningMean:
 
     Examples
     --------
-    >>> slow = RunningMean((1, 2))
-    >>> slow.add([[1.0, 5.0]], np.array([True, True]))
-    >>> slow.add([[3.0, 7.0]], np.array([True, False]))
-    >>> slow.mean, slow.count
+    >>> mean = RunningMean((1, 2))
+    >>> mean.add([[1.0, 5.0]], np.array([True, True]))
+    >>> mean.add([[3.0, 7.0]], np.array([True, False]))
+    >>> mean.mean, mean.count
     (array([[2., 5.]]), array([2, 1]))
     """
 
@@ -26,11 +26,9 @@ class RunningMean:
         self.count = np.zeros(shape[1], np.int64)
 
     def add(self, values: ArrayLike, good: BoolArray) -> None:
-        r"""Take the values of a hop, of this shape, and the channels that are good (M,).
+        r"""Take the values of a hop, shape (statistics, M), and the usable channels, shape (M,).
 
-        .. math:: \mu \leftarrow \mu + \frac{x - \mu}{\min(n, 30)}
-
-        Shapes: values (M, ...), good (M,).
+        .. math:: \mu_{sm} \leftarrow \mu_{sm} + g_m \frac{x_{sm} - \mu_{sm}}{\min(n_m, 30)}
         """
         self.count += good
         weight = good / np.clip(self.count, 1, _HOPS)

@@ -1,11 +1,11 @@
-r"""How many samples a second there really are, by another clock.
+r"""The true sample rate, measured against another clock.
 
 .. math:: n_i = n_0 + f_s t_i + \epsilon_i, \qquad
           \hat f_s = \frac{\sum_i (t_i - \bar t)(n_i - \bar n)}{\sum_i (t_i - \bar t)^2}, \qquad
           \sigma^2_{\hat f} = \frac{s^2}{\sum_i (t_i - \bar t)^2}
 
-least squares over the pairs (samples so far, time of arrival). A recorder that runs at 47,998 Hz where its
-header says 48,000 is 42 millionths off: a clock that is good to a millisecond needs two minutes to see it.
+least squares over the pairs (number of samples, capture time). A recorder at 47,998 Hz whose header says
+48,000 is 42 ppm off: a clock with an error of one millisecond shows it after two minutes.
 """
 
 import math
@@ -15,11 +15,11 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, seconds
 
-# Fewer pairs say too little about their own scatter.
+# With fewer pairs their scatter, and so the standard deviation, is not known.
 _MIN_READINGS = 10
-# An error that many standard deviations large is one.
+# An error of four standard deviations is significant: one false report in 16,000.
 _SIGNIFICANT = 4.0
-# Crystals are good to some ten millionths; below this nobody would care.
+# Crystals have an error of about 10 ppm; less has no effect on bearing or level.
 _TOLERATED = 1e-5
 
 
@@ -35,7 +35,7 @@ class RateEstimate:
 
     rate_hz: float  # Estimate and standard deviation
     std_hz: float
-    nominal_hz: float  # What the stream calls itself
+    nominal_hz: float  # Rate in the header of the stream
 
     @property
     def error(self) -> float:
@@ -44,7 +44,7 @@ class RateEstimate:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the nominal rate is off by more than 10 millionths and four standard deviations."""
+        """Whether the nominal rate is off by more than 10 ppm and four standard deviations."""
         limit = max(_SIGNIFICANT * self.std_hz / self.nominal_hz, _TOLERATED)
         return abs(self.error) > limit
 
@@ -52,7 +52,7 @@ class RateEstimate:
 def rate_from_duration(
     n_samples: int, duration_s: float, duration_std_s: float, nominal_hz: float
 ) -> RateEstimate:
-    r"""Sample rate from the length of a recording by another clock, such as a camera's.
+    r"""Estimate the sample rate from the duration of a recording by another clock, such as a camera's.
 
     .. math:: \hat f_s = n / T, \qquad \sigma_{\hat f} = \hat f_s\, \sigma_T / T
 
@@ -68,12 +68,20 @@ def rate_from_duration(
 
 
 class SampleClock:
-    """Line through the samples against the time of a caller's clock, in constant memory.
+    r"""Estimate of the sample rate from capture times, in constant memory.
+
+    .. math:: \hat f_s = f_{nom} + \frac{S_{te}}{S_{tt}}, \qquad e_n = n - f_{nom} t_n
+
+    with the centred sums S over the pairs of time t and excess e over the nominal rate.
 
     Parameters
     ----------
     nominal_hz : float
-        Rate that the stream calls its own.
+        Rate in the header of the stream, Hz.
+
+    References ---------- B. P. Welford, "Note on a method for calculating corrected sums of squares and
+    products", Technometrics 4, 1962 (the running sums); N. Draper and H. Smith, *Applied Regression
+    Analysis*, 1966, chapter 1 (the line).
 
     Examples
     --------
@@ -93,27 +101,26 @@ class SampleClock:
         self._tt = self._te = self._ee = 0.0
 
     def read(self, n_samples: int, captured_ns: int) -> None:
-        r"""Take the time at which sample number `n_samples` was captured.
-
-        .. math:: \bar t \leftarrow \bar t + \frac{t - \bar t}{n}, \qquad
-                  S_{te} \leftarrow S_{te} + (t - \bar t_{old}) (e - \bar e_{new}), \qquad e = n_t - f_{nom} t
+        """Take the capture time of the sample that is `n_samples` from the start.
 
         Parameters
         ----------
         n_samples : int
-            Samples so far.
+            Number of samples so far.
         captured_ns : int
-            When the last of them was captured, nanoseconds of the clock to compare with.
+            Capture time of the last of them by the other clock, nanoseconds.
 
         Raises
         ------
         InvalidArgumentError
             If either clock runs backwards.
 
-        References
-        ----------
-        B. P. Welford, "Note on a method for calculating corrected sums of squares and products",
-        Technometrics 4, 1962.
+        Examples
+        --------
+        >>> clock = SampleClock(nominal_hz=48_000.0)
+        >>> clock.read(n_samples=4800, captured_ns=100_000_000)
+        >>> clock.estimate()
+        NotUsable(reason='needs 10 readings of a clock, got 1')
         """
         if self._origin is None:
             self._origin = n_samples, captured_ns
@@ -137,7 +144,7 @@ class SampleClock:
         self._ee += de * (e - self._mean_e)
 
     def estimate(self) -> RateEstimate | NotUsable:
-        r"""Return the rate so far; at least ten readings at different times.
+        r"""Return the rate over all readings so far, at least ten at different times.
 
         .. math:: \hat f_s = f_{nom} + \frac{S_{te}}{S_{tt}}, \qquad
                   \sigma^2 = \frac{S_{ee} - S_{te}^2 / S_{tt}}{(n - 2)\, S_{tt}}
@@ -146,10 +153,6 @@ class SampleClock:
         -------
         RateEstimate or NotUsable
             Hz, with its standard deviation.
-
-        References
-        ----------
-        N. Draper and H. Smith, *Applied Regression Analysis*, 1966, chapter 1 (the straight line).
         """
         if self._n < _MIN_READINGS or self._tt <= 0.0:
             return NotUsable(f"needs {_MIN_READINGS} readings of a clock, got {self._n}")

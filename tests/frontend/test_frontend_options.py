@@ -155,7 +155,7 @@ def test_the_frame_tells_the_twin_and_the_grid_shows_it() -> None:
     assert np.degrees(solid.bearing_rad) == pytest.approx(30.0, abs=1.0)
 
 
-EGO = FrontEndSettings(music_sources=1, ego_noise=EgoNoiseSettings(guard_hops=0, only_from_below=False))
+EGO = FrontEndSettings(music_sources=1, ego_noise=EgoNoiseSettings(guard_hops=0, only_below_horizon=False))
 
 
 def test_prewhitened_music_hears_past_the_own_noise() -> None:

@@ -154,7 +154,7 @@ def test_reasons():
     assert "no stable line" in radial_speed(track_fundamental(noise, RATE)).reason
     assert "does not move" in radial_speed(track_fundamental(standing, RATE)).reason
     x, _, _ = pass_by(rng, 60.0, 12.0, 2.5, 6.0)
-    lines = radial_speed(track_fundamental(x, RATE), DopplerSettings(min_lines=100))
+    lines = radial_speed(track_fundamental(x, RATE), DopplerSettings(min_partials=100))
     assert "fewer than 100" in lines.reason
     x, _, _ = pass_by(rng, 60.0, 15.0, 5.5, 3.0, duration=3.0)
     only_coming = radial_speed(track_fundamental(x, RATE))
@@ -165,7 +165,7 @@ def test_disagreeing_harmonics_are_refused():
     x, _, _ = pass_by(np.random.default_rng(1), 60.0, 12.0, 2.5, 6.0)
     track = track_fundamental(x, RATE)
     inharmonic = HarmonicTrack(
-        track.time_s, track.frequency_hz, track.variance_hz2, track.lines, track.misfit + 9,
+        track.time_s, track.frequency_hz, track.variance_hz2, track.n_partials, track.misfit + 9,
         track.level_db, track.windows,
     )  # fmt: skip
     assert isinstance(radial_speed(track), RadialSpeed)

@@ -70,7 +70,7 @@ def test_variance_meets_the_decimated_bound(snr_db: float, low_hz: float, high_h
         assert isinstance(reading, ToneReading)
         errors.append(reading.frequency_hz - frequency)
         claimed.append(reading.frequency_std_hz**2)
-    bound = tone_crb_hz2(eta, len(stage._heard), rate)
+    bound = tone_crb_hz2(eta, len(stage._band_samples), rate)
     spread = 3 * np.sqrt(2 / trials)
     assert 10 * np.log10(1 - spread) < 10 * np.log10(np.mean(np.square(errors)) / bound) < 1.5
     assert abs(10 * np.log10(np.mean(claimed) / bound)) < 1.0

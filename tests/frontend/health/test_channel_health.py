@@ -129,7 +129,7 @@ def test_every_fault_is_named_and_nothing_else(
     assert named(last) == expected
     left_out = np.flatnonzero(~last.mask.keep).tolist()
     assert left_out == (next(iter(expected.values())) if masked else [])
-    assert last.n_gaps == 0
+    assert last.n_dropouts == 0
 
 
 def test_a_swap_says_where_the_channels_belong() -> None:
@@ -186,7 +186,7 @@ def test_silence_is_dead_after_a_second() -> None:
     array = MicrophoneArray(ROOF.positions_m[:4])
     last = healths(array, np.zeros((3 * RATE, 4)))[-1]
     assert named(last) == {"dead": [0, 1, 2, 3]}
-    assert last.n_gaps == 0
+    assert last.n_dropouts == 0
 
 
 def test_a_channel_that_dies_is_left_out_at_once_and_comes_back() -> None:
@@ -319,8 +319,8 @@ def test_reports_do_not_depend_on_the_block_size(cuts: list[int]) -> None:
     pieces = [f.health for b in np.split(sound, sorted(cuts)) for f in front_end.process(b)]
     for one, other in zip(whole, pieces, strict=True):
         assert isinstance(other, ArrayHealth)
-        assert (one.faults, one.gaps, one.coherence) == (other.faults, other.gaps, other.coherence)
-    assert whole[-1].n_gaps == 1
+        assert (one.faults, one.dropouts, one.coherence) == (other.faults, other.dropouts, other.coherence)
+    assert whole[-1].n_dropouts == 1
 
 
 def test_memory_does_not_grow_while_masks_change() -> None:
@@ -368,12 +368,14 @@ def test_gaps_are_found_where_they_are() -> None:
     cut[70_000:70_800] = cut[69_200:70_000]
     last = healths(HALF, cut)[-1]
     assert last.faults == ()
-    splices = [gap.sample for gap in last.gaps if gap.kind == "splice"]
+    splices = [dropout.sample for dropout in last.dropouts if dropout.kind == "splice"]
     assert splices[0] == pytest.approx(30_000, abs=1)
     # The ends of a repeat are cuts, too.
     assert all(min(abs(s - 70_000), abs(s - 70_800)) <= 1 for s in splices[1:])
-    assert [(gap.sample, gap.n_samples) for gap in last.gaps if gap.kind == "still"] == [(49_999, 301)]
-    (repeat,) = (gap for gap in last.gaps if gap.kind == "repeat")
+    assert [(dropout.sample, dropout.n_samples) for dropout in last.dropouts if dropout.kind == "still"] == [
+        (49_999, 301)
+    ]
+    (repeat,) = (dropout for dropout in last.dropouts if dropout.kind == "repeat")
     assert 70_000 <= repeat.sample < 70_800
 
 
@@ -385,10 +387,10 @@ def test_four_cuts_in_five_are_found_in_simulated_streets() -> None:
         rng = np.random.default_rng(seed)
         audio = simulate_recording(draw_settings("SA1", approach, rng, duration_s=1.5), rng, array).audio
         for _ in range(25):
-            start, gap = rng.integers(0, 30_000), rng.integers(64, 9600)
-            joined = np.concatenate([audio[start : start + 2400], audio[start + 2400 + gap :][:2400]])
-            gaps = DropoutFinder(14).push(joined, np.ones(14, bool))
-            found += any(gap.kind == "splice" and abs(gap.sample - 2400) <= 1 for gap in gaps)
+            start, dropout = rng.integers(0, 30_000), rng.integers(64, 9600)
+            joined = np.concatenate([audio[start : start + 2400], audio[start + 2400 + dropout :][:2400]])
+            dropouts = DropoutFinder(14).push(joined, np.ones(14, bool))
+            found += any(dropout.kind == "splice" and abs(dropout.sample - 2400) <= 1 for dropout in dropouts)
             clean = DropoutFinder(14).push(audio[start : start + 4800], np.ones(14, bool))
             assert clean == []
     assert found >= 160
@@ -402,10 +404,10 @@ def test_a_clipped_wave_is_clipped_and_a_whole_one_is_not(
     rng = np.random.default_rng(0)
     wave = amplitude * (np.sin(2 * np.pi * np.arange(9600) / period) + 0.1 * rng.standard_normal(9600))
     both = np.round(np.stack([wave, wave.clip(-9e9, limit * amplitude)], axis=1)).astype(np.float32)
-    rails = ClippingCounter(2)
+    clipping = ClippingCounter(2)
     for hop in np.split(both, 2):
-        rails.push(hop, hop.min(axis=0), hop.max(axis=0))
-    share = rails.clipped_share()
+        clipping.push(hop, hop.min(axis=0), hop.max(axis=0))
+    share = clipping.clipped_share()
     assert share[0] == 0.0
     assert share[1] > 0.03
 

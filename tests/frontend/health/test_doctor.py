@@ -77,7 +77,7 @@ def test_it_says_what_to_do(street: np.ndarray, write: Callable, capsys: pytest.
     assert sorted(table) == [4, 13, 21, 31, 41, 51]
     for channel, words in {4: "channel 41", 41: "channel 4:", 13: "polarity", 21: "gain", 31: "mean"}.items():
         assert words in table[channel]
-    assert any(line.startswith("1 gap (splice at sample ") for line in lines)
+    assert any(line.startswith("1 dropout (splice at sample ") for line in lines)
     assert lines[-1].startswith("not healthy: swapped 4, 41;")
 
 

@@ -23,8 +23,10 @@ def as_json(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray)
         "coherence": None if isinstance(health.coherence, NotUsable) else health.coherence,
         "masked_microphones": [channel + 1 for channel in health.masked_channels],
         "faults": [_fault_json(verdict) for verdict in health.verdicts],
-        "n_gaps": health.n_gaps,
-        "gaps": [{"kind": g.kind, "sample": g.sample, "n_samples": g.n_samples} for g in health.gaps],
+        "n_dropouts": health.n_dropouts,
+        "dropouts": [
+            {"kind": one.kind, "sample": one.sample, "n_samples": one.n_samples} for one in health.dropouts
+        ],
         "measured_rate_hz": rate and rate.rate_hz,
         "measured_rate_std_hz": rate and rate.std_hz,
     }
@@ -78,11 +80,11 @@ def _advice(verdict: ChannelVerdict) -> str:
 
 
 def _other_lines(health: RecordingHealth) -> Iterator[str]:
-    if health.n_gaps:
-        shown = ", ".join(f"{gap.kind} at sample {gap.sample}" for gap in health.gaps[:5])
-        more = ", ..." if health.n_gaps > 5 else ""
-        gaps = "1 gap" if health.n_gaps == 1 else f"{health.n_gaps} gaps"
-        yield f"{gaps} ({shown}{more}): check the recorder's buffers"
+    if health.n_dropouts:
+        shown = ", ".join(f"{one.kind} at sample {one.sample}" for one in health.dropouts[:5])
+        more = ", ..." if health.n_dropouts > 5 else ""
+        count = "1 dropout" if health.n_dropouts == 1 else f"{health.n_dropouts} dropouts"
+        yield f"{count} ({shown}{more}): check the recorder's buffers"
     if isinstance(health.sample_rate, RateEstimate):
         rate = health.sample_rate
         ppm = f"{rate.rate_hz:.2f} +- {rate.std_hz:.2f} Hz, {1e6 * rate.error:+.0f} millionths off"

@@ -8,8 +8,8 @@ from worldstate.frontend.health.dropouts import Dropout
 from worldstate.frontend.health.sample_clock import RateEstimate
 from worldstate.ground.values import NotUsable, seconds
 
-# Gaps beyond these are counted, not listed.
-_LISTED_GAPS = 100
+# Dropouts beyond these are counted, not listed.
+_LISTED_DROPOUTS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +46,8 @@ class RecordingHealth:
     """
 
     verdicts: tuple[ChannelVerdict, ...]  # By channel; empty where nothing was wrong
-    gaps: tuple[Dropout, ...]  # The first hundred
-    n_gaps: int  # All of them
+    dropouts: tuple[Dropout, ...]  # The first hundred
+    n_dropouts: int  # All of them
     n_hops: int  # Hops listened to
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
     sample_rate: RateEstimate | NotUsable  # By another clock
@@ -56,7 +56,7 @@ class RecordingHealth:
     def is_healthy(self) -> bool:
         """Whether nothing was wrong."""
         rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
-        return not (self.verdicts or self.n_gaps or rate_is_wrong)
+        return not (self.verdicts or self.n_dropouts or rate_is_wrong)
 
     @property
     def masked_channels(self) -> tuple[int, ...]:
@@ -84,7 +84,7 @@ class HealthLog:
     def __init__(self) -> None:
         self._n_hops = 0
         self._seen: dict[tuple[int, Fault], ChannelVerdict] = {}
-        self._gaps: list[Dropout] = []
+        self._dropouts: list[Dropout] = []
         self._latest: ArrayHealth | None = None
 
     def add(self, frame: AcousticFrame) -> None:
@@ -93,8 +93,10 @@ class HealthLog:
         health = frame.health
         if isinstance(health, NotUsable):
             return
-        n_new = health.n_gaps - (self._latest.n_gaps if self._latest else 0)
-        self._gaps.extend(health.gaps[-n_new:] if n_new and len(self._gaps) < _LISTED_GAPS else ())
+        n_new = health.n_dropouts - (self._latest.n_dropouts if self._latest else 0)
+        self._dropouts.extend(
+            health.dropouts[-n_new:] if n_new and len(self._dropouts) < _LISTED_DROPOUTS else ()
+        )
         self._latest = health
         for fault in health.faults:
             key = fault.channel, fault.fault
@@ -115,8 +117,8 @@ class HealthLog:
         unknown = NotUsable("nothing heard")
         return RecordingHealth(
             verdicts=self._verdicts(),
-            gaps=tuple(self._gaps[:_LISTED_GAPS]),
-            n_gaps=latest.n_gaps if latest else 0,
+            dropouts=tuple(self._dropouts[:_LISTED_DROPOUTS]),
+            n_dropouts=latest.n_dropouts if latest else 0,
             n_hops=self._n_hops,
             coherence=latest.coherence if latest else unknown,
             sample_rate=latest.sample_rate if latest else unknown,

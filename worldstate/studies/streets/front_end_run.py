@@ -31,7 +31,7 @@ from worldstate.state import Context
 from .recording_features import NONE_APPROACH, TwinRecording
 
 # The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
-DOPPLER = DopplerSettings(min_lines=2)
+DOPPLER = DopplerSettings(min_partials=2)
 # Half a camera period: the frame nearest in time to the middle of a bearing's window is the one to compare.
 NEAREST_S = 0.5 / FRAME_RATE_HZ
 
