@@ -1,15 +1,13 @@
 """How degraded a camera is, read from its own images: nobody has to tell the filter."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.schema import read_number, read_numbers
 from worldstate.ground.typing import FloatArray, ImageArray, IntArray
 
 from .degradation import LEVELS, degrade, level_of
@@ -75,25 +73,6 @@ class CameraHealth:
         darkness = level_of("darkness", min(quality.brightness / self.brightness, 1.0))
         noise = float(np.interp(quality.noise, self.noise, LEVELS))
         return Health(blur, darkness, noise)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "brightness": self.brightness,
-            "sharpness": list(self.sharpness),
-            "noise": list(self.noise),
-        }
-
-    @classmethod
-    def from_dict(cls, data: object) -> "CameraHealth":
-        """Return what `to_dict` wrote; unknown keys are ignored."""
-        if not isinstance(data, Mapping):
-            raise InvalidArgumentError("health: expected an object")
-        return cls(
-            brightness=read_number(data.get("brightness"), "brightness"),
-            sharpness=read_numbers(data.get("sharpness"), "sharpness"),
-            noise=read_numbers(data.get("noise"), "noise"),
-        )
 
 
 def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> CameraHealth:

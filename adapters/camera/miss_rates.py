@@ -5,26 +5,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from worldstate.abduction.absence import MissRateTable
 from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
 from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.json_file import read_json, refused_as_file
 from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.reading import decode_json
-from worldstate.ground.schema import check_schema, read_numbers, read_rows, schema_stamp
-from worldstate.ground.serialisation import encode
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import ADDED, Layout, decode, encode
 from worldstate.ground.typing import FloatArray
 
 from .camera_health import CameraHealth, Health
 from .degradation import LEVELS
 
-SCHEMA = "worldstate.MissRates"
-VERSION = "1.0.0"
-MAX_BYTES = 16 << 20
 MOST_FAMILIES = 100
 # Jeffreys' prior of a rate.
 PRIOR = 0.5
@@ -104,18 +100,22 @@ class MissRates:
         If bins and counts do not fit.
     """
 
+    LAYOUT: ClassVar = Layout("worldstate.MissRates", "1.0.0", order="provenance azimuth_deg repeats health")
+
     azimuth_deg: tuple[float, ...]
     families: Mapping[str, FamilyCounts]
-    provenance: Mapping[str, str] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict, metadata=ADDED)
     health: CameraHealth | None = None
-    repeats: float = 1.0
+    repeats: float = field(default=1.0, metadata=ADDED)
 
     def __post_init__(self) -> None:
         edges = finite_array("azimuth_deg", self.azimuth_deg, (None,))
         if edges.size < 2 or edges[0] != 0.0 or edges[-1] > 180.0 or (np.diff(edges) <= 0).any():
             raise InvalidArgumentError("azimuth_deg: expected edges that increase from 0 to at most 180")
-        if not self.families or any(len(c.looks) != edges.size - 1 for c in self.families.values()):
-            raise InvalidArgumentError(f"families: expected at least one, each with {edges.size - 1} bins")
+        if not 0 < len(self.families) <= MOST_FAMILIES:
+            raise InvalidArgumentError(f"families: expected 1 to {MOST_FAMILIES}, got {len(self.families)}")
+        if any(len(counts.looks) != edges.size - 1 for counts in self.families.values()):
+            raise InvalidArgumentError(f"families: expected {edges.size - 1} bins in each")
         if not 1.0 <= self.repeats <= 1000.0:
             raise InvalidArgumentError(f"repeats: expected a number in [1, 1000], got {self.repeats}")
 
@@ -151,40 +151,7 @@ class MissRates:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values with the schema's name and version."""
-        return {
-            **schema_stamp(SCHEMA, VERSION),
-            "provenance": dict(self.provenance),
-            "azimuth_deg": list(self.azimuth_deg),
-            "repeats": self.repeats,
-            "health": None if self.health is None else self.health.to_dict(),
-            "families": {name: _counts_to_dict(counts) for name, counts in self.families.items()},
-            "table": encode(self.table),
-        }
-
-    @classmethod
-    def from_dict(cls, data: object, source: object = "miss rates") -> "MissRates":
-        """Return what `to_dict` wrote; the tables are formed anew from the counts.
-
-        Raises
-        ------
-        InputFileError
-            If something is missing, of the wrong type or out of range; it begins with `source`.
-        SchemaVersionError
-            If the major version is another one.
-        """
-        fields = check_schema(data, SCHEMA, VERSION, source)
-        try:
-            families = _mapping(fields.get("families"), "families")
-            health = fields.get("health")
-            return cls(
-                azimuth_deg=read_numbers(fields.get("azimuth_deg"), "azimuth_deg"),
-                families={str(name): _counts(value) for name, value in families.items()},
-                provenance=_texts(fields.get("provenance", {})),
-                health=None if health is None else CameraHealth.from_dict(health),
-                repeats=read_numbers([fields.get("repeats", 1.0)], "repeats")[0],
-            )
-        except InvalidArgumentError as error:
-            raise InputFileError(source, str(error)) from error
+        return {**encode(self), "table": encode(self.table)}
 
     def _table(self, beta: FloatArray) -> MissRateTable:
         edges = np.array(self.azimuth_deg)
@@ -232,50 +199,6 @@ def load_miss_rates(path: str | Path) -> MissRates:
     SchemaVersionError
         If it is of another major version.
     """
-    name = Path(path)
-    try:
-        with name.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise InputFileError(name, f"expected miss rates of at most {MAX_BYTES >> 20} MiB")
-        return MissRates.from_dict(decode_json(data.decode("utf-8"), "miss rates"), name)
-    except OSError as error:
-        raise InputFileError(name, f"expected a file of miss rates ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputFileError(name, "expected a file in UTF-8") from error
-    except InputFileError:
-        raise
-    except InvalidArgumentError as error:
-        raise InputFileError(name, str(error)) from error
-
-
-def _counts_to_dict(counts: FamilyCounts) -> dict[str, Any]:
-    return {
-        "looks": [list(row) for row in counts.looks],
-        "misses": [list(row) for row in counts.misses],
-        "sectors": list(counts.sectors),
-        "clutter": list(counts.clutter),
-    }
-
-
-def _counts(value: object) -> FamilyCounts:
-    fields = _mapping(value, "family")
-    return FamilyCounts(
-        looks=read_rows(fields.get("looks"), "looks"),
-        misses=read_rows(fields.get("misses"), "misses"),
-        sectors=read_numbers(fields.get("sectors"), "sectors"),
-        clutter=read_numbers(fields.get("clutter"), "clutter"),
-    )
-
-
-def _mapping(value: object, name: str) -> Mapping[str, object]:
-    if not isinstance(value, Mapping) or len(value) > MOST_FAMILIES:
-        raise InvalidArgumentError(f"{name}: expected an object of at most {MOST_FAMILIES} entries")
-    return value
-
-
-def _texts(value: object) -> dict[str, str]:
-    entries = _mapping(value, "provenance")
-    if not all(isinstance(text, str) for text in entries.values()):
-        raise InvalidArgumentError("provenance: expected text")
-    return {str(name): str(text) for name, text in entries.items()}
+    data = read_json(path, "a file of miss rates")
+    with refused_as_file(path):
+        return decode(MissRates, data, "miss rates")

@@ -8,13 +8,10 @@ from typing import Any
 
 from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.core.filter import WorldFilter
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
-from worldstate.ground.reading import decode_json
 from worldstate.ground.serialisation import decode, encode
 
 from .atomic import write_text
-
-MAX_BYTES = 16 << 20
+from .json_file import read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,18 +94,6 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     SchemaVersionError
         If it is of another major version.
     """
-    try:
-        with Path(path).open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputFileError(path, f"expected a checkpoint ({error.strerror})") from error
-    if len(data) > MAX_BYTES:
-        raise InputFileError(path, f"expected a checkpoint of at most {MAX_BYTES >> 20} MiB")
-    try:
-        return Checkpoint.from_dict(decode_json(data.decode("utf-8"), "checkpoint"))
-    except UnicodeDecodeError as error:
-        raise InputFileError(path, "expected a checkpoint in UTF-8") from error
-    except SchemaVersionError as error:
-        raise SchemaVersionError(path, error.problem) from error
-    except InvalidArgumentError as error:
-        raise InputFileError(path, str(error)) from error
+    data = read_json(path, "a checkpoint")
+    with refused_as_file(path):
+        return Checkpoint.from_dict(data)

@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.signature.signature_io import AnySignature
-from worldstate.ground.serialisation import Layout, Via, encode
+from worldstate.ground.serialisation import Layout, Via, decode, encode
 
 from .atomic import write_text
-from .json_file import decode_file, read_json
+from .json_file import read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,4 +157,5 @@ def model_to_dict(model: Model) -> dict[str, Any]:
 
 def model_from_dict(data: object, source: object) -> Model:
     """Return the model that `model_to_dict` wrote; unknown keys are ignored."""
-    return decode_file(Model, data, source, "model")
+    with refused_as_file(source):
+        return decode(Model, data, "model")

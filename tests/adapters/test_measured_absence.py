@@ -27,6 +27,7 @@ from worldstate.adapters.camera.video import open_video
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+from worldstate.ground.serialisation import decode
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.operations.detectors.miss_rate_measurement import (
@@ -179,7 +180,7 @@ def test_rates_from_any_counts_are_monotone_probabilities_and_survive_the_disk(f
     assert (np.diff(beta, axis=0) >= 0).all()
     assert (np.diff(beta, axis=1) >= 0).all()
     assert 0.0 < beta.min() <= beta.max() < 1.0
-    again = MissRates.from_dict(json.loads(json.dumps(rates.to_dict())))
+    again = decode(MissRates, json.loads(json.dumps(rates.to_dict())), "file")
     assert again.table == rates.table
     assert again.to_dict() == rates.to_dict()
 

@@ -2,9 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
@@ -14,6 +17,14 @@ from .polar import AZIMUTH, LOG_RANGE, RADIAL_RATE, jacobian, process_noise, pro
 _NEAREST_M, _FARTHEST_M = 3.0, 200.0
 # Nobody drives through the array: within a step a vehicle comes no closer than half its range.
 _CLOSEST_SHARE = 0.5
+
+
+def _covariance(row: FloatArray) -> FloatArray:
+    """Return the covariance that a checkpoint holds as one row."""
+    covariance = row.reshape(4, 4)
+    if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+        raise InvalidArgumentError("expected it symmetric and positive definite")
+    return covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,8 +39,10 @@ class MotionBelief:
     (0.674, 0.174)
     """
 
-    mean: FloatArray  # shape (4,): theta wrapped into (-pi, pi]
-    covariance: FloatArray  # shape (4, 4): Symmetric positive definite
+    # shape (4,): theta wrapped into (-pi, pi]
+    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]
+    # shape (4, 4): Symmetric positive definite
+    covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, _covariance)]
 
     @classmethod
     def around(

@@ -1,9 +1,12 @@
 """One entity as the filter carries it."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Annotated, TypeAlias
 from uuid import UUID, uuid5
 
+from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
+from worldstate.ground.values import Answer
 from worldstate.measurement.measurement import Sighting
 
 from .existence import after_time
@@ -17,23 +20,26 @@ _PARKED_ACCELERATION = 1e-4
 _IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
 
 
+Label: TypeAlias = Annotated[tuple[str, float], Keys("label", "probability")]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """What is believed of one entity."""
 
     id: str  # UUID for life
-    side: int  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
+    side: Count  # Index of the approach side that it is hidden on, came from, or first appeared nearest to
     seen: bool  # Whether vision has it; before that its existence is read from the explanation belief
-    existence: float  # Existence probability
-    motion: MotionBelief  # Azimuth, rates, log range
-    labels: tuple[tuple[str, float], ...]  # Class probabilities, sorted by label
+    existence: Probability
+    motion: MotionBelief = field(metadata=FLAT)  # Azimuth, rates, log range
+    labels: tuple[Label, ...]  # Class probabilities, sorted by label
     moving: bool  # False for what vision holds for parked
     sources: tuple[str, ...]  # Modalities that contributed, sorted
     created_ns: int  # Birth and last measurement that moved it
     updated_ns: int
     last_seen_ns: int | None = None  # Last sighting
-    answer: str = "unqueried"  # Last answer of the co-evidence channel about it
-    miss_rate: float | None = None  # beta of that answer
+    answer: Answer = "unqueried"  # Last answer of the co-evidence channel about it
+    miss_rate: Probability | None = None  # beta of that answer
     approach_heard: bool = False  # Whether its approach rate was ever measured
     # Whether it was ever heard before it was seen, or lost from view and heard again.
     was_hidden: bool = False
@@ -65,7 +71,7 @@ def predict_track(track: Track, hidden_share: float, step_s: float, scene: SiteG
     return replace(track, motion=relax(motion, scene.prior(track.side), bearing_kept, radial_kept))
 
 
-def relabelled(labels: tuple[tuple[str, float], ...], sighting: Sighting) -> tuple[tuple[str, float], ...]:
+def relabelled(labels: tuple[Label, ...], sighting: Sighting) -> tuple[Label, ...]:
     """Return class probabilities drawn a step towards what a detector just said.
 
     Examples

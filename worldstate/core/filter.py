@@ -11,21 +11,12 @@ from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.reading import Record, check_schema
-from worldstate.ground.serialisation import encode
+from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Context, WorldState
 
-from .checkpoint import (
-    SCHEMA_NAME,
-    SCHEMA_VERSION,
-    memory_from_record,
-    memory_to_dict,
-    policy_from_record,
-    settings_from_record,
-    settings_to_dict,
-)
+from .checkpoint import FilterRecord, memory_of, memory_record
 from .memory import Memory, first_memory, priors_of
 from .snapshot_builder import cues_of, entity_of, relations_of
 from .step import (
@@ -220,14 +211,11 @@ class WorldFilter:
         >>> WorldFilter.from_dict(world.to_dict()).state == world.state
         True
         """
-        return {
-            "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
-            "context": self.context.to_dict(),
-            "policy": encode(self.policy),
-            "settings": settings_to_dict(self.settings),
-            "start_ns": self.start_ns,
-            "memory": memory_to_dict(self._memory),
-        }
+        kept = memory_record(self._memory)
+        values: dict[str, Any] = encode(
+            FilterRecord(self.context, self.policy, self.settings, self.start_ns, kept)
+        )
+        return values
 
     @classmethod
     def from_dict(cls, value: object) -> "WorldFilter":
@@ -240,17 +228,8 @@ class WorldFilter:
         InvalidArgumentError
             If a value is missing, of the wrong type or out of range; the message says where.
         """
-        record = Record(value, "checkpoint")
-        check_schema(record, SCHEMA_NAME, SCHEMA_VERSION)
-        context = Context.from_record(record.record("context"))
-        policy = policy_from_record(record.record("policy"))
-        return cls(
-            context=context,
-            policy=policy,
-            settings=settings_from_record(record.record("settings")),
-            start_ns=record.integer("start_ns"),
-            memory=memory_from_record(record.record("memory"), context.directions, policy),
-        )
+        kept = decode(FilterRecord, value, "checkpoint")
+        return cls(kept.context, kept.policy, kept.settings, kept.start_ns, memory_of(kept))
 
     @cached_property
     def _memory(self) -> Memory:

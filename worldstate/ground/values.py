@@ -1,7 +1,7 @@
 """Small values that every storey of the house speaks of."""
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -9,6 +9,9 @@ from worldstate.ground.typing import FloatArray
 
 # A float stays a float, an array an array.
 AngleT = TypeVar("AngleT", float, FloatArray)
+
+# What a co-evidence channel last said of an entity: found, searched for and not found, not searched for.
+Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
 

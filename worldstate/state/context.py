@@ -2,11 +2,11 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import ClassVar
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.reading import Record
+from worldstate.ground.serialisation import Layout, Probability
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +65,6 @@ class Rates:
             self.visible_departure_hz,
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    @classmethod
-    def from_record(cls, record: Record) -> "Rates":
-        """Return the rates that `to_dict` wrote."""
-        return cls(**{field.name: record.number(field.name) for field in fields(cls)})
-
 
 @dataclass(frozen=True, slots=True)
 class Priors:
@@ -95,23 +86,14 @@ class Priors:
     0.2
     """
 
-    hidden: float
-    visible: float
-    none: float
+    hidden: Probability
+    visible: Probability
+    none: Probability
 
     def __post_init__(self) -> None:
         values = (self.hidden, self.visible, self.none)
         if min(values) < 0 or not math.isclose(sum(values), 1.0, abs_tol=1e-6):
             raise InvalidArgumentError(f"priors: expected three probabilities that sum to one, got {values}")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {"hidden": self.hidden, "visible": self.visible, "none": self.none}
-
-    @classmethod
-    def from_record(cls, record: Record) -> "Priors":
-        """Return the priors that `to_dict` wrote."""
-        return cls(record.probability("hidden"), record.probability("visible"), record.probability("none"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,27 +127,6 @@ class Occluder:
         in_range("edge_azimuth_rad", self.edge_azimuth_rad, -math.pi, math.pi)
         in_range("hidden_azimuth_rad", self.hidden_azimuth_rad, -math.pi, math.pi)
         in_range("hidden_std_rad", self.hidden_std_rad, 0.0, math.pi, open_low=True)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "id": self.id,
-            "direction": self.direction,
-            "edge_azimuth_rad": self.edge_azimuth_rad,
-            "hidden_azimuth_rad": self.hidden_azimuth_rad,
-            "hidden_std_rad": self.hidden_std_rad,
-        }
-
-    @classmethod
-    def from_record(cls, record: Record) -> "Occluder":
-        """Return the occluder that `to_dict` wrote."""
-        return cls(
-            record.text("id"),
-            record.text("direction"),
-            record.number("edge_azimuth_rad"),
-            record.number("hidden_azimuth_rad"),
-            record.number("hidden_std_rad"),
-        )
 
 
 def blind_corner(direction: str, side: int) -> Occluder:
@@ -223,11 +184,13 @@ class Context:
     ('left', 'right')
     """
 
+    LAYOUT: ClassVar = Layout(order="site ego_speed_mps degradation priors")
+
     rates: Rates = Rates()
     occluders: tuple[Occluder, ...] = (blind_corner("left", 1), blind_corner("right", -1))
     priors: Priors | None = None
     ego_speed_mps: float | None = None
-    degradation: float | None = None
+    degradation: Probability | None = None
     site: str | None = None
     view_half_angle_rad: float = 0.6
 
@@ -241,34 +204,3 @@ class Context:
     def directions(self) -> tuple[str, ...]:
         """Labels of the approach sides."""
         return tuple(occluder.direction for occluder in self.occluders)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "site": self.site,
-            "ego_speed_mps": self.ego_speed_mps,
-            "degradation": self.degradation,
-            "priors": None if self.priors is None else self.priors.to_dict(),
-            "rates": self.rates.to_dict(),
-            "occluders": [occluder.to_dict() for occluder in self.occluders],
-            "view_half_angle_rad": self.view_half_angle_rad,
-        }
-
-    @classmethod
-    def from_record(cls, record: Record) -> "Context":
-        """Return the context that `to_dict` wrote.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If a value is missing, of the wrong type or out of range.
-        """
-        return cls(
-            rates=Rates.from_record(record.record("rates")),
-            occluders=tuple(Occluder.from_record(item) for item in record.records("occluders")),
-            priors=record.maybe("priors", lambda key: Priors.from_record(record.record(key))),
-            ego_speed_mps=record.maybe("ego_speed_mps", record.number),
-            degradation=record.maybe("degradation", record.probability),
-            site=record.maybe("site", record.text),
-            view_half_angle_rad=record.number("view_half_angle_rad"),
-        )

@@ -1,9 +1,9 @@
 """Predictive cues: the calibrated, direction-resolved risk of a hidden road user."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
-from worldstate.ground.reading import Record
+from worldstate.ground.serialisation import Layout, Probability
 
 from .context import Priors
 
@@ -48,56 +48,20 @@ class RiskCue:
     True
     """
 
+    LAYOUT: ClassVar = Layout(
+        order="entity_id direction azimuth_rad azimuth_std_rad risk confidence statistic log_lambda "
+        "hypotheses horizon_s"
+    )
+
     direction: str
     azimuth_rad: float
     azimuth_std_rad: float
-    risk: float
-    confidence: float
-    statistic: float
+    risk: Probability
+    confidence: Probability
+    statistic: Probability
     log_lambda: float | None
     hypotheses: Priors
     advisory: bool
-    alpha: float | None = None
+    alpha: Probability | None = None
     entity_id: str | None = None
     horizon_s: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "entity_id": self.entity_id,
-            "direction": self.direction,
-            "azimuth_rad": self.azimuth_rad,
-            "azimuth_std_rad": self.azimuth_std_rad,
-            "risk": self.risk,
-            "confidence": self.confidence,
-            "statistic": self.statistic,
-            "log_lambda": self.log_lambda,
-            "hypotheses": self.hypotheses.to_dict(),
-            "horizon_s": self.horizon_s,
-            "advisory": self.advisory,
-            "alpha": self.alpha,
-        }
-
-    @classmethod
-    def from_record(cls, record: Record) -> "RiskCue":
-        """Return the cue that `to_dict` wrote.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If a value is missing, of the wrong type or out of range.
-        """
-        return cls(
-            direction=record.text("direction"),
-            azimuth_rad=record.number("azimuth_rad"),
-            azimuth_std_rad=record.number("azimuth_std_rad"),
-            risk=record.probability("risk"),
-            confidence=record.probability("confidence"),
-            statistic=record.probability("statistic"),
-            log_lambda=record.maybe("log_lambda", record.number),
-            hypotheses=Priors.from_record(record.record("hypotheses")),
-            advisory=record.flag("advisory"),
-            alpha=record.maybe("alpha", record.probability),
-            entity_id=record.maybe("entity_id", record.text),
-            horizon_s=record.maybe("horizon_s", record.number),
-        )

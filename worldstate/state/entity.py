@@ -1,13 +1,12 @@
 """Entities: road users that the world-state holds, seen or not."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar, Literal, TypeAlias
 
-from worldstate.ground.reading import Record
+from worldstate.ground.serialisation import Layout, Probability
+from worldstate.ground.values import Answer
 
-STATUSES = ("hidden", "emerged", "visible")
-ANSWERS = ("visible", "absent", "unqueried")
-
+Status: TypeAlias = Literal["hidden", "emerged", "visible"]
 Vector = tuple[float, float, float]
 
 
@@ -16,7 +15,7 @@ class Classification:
     """A class label with its probability, given that the entity exists."""
 
     label: str
-    probability: float
+    probability: Probability
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +30,8 @@ class Visibility:
         Probability that the channel misses such an entity in view; None where it was not asked.
     """
 
-    answer: str
-    miss_rate: float | None = None
+    answer: Answer
+    miss_rate: Probability | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +82,16 @@ class Entity:
     True
     """
 
+    LAYOUT: ClassVar = Layout(
+        order="id status existence_probability hidden_probability classification moving direction "
+        "azimuth_rad azimuth_std_rad azimuth_rate_rad_s range_m position_m velocity_mps inverse_tta_hz "
+        "inverse_tta_std_hz tta_s visibility sources created_ns updated_ns"
+    )
+
     id: str
-    status: str
-    existence_probability: float
-    hidden_probability: float
+    status: Status
+    existence_probability: Probability
+    hidden_probability: Probability
     azimuth_rad: float
     azimuth_std_rad: float
     created_ns: int
@@ -104,73 +109,3 @@ class Entity:
     visibility: Visibility = Visibility("unqueried")
     sources: tuple[str, ...] = ()
     last_seen_ns: int | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "id": self.id,
-            "status": self.status,
-            "existence_probability": self.existence_probability,
-            "hidden_probability": self.hidden_probability,
-            "classification": [{"label": c.label, "probability": c.probability} for c in self.classification],
-            "moving": self.moving,
-            "direction": self.direction,
-            "azimuth_rad": self.azimuth_rad,
-            "azimuth_std_rad": self.azimuth_std_rad,
-            "azimuth_rate_rad_s": self.azimuth_rate_rad_s,
-            "range_m": self.range_m,
-            "position_m": _listed(self.position_m),
-            "velocity_mps": _listed(self.velocity_mps),
-            "inverse_tta_hz": self.inverse_tta_hz,
-            "inverse_tta_std_hz": self.inverse_tta_std_hz,
-            "tta_s": self.tta_s,
-            "visibility": {"answer": self.visibility.answer, "miss_rate": self.visibility.miss_rate},
-            "sources": list(self.sources),
-            "created_ns": self.created_ns,
-            "updated_ns": self.updated_ns,
-            "last_seen_ns": self.last_seen_ns,
-        }
-
-    @classmethod
-    def from_record(cls, record: Record) -> "Entity":
-        """Return the entity that `to_dict` wrote.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If a value is missing, of the wrong type or out of range.
-        """
-        return cls(
-            id=record.text("id"),
-            status=record.one_of("status", STATUSES),
-            existence_probability=record.probability("existence_probability"),
-            hidden_probability=record.probability("hidden_probability"),
-            classification=tuple(
-                Classification(item.text("label"), item.probability("probability"))
-                for item in record.records("classification")
-            ),
-            moving=record.flag("moving"),
-            direction=record.maybe("direction", record.text),
-            azimuth_rad=record.number("azimuth_rad"),
-            azimuth_std_rad=record.number("azimuth_std_rad"),
-            azimuth_rate_rad_s=record.maybe("azimuth_rate_rad_s", record.number),
-            range_m=record.maybe("range_m", record.number),
-            position_m=record.maybe("position_m", record.vector),
-            velocity_mps=record.maybe("velocity_mps", record.vector),
-            inverse_tta_hz=record.maybe("inverse_tta_hz", record.number),
-            inverse_tta_std_hz=record.maybe("inverse_tta_std_hz", record.number),
-            tta_s=record.maybe("tta_s", record.number),
-            visibility=_visibility(record.record("visibility")),
-            sources=record.texts("sources"),
-            created_ns=record.integer("created_ns"),
-            updated_ns=record.integer("updated_ns"),
-            last_seen_ns=record.maybe("last_seen_ns", record.integer),
-        )
-
-
-def _listed(vector: Vector | None) -> list[float] | None:
-    return None if vector is None else list(vector)
-
-
-def _visibility(record: Record) -> Visibility:
-    return Visibility(record.one_of("answer", ANSWERS), record.maybe("miss_rate", record.probability))

@@ -1,9 +1,8 @@
 """Relations: directed, typed and uncertain edges between entities, occluders and the ego vehicle."""
 
 from dataclasses import dataclass
-from typing import Any
 
-from worldstate.ground.reading import Record
+from worldstate.ground.serialisation import Probability
 
 EGO = "ego"
 
@@ -32,32 +31,5 @@ class Relation:
     src: str
     dst: str
     kind: str
-    probability: float
+    probability: Probability
     stamp_ns: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
-        return {
-            "src": self.src,
-            "dst": self.dst,
-            "kind": self.kind,
-            "probability": self.probability,
-            "stamp_ns": self.stamp_ns,
-        }
-
-    @classmethod
-    def from_record(cls, record: Record) -> "Relation":
-        """Return the relation that `to_dict` wrote.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If a value is missing, of the wrong type or out of range.
-        """
-        return cls(
-            src=record.text("src"),
-            dst=record.text("dst"),
-            kind=record.text("kind"),
-            probability=record.probability("probability"),
-            stamp_ns=record.integer("stamp_ns"),
-        )

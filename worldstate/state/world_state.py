@@ -2,10 +2,10 @@
 
 import json
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.reading import Record, check_schema, decode_json
+from worldstate.ground.serialisation import Layout, decode, decode_json, encode
 
 from .context import Context
 from .cue import RiskCue
@@ -15,9 +15,6 @@ from .relation import Relation
 
 if TYPE_CHECKING:
     import networkx as nx
-
-SCHEMA_NAME = "worldstate.Snapshot"
-SCHEMA_VERSION = "1.0.0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +46,8 @@ class WorldState:
     >>> state.risk, WorldState.from_json(state.to_json()) == state
     (0.0, True)
     """
+
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.0.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -84,17 +83,8 @@ class WorldState:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the snapshot as JSON-able values; unknown is None."""
-        return {
-            "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
-            "stamp_ns": self.stamp_ns,
-            "clock": self.clock,
-            "seq": self.seq,
-            "frame_id": self.frame_id,
-            "entities": [entity.to_dict() for entity in self.entities],
-            "relations": [relation.to_dict() for relation in self.relations],
-            "context": self.context.to_dict(),
-            "cues": [cue.to_dict() for cue in self.cues],
-        }
+        values: dict[str, Any] = encode(self)
+        return values
 
     def to_json(self) -> str:
         """Return the snapshot as one line of strict JSON.
@@ -120,18 +110,7 @@ class WorldState:
         InvalidArgumentError
             If a value is missing, of the wrong type or out of range; the message says where.
         """
-        record = Record(value, "snapshot")
-        check_schema(record, SCHEMA_NAME, SCHEMA_VERSION)
-        return cls(
-            stamp_ns=record.integer("stamp_ns"),
-            seq=record.integer("seq"),
-            entities=tuple(Entity.from_record(item) for item in record.records("entities")),
-            relations=tuple(Relation.from_record(item) for item in record.records("relations")),
-            context=Context.from_record(record.record("context")),
-            cues=tuple(RiskCue.from_record(item) for item in record.records("cues")),
-            frame_id=record.text("frame_id"),
-            clock=record.text("clock"),
-        )
+        return decode(cls, value, "snapshot")
 
     @classmethod
     def from_json(cls, text: str) -> "WorldState":
