@@ -37,6 +37,16 @@ class AudioSource:
         Samples per channel.
     silent_channels : tuple of int
         Channels, from 1, that hold one constant value through the first second.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "noise.wav"
+    ...     soundfile.write(name, np.random.default_rng(0).uniform(-1, 1, (9600, 4)), 8000)
+    ...     with open_audio(name) as source:
+    ...         source.sample_rate_hz, source.frames, source.silent_channels
+    (8000, 9600, ())
     """
 
     def __init__(self, path: Path, file: Any) -> None:

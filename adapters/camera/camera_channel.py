@@ -63,6 +63,21 @@ class Watcher:
     ------
     InvalidArgumentError
         If the rates hold no scale of health.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from worldstate.adapters.camera.camera_health import CameraHealth
+    >>> from worldstate.adapters.camera.detections import DetectionFrame
+    >>> from worldstate.adapters.camera.miss_rates import FamilyCounts
+    >>> class Blind:
+    ...     def detect(self, frame): return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    >>> clean = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
+    >>> counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
+    >>> rates = MissRates((0.0, 30.0), {"noise": counts}, health=clean)
+    >>> watcher = Watcher(Blind(), rates)
+    >>> watcher.look(100_000_000, np.full((48, 64, 3), 100, np.uint8)) is None
+    True
     """
 
     def __init__(self, detector: Detector, rates: MissRates) -> None:

@@ -59,6 +59,15 @@ def read_any_detections(
     ------
     InputFileError
         As the reader of that form, or if YOLO text is read without a size.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "000000.txt").write_text("2 0.5 0.5 0.1 0.2 0.9")
+    ...     log = read_any_detections(folder, size_px=(640, 480))
+    >>> log.frames[0].labels, log.frames[0].boxes_px.tolist()
+    (('car',), [[288.0, 192.0, 352.0, 288.0]])
     """
     name = Path(path)
     if name.is_dir():

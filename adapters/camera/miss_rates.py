@@ -98,6 +98,13 @@ class MissRates:
     ------
     InvalidArgumentError
         If bins and counts do not fit.
+
+    Examples
+    --------
+    >>> counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
+    >>> rates = MissRates((0.0, 30.0), {"noise": counts}, {"detector": "mine"})
+    >>> round(float(rates.table(azimuth_rad=0.1, degradation=1.0)), 2)
+    0.95
     """
 
     LAYOUT: ClassVar = Layout("worldstate.MissRates", "1.0.0", order="provenance azimuth_deg repeats health")
@@ -175,6 +182,15 @@ def save_miss_rates(path: str | Path, rates: MissRates) -> None:
     ------
     InputFileError
         If the folder is missing.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
+    >>> with TemporaryDirectory() as folder:
+    ...     save_miss_rates(Path(folder) / "beta.json", MissRates((0.0, 30.0), {"noise": counts}))
+    ...     load_miss_rates(Path(folder) / "beta.json").families["noise"].misses
+    ((0.0, 1.0, 2.0, 5.0, 10.0),)
     """
     write_text(path, json.dumps(rates.to_dict(), allow_nan=False, indent=1) + "\n")
 
@@ -198,6 +214,15 @@ def load_miss_rates(path: str | Path) -> MissRates:
         If the file is missing, larger than 16 MiB, no JSON, or a number is missing or out of range.
     SchemaVersionError
         If it is of another major version.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
+    >>> with TemporaryDirectory() as folder:
+    ...     save_miss_rates(Path(folder) / "beta.json", MissRates((0.0, 30.0), {"noise": counts}))
+    ...     load_miss_rates(Path(folder) / "beta.json").families["noise"].misses
+    ((0.0, 1.0, 2.0, 5.0, 10.0),)
     """
     data = read_json(path, "a file of miss rates")
     with refused_as_file(path):

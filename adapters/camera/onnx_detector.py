@@ -73,6 +73,19 @@ class OnnxDetector:
     ------
     InvalidArgumentError
         If the model does not take one image.
+
+    Examples
+    --------
+    A stand-in for a model that finds one car in every image:
+
+    >>> from types import SimpleNamespace
+    >>> image = SimpleNamespace(name="images", shape=[1, 3, 64, 64], type="tensor(float)")
+    >>> class OneCar:
+    ...     def get_inputs(self): return [image]
+    ...     def run(self, names, feed): return [np.array([[[32.0], [32.0], [20.0], [10.0], [0.9]]])]
+    >>> found = OnnxDetector(OneCar(), OnnxSettings(("car",))).detect(np.zeros((64, 64, 3), np.uint8))
+    >>> found.labels, found.boxes_px.tolist()
+    (('car',), [[22.0, 27.0, 42.0, 37.0]])
     """
 
     def __init__(self, session: Session, settings: OnnxSettings) -> None:
@@ -143,6 +156,14 @@ def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
         If it is missing, larger than 2 GiB, or no model that onnxruntime takes.
     MissingExtraError
         If onnxruntime is not installed.
+
+    Examples
+    --------
+    >>> try:
+    ...     open_onnx("missing.onnx", OnnxSettings(labels=("car", "bicycle")))
+    ... except InputFileError as error:
+    ...     print(error)
+    missing.onnx: expected an ONNX model (No such file or directory)
     """
     name = Path(path)
     try:

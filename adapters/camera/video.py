@@ -64,6 +64,14 @@ def open_video(path: str | Path) -> Video:
         If it is missing, no video, or its frames are larger than 8192 px.
     MissingExtraError
         If OpenCV is not installed.
+
+    Examples
+    --------
+    >>> try:
+    ...     open_video("missing.mp4")
+    ... except InputFileError as error:
+    ...     print(error.path)
+    missing.mp4
     """
     name = Path(path)
     capture = _open(name)

@@ -69,6 +69,18 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
     ------
     InputFileError
         If a recording is damaged, has another number of channels than the array, or is too short.
+
+    Examples
+    --------
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> array = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "noise.wav"
+    ...     soundfile.write(name, np.random.default_rng(0).uniform(-0.1, 0.1, (48_000, 4)), 48_000)
+    ...     window = LabelledWindow("0", "none", "SX1", "0", None, name, end_s=1.0)
+    ...     [feature.shape for feature in extract_features([window], array)]
+    [(60,)]
     """
     for samples, rate_hz in read_windows(windows, array.n_microphones):
         yield published_feature(samples, array, rate_hz)

@@ -149,6 +149,17 @@ def read_features(path: str | Path) -> FeatureTable:
     InputFileError
         If the file is missing or too large, a column is missing, or a line does not hold 60 finite numbers, a
         known class and an environment that begins with S or D; the message names file and line.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> words = np.array(["none", "left"])
+    >>> table = FeatureTable(np.ones((2, 60)), words, words, np.array(["SA1", "SB1"]), words, (None, 70))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_features(Path(folder) / "windows.csv", table)
+    ...     again = read_features(Path(folder) / "windows.csv")
+    >>> again.labels.tolist(), again.t0_frames
+    (['none', 'left'], (None, 70))
     """
     rows = read_rows(Path(path), FEATURE_COLUMNS + LABEL_COLUMNS)
     windows = [_window(path, line, row) for line, row in rows]
@@ -173,6 +184,17 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
     ------
     InputFileError
         If the folder is missing.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> words = np.array(["none", "left"])
+    >>> table = FeatureTable(np.ones((2, 60)), words, words, np.array(["SA1", "SB1"]), words, (None, 70))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_features(Path(folder) / "windows.csv", table)
+    ...     again = read_features(Path(folder) / "windows.csv")
+    >>> again.labels.tolist(), again.t0_frames
+    (['none', 'left'], (None, 70))
     """
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -70,6 +70,14 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     ------
     InputFileError
         If the folder is missing.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_checkpoint(Path(folder) / "now.json", Checkpoint(WorldFilter().predict(0.3)))
+    ...     read_checkpoint(Path(folder) / "now.json").world.stamp_ns
+    300000000
     """
     write_text(path, json.dumps(checkpoint.to_dict(), allow_nan=False) + "\n")
 
@@ -93,6 +101,14 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         If the file is missing, too large, truncated or no JSON, or a value is missing or out of range.
     SchemaVersionError
         If it is of another major version.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_checkpoint(Path(folder) / "now.json", Checkpoint(WorldFilter().predict(0.3)))
+    ...     read_checkpoint(Path(folder) / "now.json").world.stamp_ns
+    300000000
     """
     data = read_json(path, "a checkpoint")
     with refused_as_file(path):

@@ -67,6 +67,12 @@ class Model:
         Threshold, sustained rule and risk map for each budget.
     provenance : Provenance
         Where it comes from.
+
+    Examples
+    --------
+    >>> model = read_model()
+    >>> sorted({policy.alpha for policy in model.policies.policies})
+    [0.01, 0.02, 0.05]
     """
 
     LAYOUT: ClassVar = Layout("worldstate.Model", "1.1.0", order="provenance signature policies")
@@ -93,6 +99,12 @@ def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPoli
     ------
     InputFileError
         As `read_model`.
+
+    Examples
+    --------
+    >>> signature, policies = load_model()
+    >>> policies.for_alpha(0.02).sustain_hops
+    3
     """
     model = read_model(path)
     return model.signature, model.policies
@@ -144,6 +156,14 @@ def save_model(path: str | Path, model: Model) -> None:
     ------
     InputFileError
         If the folder is missing.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_model(Path(folder) / "copy.json", read_model())
+    ...     read_model(Path(folder) / "copy.json").provenance == read_model().provenance
+    True
     """
     lines = [f"{json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in model_to_dict(model).items()]
     write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")

@@ -6,11 +6,30 @@ line can turn any of them into one line and exit code 2.
 
 
 class WorldstateError(ValueError):
-    """Root of every error that this library raises on purpose."""
+    """Root of every error that this library raises on purpose.
+
+    Examples
+    --------
+    >>> from worldstate.adapters import read_model
+    >>> try:
+    ...     read_model("missing.json")
+    ... except WorldstateError as error:
+    ...     print(type(error).__name__, isinstance(error, ValueError))
+    InputFileError True
+    """
 
 
 class InvalidArgumentError(WorldstateError):
-    """An argument has the wrong shape, range or type; the message names it."""
+    """An argument has the wrong shape, range or type; the message names it.
+
+    Examples
+    --------
+    >>> from worldstate import Absent
+    >>> Absent(miss_rate=1.5)
+    Traceback (most recent call last):
+    ...
+    worldstate.ground.errors.InvalidArgumentError: miss_rate: ...
+    """
 
 
 class OutOfDomainError(WorldstateError):
@@ -18,7 +37,14 @@ class OutOfDomainError(WorldstateError):
 
 
 class InputFileError(WorldstateError):
-    """A file is missing, damaged or not what was expected; the message begins with its name."""
+    """A file is missing, damaged or not what was expected; the message begins with its name.
+
+    Examples
+    --------
+    >>> error = InputFileError("mics.xml", "expected positions of microphones")
+    >>> error.path, str(error)
+    ('mics.xml', 'mics.xml: expected positions of microphones')
+    """
 
     def __init__(self, path: object, problem: str) -> None:
         super().__init__(f"{path}: {problem}")
@@ -27,11 +53,28 @@ class InputFileError(WorldstateError):
 
 
 class SchemaVersionError(InputFileError):
-    """A file was written by another major version of its schema."""
+    """A file was written by another major version of its schema.
+
+    Examples
+    --------
+    >>> from worldstate import WorldState
+    >>> stranger = WorldState(0, 0).to_json().replace('"version":"1.', '"version":"9.')
+    >>> try:
+    ...     WorldState.from_json(stranger)
+    ... except SchemaVersionError as error:
+    ...     print(type(error).__name__)
+    SchemaVersionError
+    """
 
 
 class MissingExtraError(WorldstateError):
-    """An optional package is not installed; the message names the extra that brings it."""
+    """An optional package is not installed; the message names the extra that brings it.
+
+    Examples
+    --------
+    >>> str(MissingExtraError("cv2", "vision"))
+    "cv2 is not installed: pip install 'worldstate[vision]'"
+    """
 
     def __init__(self, package: str, extra: str) -> None:
         super().__init__(f"{package} is not installed: pip install 'worldstate[{extra}]'")

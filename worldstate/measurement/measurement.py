@@ -107,6 +107,15 @@ class Measurement:
         All that the co-evidence channel reports, in the queried sector or not.
     source : str
         Name of the modality.
+
+    Examples
+    --------
+    >>> from worldstate.abduction import Absent, SignatureEvidence
+    >>> heard = SignatureEvidence(("left", "right"), hidden=(2.0, -1.0), visible=1.0, none=-2.0)
+    >>> unknown = NotUsable("not measured")
+    >>> measurement = Measurement(100_000_000, heard, Absent(miss_rate=0.04), unknown, unknown, source="v2x")
+    >>> measurement.source, measurement.bearing.reason
+    ('v2x', 'not measured')
     """
 
     stamp_ns: int

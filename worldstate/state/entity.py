@@ -12,7 +12,20 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Classification:
-    """A class label with its probability, given that the entity exists."""
+    """A class label with its probability, given that the entity exists.
+
+    Parameters
+    ----------
+    label : str
+        Name of the class.
+    probability : float
+        In [0, 1]; the labels of one entity sum to at most 1.
+
+    Examples
+    --------
+    >>> Classification("car", 0.8).label
+    'car'
+    """
 
     label: str
     probability: Probability
@@ -28,6 +41,11 @@ class Visibility:
         Found, searched for and not found, or not searched for.
     miss_rate : float or None
         Probability that the channel misses such an entity in view; None where it was not asked.
+
+    Examples
+    --------
+    >>> Visibility("absent", miss_rate=0.04)
+    Visibility(answer='absent', miss_rate=0.04)
     """
 
     answer: Answer

@@ -105,6 +105,15 @@ def write_dataset(
         If something that was not simulated stands where a recording would go, or recordings of another array.
     MissingExtraError
         If video is wanted and OpenCV is not installed.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> pair = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
+    >>> with TemporaryDirectory() as root:
+    ...     rows = write_dataset(root, DatasetSettings(n_static=2, duration_s=0.5), array=pair)
+    >>> [row.approach for row in rows]
+    ['left', 'none']
     """
     in_range("jobs", jobs, 1, 256)
     wanted = settings or DatasetSettings()
@@ -147,6 +156,18 @@ def write_recording(
     ------
     InputFileError
         If something that was not simulated stands there, or the data set is of another array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from worldstate.adapters.simulation import SimulationSettings, simulate_recording, site
+    >>> settings = SimulationSettings(site("SA1"), "none", duration_s=0.5)
+    >>> recording = simulate_recording(settings, np.random.default_rng(1))
+    >>> with TemporaryDirectory() as root:
+    ...     row = write_recording(root, recording)
+    ...     row.folder.as_posix(), (Path(root) / row.folder / "out_multi.wav").is_file()
+    ('SA1/none/2_00_0000', True)
     """
     in_range("number", number, 0, 9999)
     row = _log_row(recording, number)

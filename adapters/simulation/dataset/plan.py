@@ -53,6 +53,11 @@ class DatasetSettings:
     ------
     InvalidArgumentError
         If a number is out of range, a word unknown or a combination not to be had.
+
+    Examples
+    --------
+    >>> DatasetSettings(n_static=6, kind="electric").preset
+    'street-5'
     """
 
     n_static: int = 4

@@ -61,6 +61,14 @@ class SimulatedRecording:
         Settings, trajectory, line of sight and azimuth per frame; see `truth.describe`.
     array : MicrophoneArray
         What listened, in the order of the channels.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.simulation import SimulationSettings, site
+    >>> settings = SimulationSettings(site("SB1"), "none", duration_s=0.5)
+    >>> recording = simulate_recording(settings, np.random.default_rng(1))
+    >>> recording.audio.dtype, recording.truth["settings"]["approach"]
+    (dtype('float32'), 'none')
     """
 
     audio: Float32Array

@@ -97,6 +97,11 @@ class Preset:
     ------
     InvalidArgumentError
         If a number is outside `LIMITS`.
+
+    Examples
+    --------
+    >>> Preset("windy", wind_100hz_db=66.0).wind_100hz_db
+    66.0
     """
 
     name: str

@@ -48,6 +48,11 @@ class VehicleSettings:
     ------
     InvalidArgumentError
         If a number is out of range or a word unknown.
+
+    Examples
+    --------
+    >>> VehicleSettings("left", entry_s=4.0, kind="heavy", manoeuvre="turn").speed_mps > 8
+    True
     """
 
     approach: str

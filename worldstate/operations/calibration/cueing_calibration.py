@@ -147,6 +147,13 @@ class CueingCalibration:
         Where the risk map comes from.
     warnings : tuple of str
         What the hours do not suffice for.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.files.model_file import load_model
+    >>> found = CueingCalibration(load_model()[1], (), 0.5, 18_000, 3, 180, 1.1, "kept", ("too few hours",))
+    >>> found.policies.for_alpha(0.02).alpha, found.warnings
+    (0.02, ('too few hours',))
     """
 
     policies: CueingPolicies
@@ -183,6 +190,21 @@ def calibrate_cueing(
     ------
     InvalidArgumentError
         If there is no hazard-free window.
+
+    Examples
+    --------
+    Ten hazard-free recordings of a minute, made up:
+
+    >>> from dataclasses import replace
+    >>> from worldstate.adapters.files.model_file import load_model
+    >>> rng, kept = np.random.default_rng(0), load_model()[1]
+    >>> quiet = [
+    ...     replace(HopStream.blank(f"street/{i}", hops=600), log_likelihoods=rng.normal(0.0, 1.0, (600, 4)))
+    ...     for i in range(10)
+    ... ]
+    >>> found = calibrate_cueing(quiet, (0.25,) * 4, kept, CueingSettings(alphas=(0.05,)))
+    >>> found.recordings, round(found.hours, 2), found.risk
+    (10, 0.17, 'kept')
     """
     chosen = settings or CueingSettings()
     free = [stream for stream in streams if stream.hazard_free and len(stream)]

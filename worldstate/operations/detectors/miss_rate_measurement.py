@@ -130,6 +130,25 @@ def measure_absence(
         If there is no scene.
     InputFileError
         If no reference object is ever in view.
+
+    Examples
+    --------
+    Twenty images with a white box on black, and a detector that finds whatever is bright:
+
+    >>> from types import SimpleNamespace
+    >>> image = np.zeros((120, 160, 3), np.uint8)
+    >>> image[40:90, 60:110] = 255
+    >>> box = DetectionFrame(np.array([[60.0, 40.0, 110.0, 90.0]]), np.array([0.9]), ("car",))
+    >>> nothing = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    >>> class Bright:
+    ...     def detect(self, frame): return box if frame[40:90, 60:110].mean() > 100 else nothing
+    >>> video = SimpleNamespace(frames=lambda: iter([image] * 20), n_frames=20, frame_rate_hz=10.0)
+    >>> truth = DetectionLog.at_rate([box] * 20, 10.0)
+    >>> scene = LabelledVideo(video, truth, PinholeCamera(width_px=160, height_px=120))
+    >>> settings = AbsenceSettings(families=("darkness",), moving_only=False)
+    >>> rates = measure_absence([scene], Bright, np.random.default_rng(0), settings)
+    >>> rates.families["darkness"].misses[0]
+    (0.0, 0.0, 10.0, 10.0, 10.0)
     """
     chosen = settings or AbsenceSettings()
     if not scenes:

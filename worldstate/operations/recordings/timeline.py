@@ -87,6 +87,18 @@ class Timeline:
         True tracks of the vehicles of a simulated recording, else empty.
     title : str
         Heading of the figure.
+
+    Examples
+    --------
+    >>> n = 20
+    >>> quiet = Timeline(
+    ...     time_s=1.0 + 0.1 * np.arange(n), statistic=np.zeros(n), risk=np.zeros(n), threshold=0.8,
+    ...     alpha=0.02, advisory={"left": np.zeros(n, bool), "right": np.zeros(n, bool)},
+    ...     azimuths_rad=np.linspace(-1, 1, 9), srp=np.ones((n, 9)), srp_age_s=0.5, entities=(),
+    ...     sighting_time_s=np.empty(0), sighting_azimuth_rad=np.empty(0), t0_s=None, truth=(), title="",
+    ... )
+    >>> int(quiet.advisory["left"].sum())
+    0
     """
 
     time_s: FloatArray
@@ -115,6 +127,13 @@ def write_timeline(timeline: Timeline, path: Path) -> None:
         If the ending is another one or the folder is missing.
     OSError
         If the folder cannot be written.
+
+    Parameters
+    ----------
+    timeline : Timeline
+        From `run_recording`.
+    path : Path
+        Exactly this file.
     """
     with figure_style():
         save_figure(draw_timeline(timeline), path)

@@ -89,6 +89,21 @@ def cross_validate(
     -------
     dict of float to Predictions
         For each beta: 1, the published statistic, and 0, with the visible explanation removed.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.signature.published_training import PublishedClassifier
+    >>> from worldstate.operations.training.splits import folds_by_recording
+    >>> rng = np.random.default_rng(0)
+    >>> labels = np.repeat(["left", "none", "right", "front"], 20)
+    >>> keys = np.array([str(i) for i in range(80)])
+    >>> loud = np.where(labels == "none", 0.1, 0.2)[:, None]
+    >>> features = loud * rng.lognormal(0.0, 0.2, (80, 60))
+    >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
+    >>> found = cross_validate(table, folds_by_recording, PublishedClassifier, rng, alpha=0.1)
+    >>> alarms = found[0.0].decision
+    >>> bool(alarms[table.hazards].mean() > alarms[table.hazard_free].mean())
+    True
     """
     folds = split(table, rng)
     predictions = {beta: Predictions.blank(folds) for beta in MISS_RATES}

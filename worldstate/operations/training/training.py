@@ -99,6 +99,19 @@ def train_model(
     ------
     InvalidArgumentError
         If a class is missing or there are fewer recordings than folds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> labels = np.repeat(["left", "none", "right", "front"], 20)
+    >>> keys = np.array([str(i) for i in range(80)])
+    >>> loud = np.where(labels == "none", 0.1, 0.2)[:, None]
+    >>> features = loud * rng.lognormal(0.0, 0.2, (80, 60))
+    >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
+    >>> model = train_model(table, TrainingSettings(repeats=1), dataset="made up", group="static")
+    >>> model.signature.classes, model.provenance.dataset
+    (('front', 'left', 'none', 'right'), 'made up')
     """
     rng = np.random.default_rng(settings.seed)
     compares = settings.method == "worldstate"

@@ -115,6 +115,28 @@ def degradation_sweep(
     InvalidArgumentError
         If states differ, no vehicle is ever in view after T0, or a fold is left without a hazard-free
         recording to set thresholds on.
+
+    Examples
+    --------
+    Twenty made-up recordings in two states of the camera; half are approaches with line of sight from 4 s on:
+
+    >>> def staged(i):
+    ...     time_s, hazard = 1.0 + 0.1 * np.arange(60), i % 2 == 1
+    ...     view = hazard & (time_s > 4.0)
+    ...     scores = np.random.default_rng(i).normal(0.0, 0.3, (60, 4)) + np.array([0.0, 0.0, 0.0, 3.0])
+    ...     scores[hazard & (time_s > 2.0), 0] += 8.0
+    ...     seen, ones = np.stack([view, 0 * view]).astype(bool), np.ones((2, 60))
+    ...     return StagedRecording(
+    ...         name=str(i), label="left" if hazard else "none", t0_s=4.0 if hazard else np.nan,
+    ...         states=("clean", "off"), time_s=time_s, there=view, approach=np.full(60, np.nan),
+    ...         log_likelihoods=scores, answer=np.stack([1 + view, 0 * view]), miss_rate=0.5 * ones,
+    ...         clutter_rate=0.01 * ones, seen=seen, degradation=0 * ones, found=seen,
+    ...         presence=0.5 * ones * (1 + (hazard & (time_s > 2.0))),
+    ...     )
+    >>> recordings, rng = [staged(i) for i in range(20)], np.random.default_rng(0)
+    >>> rows = degradation_sweep(recordings, SweepSettings((0.25,) * 4), rng)
+    >>> [(row.state, row.vision_only) for row in rows]
+    [('clean', 1.0), ('off', 0.0)]
     """
     if not recordings or any(one.states != recordings[0].states for one in recordings):
         raise InvalidArgumentError("recordings: expected at least one, all in the same states")

@@ -69,6 +69,22 @@ def comparison(
     ------
     InvalidArgumentError
         If there are no passes of that row's method.
+
+    Returns
+    -------
+    dict
+        Figures of the row, its intervals, the other rows, and the gains.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> labels, keys = np.repeat(["left", "none", "right", "front"], 20), np.arange(80).astype(str)
+    >>> features = np.where(labels == "none", 0.1, 0.2)[:, None] * rng.lognormal(0.0, 0.2, (80, 60))
+    >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
+    >>> passes = run_passes(["baseline"], table, "cv", seeds=1, alpha=0.1)
+    >>> comparison(table, passes, "baseline", alpha=0.1, draws=20)["auroc_pooled"] > 0.9
+    True
     """
     chosen = {name: _of_row(passes, name) for name in ROWS if ROWS[name].method in passes}
     if row not in chosen:
