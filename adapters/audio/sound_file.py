@@ -198,7 +198,7 @@ def _open_file(path: Path) -> Any:
         raise InputFileError(path, problem)
     try:
         file = soundfile.SoundFile(path)
-    except (soundfile.SoundFileError, OSError) as error:
+    except (soundfile.SoundFileError, OSError, TypeError) as error:
         raise InputFileError(path, "expected WAV, RF64, W64 or FLAC audio, found something else") from error
     if file.format not in CONTAINERS or file.subtype not in ENCODINGS:
         kind = f"{file.format} {file.subtype}"

@@ -1,8 +1,10 @@
 """Atomic file writing: a temporary name, then a rename.
 
-A reader never meets half a file, and a run that fails leaves nothing behind.
+A reader never meets half a file, and a run that fails leaves nothing behind. A link is followed: what it
+points to is replaced, and the link stays. Devices, pipes and folders are never replaced.
 """
 
+import os
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -25,17 +27,42 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     ...     [p.name for p in Path(folder).iterdir()]
     ['states.jsonl']
     """
-    # The sibling keeps the suffix, because writers such as ``numpy.savez`` and ``soundfile`` look at it. It
-    # may be made a file or a folder; a folder can only take a name that is free or an empty folder.
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise InputFileError(target, f"expected an existing folder {target.parent} to write into")
-    temporary = target.with_name(f".{target.stem}-{uuid.uuid4().hex[:12]}{target.suffix}")
+    # The sibling keeps the suffix, because writers such as ``numpy.savez`` and ``soundfile`` look at it.
+    target = check_target(path)
+    temporary = target.with_name(f".{target.stem[:100]}-{uuid.uuid4().hex[:12]}{target.suffix}")
     try:
         yield temporary
-        _take_name(temporary, target)
+        if target.exists():
+            shutil.copymode(target, temporary)
+        temporary.replace(target)
     finally:
-        _remove(temporary)
+        try:
+            _remove(temporary)
+        except BaseException:  # a second Ctrl-C; the first one is on its way up already
+            _remove(temporary)
+            raise
+
+
+def check_target(path: str | Path) -> Path:
+    """Return where output to `path` would go, links followed; refuse what is neither free nor a plain file.
+
+    Examples
+    --------
+    >>> check_target("/dev/null")
+    Traceback (most recent call last):
+    worldstate.ground.errors.InputFileError: /dev/null: expected a file to write to, found a device or pipe
+    """
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise InputFileError(path, f"expected an existing folder {target.parent} to write into")
+    if target.is_dir():
+        raise InputFileError(path, "expected a file name to write to, found a folder")
+    if os.path.lexists(target) and not target.is_file():
+        raise InputFileError(path, "expected a file to write to, found a device or pipe")
+    there = target if target.exists() else target.parent
+    if not (os.access(there, os.W_OK) and os.access(target.parent, os.W_OK | os.X_OK)):
+        raise InputFileError(path, "expected a place to write to, permission denied")
+    return target
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -51,12 +78,6 @@ def write_text(path: str | Path, text: str) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _take_name(temporary: Path, target: Path) -> None:
-    if target.is_dir() and not temporary.is_dir():
-        raise InputFileError(target, "expected a file name to write to, found a folder")
-    temporary.replace(target)
 
 
 def _remove(path: Path) -> None:

@@ -1,8 +1,12 @@
 """Entry point: one module per command, each with `add_parser` and `run`."""
 
 import argparse
+import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 
 from worldstate.ground.errors import WorldstateError
@@ -44,16 +48,47 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code: 0, or 2 and one line on standard error for bad input."""
-    arguments = build_parser().parse_args(argv)
     try:
-        return int(arguments.run(arguments))
+        with _orderly_termination():
+            arguments = build_parser().parse_args(argv)
+            code = int(arguments.run(arguments))
+            sys.stdout.flush()
+            return code
     except WorldstateError as error:
-        print(f"worldstate: {error}", file=sys.stderr)
-        return 2
+        return _refused(str(error))
     except BrokenPipeError:
+        # Else the interpreter writes what is left to the closed pipe once more, and complains.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        return _refused(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except MemoryError:
+        return _refused("expected more memory than this machine has left")
     except KeyboardInterrupt:
         return 130
+
+
+@contextmanager
+def _orderly_termination() -> Iterator[None]:
+    """Turn SIGTERM into an exception, so that unfinished files are removed on the way out; exit code 143."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise SystemExit(128 + number)
+
+
+def _refused(problem: str) -> int:
+    line = " ".join(problem.split())
+    print(f"worldstate: {line}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

@@ -1,15 +1,25 @@
-"""Parallel map over processes; results are in order and do not depend on the number of processes."""
+"""Independent work over processes, in order: what comes out does not depend on how many there are."""
 
 import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar
+
+from .errors import WorldstateError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_processes(work: Callable[[Item], Result], items: Sequence[Item], jobs: int) -> Iterator[Result]:
+def in_processes(
+    work: Callable[[Item], Result], items: Sequence[Item], jobs: int
+) -> Generator[Result, None, None]:
     """Yield ``work(item)`` for every item, in the order of the items.
 
     Examples
@@ -22,5 +32,45 @@ def in_processes(work: Callable[[Item], Result], items: Sequence[Item], jobs: in
         yield from map(work, items)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(items)), mp_context=context) as pool:
-        yield from pool.map(work, items)
+    others = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(min(jobs, len(items)), context, signal.signal, _ON_TERMINATION) as pool:
+        try:
+            with _without_interrupts():
+                waiting = deque(pool.submit(_work_or_leave, work, item) for item in items)
+            while waiting:
+                yield waiting.popleft().result()
+        except BrokenProcessPool as error:
+            raise WorldstateError("a process ended before its work was done: out of memory?") from error
+        except BaseException:
+            # An error, Ctrl-C or SIGTERM: nobody waits for what the workers are at.
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+            raise
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise SystemExit(128 + number)
+
+
+_ON_TERMINATION = (signal.SIGTERM, _terminate)
+
+
+def _work_or_leave(work: Callable[[Item], Result], item: Item) -> Result:
+    """Do the work; on SIGTERM remove unfinished files and end, where the pool would take the next item."""
+    try:
+        return work(item)
+    except SystemExit:
+        os._exit(128 + signal.SIGTERM)
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Start processes that ignore Ctrl-C: the one that started them ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

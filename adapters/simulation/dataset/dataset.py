@@ -3,32 +3,36 @@
 import csv
 import io
 import json
-import shutil
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import soundfile
 
 from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.datasets.ovad_layout import (
     ARRAY_NAME,
     AUDIO_NAME,
     COLUMNS,
     DETECTION_NAMES,
     LOG_NAME,
+    TRUTH_NAME,
 )
 from worldstate.adapters.files.array_file import read_array_xml, write_array_xml
-from worldstate.adapters.files.atomic import atomic_path, write_text
+from worldstate.adapters.files.atomic import write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
 from worldstate.adapters.simulation.scene.presets import preset
 from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
@@ -38,7 +42,6 @@ from .plan import DatasetSettings, Plan
 from .recording import SimulatedRecording, simulate_recording
 from .rendered_video import camera_frames, write_video
 
-TRUTH_NAME = "truth.json"
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
 # OVAD's location numbers 00 to 09, then the scenes in the open.
 PLACES = (*SITES, *MOVING_SITES, *(occluded_scene(name).site.name for name in OCCLUSIONS))
@@ -78,11 +81,13 @@ def write_dataset(
     """Simulate a data set.
 
     The same settings give the same bytes, whatever the number of jobs: every recording has a seed of its own.
+    Interrupted, it leaves the recordings that were finished in their order, and the log that lists them.
 
     Parameters
     ----------
     root : str or Path
-        Folder to write to; made if it is not there. Simulated recordings of the same name are replaced.
+        Folder to write to; made if it is not there. Simulated recordings of the same name are replaced,
+        and others that its log lists stay listed.
     settings : DatasetSettings, optional
         What to write; four recordings of junctions if not given.
     array : MicrophoneArray, optional
@@ -117,14 +122,27 @@ def write_dataset(
     """
     in_range("jobs", jobs, 1, 256)
     wanted = settings or DatasetSettings()
-    folder = Path(root)
+    folder, plans = Path(root), wanted.plans()
     folder.mkdir(parents=True, exist_ok=True)
+    listed, listening = _listed(folder), ovad_array() if array is None else array
+    if (folder / ARRAY_NAME).exists():
+        _name_array(folder / ARRAY_NAME, listening)
+    for plan in plans:
+        _refuse_foreign(folder / _log_row(plan.environment, plan.approach, plan.number, 0).folder)
     rows = []
-    for row in in_processes(partial(_simulate_one, folder, wanted, array), wanted.plans(), jobs):
-        rows.append(row)
-        if progress is not None:
-            progress(row)
-    write_log(folder, rows)
+    with TemporaryDirectory(prefix=".simulated-", dir=folder) as unlisted:
+        simulate = partial(_simulate_one, Path(unlisted), wanted, listening)
+        with closing(in_processes(simulate, plans, jobs)) as simulated:
+            for row in simulated:
+                rows.append(row)
+                listed[row.folder] = row
+                _name_array(folder / ARRAY_NAME, listening)
+                try:
+                    _replace(folder / row.folder, Path(unlisted) / row.folder)
+                finally:
+                    write_log(folder, [one for one in listed.values() if (folder / one.folder).is_dir()])
+                if progress is not None:
+                    progress(row)
     return rows
 
 
@@ -170,12 +188,14 @@ def write_recording(
     ('SA1/none/2_00_0000', True)
     """
     in_range("number", number, 0, 9999)
-    row = _log_row(recording, number)
+    settings = recording.truth["settings"]
+    row = _log_row(settings["site"]["name"], settings["approach"], number, recording.t0_frame)
     target = Path(root) / row.folder
+    _refuse_foreign(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     _name_array(Path(root) / ARRAY_NAME, recording.array)
-    _clear(target)
-    with atomic_path(target) as temporary:
+    with TemporaryDirectory(prefix=".simulated-", dir=target.parent) as folder:
+        temporary = Path(folder) / target.name
         temporary.mkdir()
         _write_audio(temporary / AUDIO_NAME, recording)
         if recording.detections:
@@ -183,6 +203,7 @@ def write_recording(
         _write_json(temporary / TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
+        _replace(target, temporary)
     return row
 
 
@@ -215,12 +236,10 @@ def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray | 
     return write_recording(root, recording, plan.number, frames)
 
 
-def _log_row(recording: SimulatedRecording, number: int) -> LogRow:
-    settings = recording.truth["settings"]
-    environment, approach = settings["site"]["name"], settings["approach"]
+def _log_row(environment: str, approach: str, number: int, t0_frame: int) -> LogRow:
     location = PLACES.index(environment) if environment in PLACES else UNKNOWN_PLACE
     identity = f"{APPROACHES.index(approach) + 1}_{location:02d}_{number:04d}"
-    return LogRow(identity, environment, approach, recording.t0_frame)
+    return LogRow(identity, environment, approach, t0_frame)
 
 
 def _name_array(path: Path, array: MicrophoneArray) -> None:
@@ -232,19 +251,38 @@ def _name_array(path: Path, array: MicrophoneArray) -> None:
         )
 
 
-def _clear(target: Path) -> None:
-    if not target.exists():
-        return
-    if not (target / TRUTH_NAME).is_file():
+def _listed(root: Path) -> dict[Path, LogRow]:
+    """Return what the log of an existing data set lists and is there."""
+    if not (root / LOG_NAME).exists():
+        return {}
+    found = [recording for recording in OvadDataset(root).recordings if recording.path.is_dir()]
+    rows = [LogRow(r.recording_id, str(r.environment), str(r.label), r.logged_frame or 0) for r in found]
+    return {row.folder: row for row in rows}
+
+
+def _refuse_foreign(target: Path) -> None:
+    if target.exists() and not (target / TRUTH_NAME).is_file():
         raise InputFileError(target, "expected a free name or a simulated recording, found something else")
-    shutil.rmtree(target)
+
+
+def _replace(target: Path, finished: Path) -> None:
+    """Put a finished recording in the place of an old one, which goes with the folder of the new one."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if target.exists():
+        target.replace(finished.with_suffix(".old"))
+    finished.replace(target)
 
 
 def _write_audio(path: Path, recording: SimulatedRecording) -> None:
     samples, channels = recording.audio.shape
     kind = "RF64" if 3 * samples * channels > WAV_LIMIT_BYTES else "WAV"
     rate = round(recording.sample_rate_hz)
-    soundfile.write(path, recording.audio, rate, subtype="PCM_24", format=kind)
+    try:
+        soundfile.write(path, recording.audio, rate, subtype="PCM_24", format=kind)
+    except soundfile.SoundFileError as error:
+        raise InputFileError(
+            path, f"expected to write {samples} samples, the disk may be full: {error}"
+        ) from error
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ from worldstate.cli.common.detector_options import (
     detector_name,
 )
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.studies.degradation.degradation_sweep import SweepSettings, degradation_sweep
     from worldstate.studies.degradation.staged_dataset import filmed_recordings
 
+    output_folder(arguments.out, "degradation.json", "degradation.png")
     settings = _settings(arguments)
     found = filmed_recordings(arguments.dataset, arguments.most)
     policy = load_model(arguments.model)[1].policies[0]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.feature_options import add_table_options
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.datasets.feature_table import read_features, read_ids
     from worldstate.studies.features.feature_report import write_predictions
 
+    check_outputs(arguments, "predictions")
     whole = read_features(arguments.table)
     table = whole.group(arguments.group)
     if arguments.only is not None:

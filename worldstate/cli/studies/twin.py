@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar, track
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.studies.streets.published_figures import twin_figures, twin_intervals
     from worldstate.studies.streets.report import twin_report, twin_table
 
+    output_folder(arguments.out, "twin.json", "twin.png")
     realism = _realism(arguments)
     heard = _listen(arguments)
     signature = _signature(arguments)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def _try_estimators(array: "MicrophoneArray", arguments: argparse.Namespace) -> 
     from worldstate.adapters.files.atomic import write_text
     from worldstate.operations.arrays.efficiency_figure import write_efficiency_figure, write_endfire_figure
 
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    output_folder(arguments.out, "efficiency.png", "endfire.png", "bounds.json")
     over_snr, endfire = _measure(array, arguments)
     write_efficiency_figure(over_snr, arguments.out / "efficiency.png")
     title = f"{arguments.frequency:g} Hz, SNR {ENDFIRE_SNR_DB:g} dB, N = {arguments.snapshots}"

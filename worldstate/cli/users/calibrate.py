@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 
 if TYPE_CHECKING:
     from worldstate.operations.calibration.cueing_calibration import CueingCalibration
@@ -62,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
     from worldstate.operations.recordings.hop_stream import save_streams
 
+    check_outputs(arguments, "out", "save_streams")
     settings = CueingSettings(
         alphas=tuple(arguments.alpha),
         sustain_hops=arguments.sustain_hops,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import output_folder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,8 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.cli.common.listening import listen_with_progress
     from worldstate.operations.recordings.timeline import write_timeline
 
-    out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
+    out = output_folder(arguments.out, "timeline.png", "states.jsonl", "summary.json")
     folder = simulate_approach(out / "recording", arguments.seed)
     report = listen_with_progress(
         open_source(folder), title=f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}",

@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.outputs import check_outputs
+
 if TYPE_CHECKING:
     from worldstate.adapters.audio.sound_file import AudioSource
     from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -54,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from .doctor_report import as_json, as_text
 
+    check_outputs(arguments, figures=("figure",))
     path: Path = arguments.input
     sound = Recording.open(path).audio_path if path.is_dir() else path
     given = None if arguments.array is None else read_array_xml(arguments.array)

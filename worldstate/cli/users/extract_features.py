@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.datasets.feature_table import write_features
     from worldstate.adapters.files.array_file import read_array_xml
 
+    check_outputs(arguments, "out")
     given = None if arguments.array is None else read_array_xml(arguments.array)
     array = choose_array(arguments.dataset, given, name=arguments.array)
     windows, left_out = _windows(arguments)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.detector_options import add_detector_options, detector_maker, detector_name
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.operations.detectors.miss_rate_figure import write_absence_figure
     from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, measure_absence
 
+    check_outputs(arguments, "out", figures=("figure",))
     make, settings = detector_maker(arguments), AbsenceSettings()
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
     with progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 from worldstate.ground.errors import InputFileError
 
 DESCRIPTION = """\
@@ -81,6 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.operations.recordings.bearing_gating import write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
+    check_outputs(arguments, "out", figures=("figure", "gating"))
     source = open_source(
         arguments.input,
         array=arguments.array,

@@ -6,6 +6,7 @@ from pathlib import Path
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.feature_options import add_table_options
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
 DESCRIPTION = """\
@@ -48,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.files.model_file import save_model
     from worldstate.operations.training.training import TrainingSettings, train_model
 
+    check_outputs(arguments, "out")
     table = read_features(arguments.table).group(arguments.group)
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
     settings = TrainingSettings(

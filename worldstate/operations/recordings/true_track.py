@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.simulation.dataset.dataset import TRUTH_NAME
+from worldstate.adapters.datasets.ovad_layout import TRUTH_NAME
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 

@@ -1,0 +1,243 @@
+"""Faults of files, disks and users: one line and exit code 2, nothing destroyed, nothing left behind."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.datasets.ovad import OvadDataset
+from worldstate.adapters.simulation.dataset.dataset import LogRow, write_log
+from worldstate.cli.main import main
+
+COMMAND = (sys.executable, "-m", "worldstate.cli.main")
+RECORDING = "set/SA1/left/1_00_0000"
+
+
+def tree(root: Path) -> dict[str, object]:
+    """Return every name below `root` with what it holds."""
+    return {str(path.relative_to(root)): content(path) for path in sorted(root.rglob("*"))}
+
+
+def content(path: Path) -> object:
+    if path.is_symlink():
+        return path.readlink()
+    return path.read_bytes() if path.is_file() else path.stat().st_mode
+
+
+def refusal(words: list[str], root: Path, capsys) -> str:
+    """Run a command that shall be refused, and return the one line that it says."""
+    before = tree(root)
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("worldstate: ")
+    assert tree(root) == before
+    return lines[0]
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch) -> Path:
+    """Inputs that no reader could read: whatever is refused is refused before the work."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.wav", "m.json", "t.csv", "ids.csv", "mics.xml", "v.mp4", f"{RECORDING}/out_multi.wav"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_bytes(b"precious")
+    Path("folder.png").mkdir()
+    Path("folder").mkdir()
+    Path("link.wav").symlink_to("a.wav")
+    Path("loop").symlink_to("loop")
+    os.mkfifo("pipe")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("run a.wav --out a.wav", "a.wav: expected another file"),
+        ("run a.wav --out ./folder/../a.wav", "expected another file"),
+        ("run a.wav --out link.wav", "link.wav: expected another file"),
+        ("run link.wav --out a.wav", "expected another file"),
+        (f"run {RECORDING} --out {RECORDING}/out_multi.wav", "expected another file"),
+        ("run a.wav --array mics.xml --out mics.xml", "mics.xml"),
+        ("run a.wav --model m.json --out m.json", "m.json"),
+        ("run a.wav --out folder", "found a folder"),
+        ("run a.wav --out pipe", "found a device or pipe"),
+        ("run a.wav --out loop", "found a device or pipe"),
+        ("run a.wav --out /dev/null", "found a device or pipe"),
+        ("run a.wav --out missing/s.jsonl", "existing folder"),
+        ("run a.wav --out a.wav/s.jsonl", "existing folder"),
+        ("run a.wav --figure f.xyz", "f.xyz: expected a figure name"),
+        ("run a.wav --figure f", "expected a figure name"),
+        ("run a.wav --gating a.wav", "expected a figure name"),
+        ("run a.wav --figure folder.png", "found a folder"),
+        ("run a.wav --figure f.png --gating f.png", "--gating than for --figure"),
+        ("doctor a.wav --figure a.wav", "expected a figure name"),
+        ("calibrate a.wav m.json --out m.json", "m.json"),
+        ("calibrate a.wav --out m2.json --save-streams m2.json", "save_streams"),
+        (f"calibrate set --out {RECORDING}/out_multi.wav", "expected another file"),
+        ("train t.csv --out t.csv", "t.csv"),
+        ("train t.csv --exclude ids.csv --out ids.csv", "ids.csv"),
+        ("extract-features set --labels t.csv --out t.csv", "t.csv"),
+        ("evaluate-features t.csv --predictions t.csv", "t.csv"),
+        ("measure-absence v.mp4 --out v.mp4", "v.mp4"),
+        ("measure-absence v.mp4 --out b.json --figure b.bmp", "b.bmp"),
+        ("bounds --out a.wav", "a.wav"),
+        ("demo --out a.wav/demo", "a.wav"),
+        ("simulate --out a.wav", "a.wav"),
+        ("twin --out a.wav", "a.wav"),
+        ("evaluate-degradation set --miss-rates m.json --out a.wav", "a.wav"),
+    ],
+)
+def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files, capsys):
+    assert named in refusal(line.split(), files, capsys)
+
+
+@pytest.mark.parametrize("file", ["timeline.png", "states.jsonl"])
+def test_a_folder_in_the_place_of_a_figure_is_seen_before_the_work(file, tmp_path, capsys):
+    (tmp_path / file).mkdir()
+    assert file in refusal(["demo", "--out", str(tmp_path)], tmp_path, capsys)
+
+
+def test_an_output_through_a_link_keeps_the_link(tmp_path):
+    from worldstate.adapters.files.atomic import write_text
+
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link.json").symlink_to("real/model.json")
+    write_text(tmp_path / "link.json", "new")
+    assert (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "real/model.json").read_text() == "new"
+
+
+def test_an_output_keeps_the_permissions_of_the_file_it_replaces(tmp_path):
+    from worldstate.adapters.files.atomic import write_text
+
+    private = tmp_path / "model.json"
+    write_text(private, "old")
+    private.chmod(0o600)
+    write_text(private, "new")
+    assert private.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_no_permission_is_said_before_the_work(files, capsys):
+    Path("folder").chmod(0o500)
+    assert "permission" in refusal(["run", "a.wav", "--out", "folder/s.jsonl"], files, capsys)
+    Path("m.json").chmod(0o400)
+    assert "permission" in refusal(["run", "a.wav", "--out", "m.json"], files, capsys)
+
+
+# --- inputs ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".raw", ".au", ".ogg", ".mp3", ".wav", ".npz", ""])
+@pytest.mark.parametrize("command", ["run", "doctor", "calibrate"])
+def test_bytes_that_are_no_sound_are_one_line(command, suffix, tmp_path, capsys):
+    sound = tmp_path / f"f{suffix}"
+    sound.write_bytes(np.random.default_rng(1).bytes(5000))
+    out = ["--out", str(tmp_path / "m.json")] if command == "calibrate" else []
+    assert str(sound) in refusal([command, str(sound), *out], tmp_path, capsys)
+
+
+# --- disks -----------------------------------------------------------------------------------------------
+
+
+def on_small_disk(words: list[str], limit: int = 4096) -> subprocess.CompletedProcess[str]:
+    """Run a command that may write so many bytes a file."""
+    return subprocess.run(
+        [*COMMAND, *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+
+
+def one_line(done: subprocess.CompletedProcess[str]) -> str:
+    assert done.returncode == 2, done
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    return done.stderr
+
+
+def test_a_full_disk_leaves_no_recording(tmp_path):
+    done = on_small_disk(["simulate", "--out", str(tmp_path), "--static", "1", "--duration", "0.5"])
+    assert "expected to write" in one_line(done)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_full_disk_leaves_no_figure(tmp_path):
+    done = on_small_disk(["bounds", "--out", str(tmp_path), "--trials", "2", "--snr-db", "0"])
+    assert "File too large" in one_line(done)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_standard_output_is_one_line():
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*COMMAND, "bounds"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert "No space left" in one_line(done)
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    line = " ".join([*COMMAND, "bounds", "--json"])
+    done = subprocess.run(
+        ["bash", "-c", f"{line} | true; exit ${{PIPESTATUS[0]}}"], capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+# --- interruptions ---------------------------------------------------------------------------------------
+
+
+def interrupted(words: list[str], begun, number: int) -> int:
+    """Start a command, signal it (all its processes, as a terminal does on Ctrl-C) once `begun`."""
+    running = subprocess.Popen([*COMMAND, *words], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 60.0
+    while not begun() and running.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if number == signal.SIGINT:
+        os.killpg(running.pid, number)
+    else:
+        running.send_signal(number)
+    _, said = running.communicate(timeout=60.0)
+    assert "Traceback" not in said
+    return running.returncode
+
+
+CODES = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+
+
+@pytest.mark.parametrize(("number", "code"), CODES)
+def test_an_interrupted_simulation_lists_what_it_leaves(number, code, tmp_path):
+    words = ["simulate", "--out", str(tmp_path), "--static", "400", "--duration", "0.5", "--jobs", "2"]
+    assert interrupted(words, (tmp_path / "DataLog.csv").exists, number) == code
+    listed = {recording.path for recording in OvadDataset(tmp_path).recordings}
+    assert listed == {path.parent for path in tmp_path.rglob("truth.json")}
+    assert listed
+    assert not list(tmp_path.rglob(".*"))
+
+
+@pytest.mark.parametrize(("number", "code"), CODES)
+def test_an_interrupted_run_leaves_nothing(number, code, tmp_path):
+    sound = tmp_path / "long.wav"
+    soundfile.write(sound, np.random.default_rng(1).normal(0, 0.1, (20 * 47_998, 56)), 47_998, "PCM_16")
+    words = ["run", str(sound), "--out", str(tmp_path / "states.jsonl")]
+    assert interrupted(words, lambda: list(tmp_path.glob(".states-*")), number) == code
+    assert list(tmp_path.iterdir()) == [sound]
+
+
+def test_another_simulation_keeps_what_the_log_lists(tmp_path):
+    write_log(tmp_path, [LogRow("3_01_0007", "SA2", "right", 70)])
+    (tmp_path / "SA2/right/3_01_0007").mkdir(parents=True)
+    assert main(["simulate", "--out", str(tmp_path), "--duration", "0.5", "--static", "1"]) == 0
+    listed = [recording.recording_id for recording in OvadDataset(tmp_path).recordings]
+    assert listed == ["3_01_0007", "1_00_0000"]

@@ -1,0 +1,66 @@
+"""Outputs are checked before the work: a long run does not fail at its end, and no input is overwritten."""
+
+import argparse
+import os
+from pathlib import Path
+
+from worldstate.ground.errors import InputFileError
+
+
+def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[str, ...] = ()) -> None:
+    """Refuse output files that cannot be written, that replace an input, or that are one and the same.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     sound = Path(folder, "a.wav")
+    ...     sound.touch()
+    ...     check_outputs(argparse.Namespace(input=sound, out=Path(folder, "b.jsonl")), "out")
+    """
+    from worldstate.adapters.files.atomic import check_target
+    from worldstate.operations.figure_style import check_suffix
+
+    given = vars(arguments)
+    outputs = {name: given[name] for name in (*options, *figures) if given[name] is not None}
+    lists = [
+        value if isinstance(value, list) else [value] for name, value in given.items() if name not in outputs
+    ]
+    inputs = [value for values in lists for value in values if isinstance(value, Path)]
+    taken: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if name in figures:
+            check_suffix(path)
+        target = check_target(path)
+        if any(_is_read(target, source) for source in inputs):
+            raise InputFileError(path, "expected another file to write to, this one is read")
+        if target in taken:
+            raise InputFileError(path, f"expected another file for --{name} than for --{taken[target]}")
+        taken[target] = name
+
+
+def output_folder(folder: Path, *files: str) -> Path:
+    """Make the folder that a command writes to, and refuse one in which its files cannot be written."""
+    from worldstate.adapters.files.atomic import check_target
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        check_target(folder / name)
+    return folder
+
+
+def _is_read(target: Path, source: Path) -> bool:
+    """Whether an output is the input file itself, or one of the files of an input in the layout of OVAD."""
+    from worldstate.adapters.camera.video import VIDEO_NAME
+    from worldstate.adapters.datasets.ovad_layout import (
+        ARRAY_NAME,
+        AUDIO_NAME,
+        DETECTION_NAMES,
+        LOG_NAME,
+        TRUTH_NAME,
+    )
+
+    if source.is_dir():
+        names = (ARRAY_NAME, AUDIO_NAME, LOG_NAME, TRUTH_NAME, VIDEO_NAME, *DETECTION_NAMES)
+        return target.name in names and target.is_relative_to(os.path.realpath(source))
+    return target.exists() and source.exists() and target.samefile(source)
