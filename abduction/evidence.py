@@ -55,4 +55,4 @@ class SignatureEvidence:
     @property
     def log_likelihoods(self) -> np.ndarray:
         """The vector (hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
-        return np.array([*self.hidden, self.visible, self.none])
+        return np.array([*self.hidden, self.visible, self.none], dtype=np.float64)

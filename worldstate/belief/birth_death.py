@@ -54,7 +54,8 @@ def birth_death(
                     kept.append(_hidden_again(returning, k, explanation.hidden[k], measurement, scene))
         else:
             kept.remove(current)
-            existence = explanation.hidden[k] + explanation.emerged[k]
+            # The sum of two exponentials exceeds one by rounding where nothing else is possible.
+            existence = min(explanation.hidden[k] + explanation.emerged[k], 1.0)
             if existence >= settings.death_probability or alarmed[k]:
                 kept.append(replace(current, existence=existence))
     return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))

@@ -98,7 +98,7 @@ class ExplanationBelief:
         seen: Posterior = abduce(prior + log_co_evidence, evidence, _FOLDED_IN)
         posterior = np.array(seen.log_probabilities)
         spread = np.concatenate([posterior[:k], parts + (posterior[-2] - visible), posterior[-1:]])
-        return replace(self, log_probabilities=tuple(np.maximum(spread, LOG_FLOOR).tolist()))
+        return replace(self, log_probabilities=tuple(np.clip(spread, LOG_FLOOR, 0.0).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
         """Return the belief once vision has the vehicle of a direction: its mass is in view now."""

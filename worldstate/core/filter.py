@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Integral
 from typing import Any
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
@@ -100,6 +101,7 @@ class WorldFilter:
     memory: Memory | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "start_ns", _integer_ns("start_ns", self.start_ns))
         expected = len(self.context.directions) + 2
         if len(self.policy.reference_prior) != expected:
             got = len(self.policy.reference_prior)
@@ -174,8 +176,9 @@ class WorldFilter:
         Raises
         ------
         InvalidArgumentError
-            If that time is earlier than the belief's.
+            If that time is no integer or is earlier than the belief's.
         """
+        stamp_ns = _integer_ns("stamp_ns", stamp_ns)
         if stamp_ns < self.stamp_ns - STAMP_SLACK_NS:
             raise InvalidArgumentError(
                 f"stamp_ns: expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
@@ -190,9 +193,12 @@ class WorldFilter:
         Raises
         ------
         InvalidArgumentError
-            If the time stamp is earlier than the belief's or than the source's last one, the directions are
-            not those of the context, or a number is not finite.
+            If the time stamp is no integer or is earlier than the belief's or than the source's last one, the
+            directions are not those of the context, or a number is not finite.
         """
+        stamp_ns = _integer_ns("stamp_ns", measurement.stamp_ns)
+        if stamp_ns is not measurement.stamp_ns:  # numpy's integers cannot be written as JSON
+            measurement = replace(measurement, stamp_ns=stamp_ns)
         _check(measurement, self.context, dict(self._memory.last_ns))
         world = self.predict_to(measurement.stamp_ns)
         memory, model = world._memory, world._model
@@ -238,6 +244,13 @@ class WorldFilter:
     @cached_property
     def _model(self) -> FilterModel:
         return FilterModel(self.context, self.policy, site_geometry_of(self.context, self.settings))
+
+
+def _integer_ns(name: str, value: object) -> int:
+    """Return a time stamp as a Python integer; NaN and infinity would pass every comparison unnoticed."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InvalidArgumentError(f"{name}: expected integer nanoseconds, got {value!r}")
+    return int(value)
 
 
 def _check(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> None:

@@ -1,0 +1,228 @@
+"""What a user would miss: behaviour behind settings and promises, through the public face alone."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldstate import (
+    Absent,
+    Approach,
+    Bearing,
+    Context,
+    FilterSettings,
+    Measurement,
+    NotUsable,
+    Sighting,
+    SignatureEvidence,
+    Unqueried,
+    WorldFilter,
+    WorldstateError,
+    uncalibrated_policy,
+)
+from worldstate.abduction import log_lambda
+
+NOTHING, UNASKED = NotUsable("-"), Unqueried("-")
+EVEN = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+LEFT = SignatureEvidence(("left", "right"), (6.0, 0.0), 0.0, 0.0)
+RIGHT = SignatureEvidence(("left", "right"), (0.0, 6.0), 0.0, 0.0)
+FRONT = SignatureEvidence(("left", "right"), (0.0, 0.0), 6.0, 0.0)
+
+
+def measured(time_s, signature=EVEN, *sightings, answer=UNASKED, bearing=NOTHING, approach=NOTHING):
+    return Measurement(round(time_s * 1e9), signature, answer, bearing, approach, sightings)
+
+
+def car(azimuth_rad):
+    return Sighting(azimuth_rad, 0.02, "car", 0.9, 0.05)
+
+
+def after(world, *measurements):
+    for measurement in measurements:
+        world = world.update(measurement)
+    return world
+
+
+def entities(world):
+    return {entity.status: entity for entity in world.state.entities}
+
+
+@pytest.mark.parametrize(("azimuth", "answer"), [(0.5, "unqueried"), (0.2, "absent")])
+def test_an_empty_look_says_nothing_of_what_it_cannot_see(azimuth, answer):
+    """A vehicle beyond the edge of the view is not there to be missed."""
+    world = after(WorldFilter(Context(view_half_angle_rad=0.35)), measured(1.0, FRONT, car(azimuth)))
+    before = world.state.entities[0].existence_probability
+    (entity,) = after(world, measured(1.3, FRONT, answer=Absent(0.05))).state.entities
+    assert entity.visibility.answer == answer
+    alive = before * math.exp(-0.3 / world.settings.visible_life_s)
+    assert (entity.existence_probability == pytest.approx(alive)) == (answer == "unqueried")
+    assert entity.existence_probability <= alive * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(("gate_rad", "vehicles"), [(0.35, 2), (0.6, 1)])
+def test_a_sighting_beyond_the_gate_is_another_vehicle(gate_rad, vehicles):
+    """However uncertain an azimuth has become, a vehicle does not jump by more than the gate."""
+    world = after(WorldFilter(settings=FilterSettings(gate_rad=gate_rad)), measured(1.0, FRONT, car(-0.2)))
+    assert len(after(world, measured(1.6, FRONT, car(0.25))).state.entities) == vehicles
+
+
+def test_how_often_the_side_is_heard_wrongly_decides_who_came_into_view():
+    def seen_on_the_right(side_confusion):
+        world = WorldFilter(settings=FilterSettings(side_confusion=side_confusion))
+        world = after(world, *[measured(t, LEFT) for t in (1.0, 2.0, 3.0)])
+        (heard,) = world.state.entities
+        return heard, entities(after(world, measured(3.1, LEFT, car(-0.5))))
+
+    heard, seen = seen_on_the_right(0.2)
+    assert {status: entity.id for status, entity in seen.items()} == {"visible": heard.id}
+    heard, seen = seen_on_the_right(1e-6)
+    assert seen["hidden"].id == heard.id != seen["visible"].id
+
+
+@pytest.mark.parametrize(("side_confusion", "whose"), [(0.2, "left"), (0.9, "right")])
+def test_of_two_hidden_vehicles_the_likelier_one_comes_into_view(side_confusion, whose):
+    """With a signature that mostly names the wrong side, what appears on the left was heard on the right."""
+    both = SignatureEvidence(("left", "right"), (6.0, 6.0), 0.0, 0.0)
+    chances = FilterSettings(side_confusion=side_confusion, birth_probability=0.3)
+    world = after(WorldFilter(settings=chances), *[measured(t, both) for t in (1.0, 2.0, 3.0)])
+    heard = {entity.direction: entity.id for entity in world.state.entities}
+    assert set(heard) == {"left", "right"}
+    assert entities(after(world, measured(3.1, both, car(0.5))))["visible"].id == heard[whose]
+
+
+def test_what_came_into_view_before_a_birth_is_another_vehicle_for_the_whole_window():
+    """The belief of one window ago, which the next windows build on, forgets it as well."""
+    weak = SignatureEvidence(("left", "right"), (2.0, 0.0), 0.0, 0.0)
+    patient = FilterSettings(birth_probability=0.97, death_probability=0.001)
+    world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=1.1), settings=patient)
+    world = after(world, *[measured(1.0 + t / 10, weak) for t in range(15)])
+    world = after(world, *[measured(2.5 + t / 10, FRONT) for t in range(10)])
+    assert world.state.entities == ()
+    assert world.state.cues[0].hypotheses.visible > 0.7
+    loud = SignatureEvidence(("left", "right"), (20.0, 0.0), 0.0, 0.0)
+    (born,) = after(world, measured(3.5, loud)).state.entities
+    (later,) = after(world, measured(3.5, loud), measured(3.6, FRONT)).state.entities
+    assert born.id == later.id
+    assert later.existence_probability < 0.05 < 0.99 < born.existence_probability
+
+
+def test_a_vehicle_seen_a_moment_ago_has_not_gone_into_hiding():
+    """One missed image is no occlusion: what is heard hidden beside it is another vehicle."""
+    world = after(WorldFilter(), measured(1.0, FRONT, car(-0.5)), measured(1.1, RIGHT))
+    assert set(entities(world)) == {"visible", "hidden"}
+    first = entities(world)["visible"].id
+    late = after(WorldFilter(), measured(1.0, FRONT, car(-0.5)), measured(1.3, RIGHT))
+    assert {status: entity.id for status, entity in entities(late).items()} == {"hidden": first}
+
+
+def test_a_peak_moves_a_doubtful_entity_less():
+    """What may not exist may not have made the sound."""
+
+    def moved(sighting_existence):
+        doubt = FilterSettings(sighting_existence=sighting_existence, clutter_rate=0.9)
+        world = after(WorldFilter(settings=doubt), measured(1.0, FRONT, car(0.0)))
+        bearing = Bearing(0.15, 0.05, 1.6)
+        (entity,) = after(world, measured(2.0, FRONT, bearing=bearing)).state.entities
+        (unheard,) = after(world, measured(2.0, FRONT)).state.entities
+        return entity.azimuth_rad - unheard.azimuth_rad
+
+    assert 0.0 < moved(0.1) < 0.6 * moved(0.95)
+
+
+def test_a_range_is_published_once_it_is_known_and_in_view():
+    def handed_over(log_range_std):
+        known = FilterSettings(hidden_std=(0.15, 0.25, log_range_std), hidden_range_m=20.0)
+        world = after(WorldFilter(settings=known), *[measured(t, LEFT) for t in (1.0, 2.0)])
+        (hidden,) = world.state.entities
+        assert (hidden.status, hidden.range_m, hidden.position_m) == ("hidden", None, None)
+        return entities(after(world, measured(2.1, LEFT, car(0.5))))["visible"]
+
+    vague, known = handed_over(0.6), handed_over(0.1)
+    assert (vague.range_m, vague.position_m) == (None, None)
+    assert known.range_m == pytest.approx(20.0, rel=0.15)
+    x_m, y_m = known.range_m * math.cos(known.azimuth_rad), known.range_m * math.sin(known.azimuth_rad)
+    assert known.position_m == pytest.approx((x_m, y_m, 0.0))
+
+
+@pytest.mark.parametrize("step_s", [1.0, 0.5, 0.1])
+def test_an_approach_rate_sharpens_the_belief_as_data_association_says(step_s):
+    r"""P = w P^+ + (1 - w) P^- + w (1 - w) K^2 nu^2, with w = P(the sound is this entity's).
+
+    Of a window that overlaps the last one, only the new share counts: R / share.
+    """
+    world = after(WorldFilter(), *[measured(t, LEFT, approach=Approach(0.3, 0.3)) for t in (1.0, 2.0)])
+    (before,) = world.predict_to(round((2.0 + step_s) * 1e9)).state.entities
+    (later,) = after(world, measured(2.0 + step_s, LEFT, approach=Approach(0.6, 0.2))).state.entities
+    prior, w = before.inverse_tta_std_hz**2, later.existence_probability
+    gain = prior / (prior + 0.2**2 / step_s)
+    news = 0.6 - before.inverse_tta_hz
+    expected = w * (1 - gain) * prior + (1 - w) * prior + w * (1 - w) * (gain * news) ** 2
+    assert later.inverse_tta_hz == pytest.approx(before.inverse_tta_hz + w * gain * news)
+    assert later.inverse_tta_std_hz**2 == pytest.approx(expected)
+
+
+def test_a_hand_over_keeps_the_approach_that_was_heard():
+    world = after(WorldFilter(), *[measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in (1.0, 2.0, 3.0)])
+    (before,) = world.predict_to(3_100_000_000).state.entities
+    seen = entities(after(world, measured(3.1, LEFT, car(0.5))))["visible"]
+    assert seen.inverse_tta_hz == pytest.approx(before.inverse_tta_hz)
+    assert seen.inverse_tta_std_hz == pytest.approx(before.inverse_tta_std_hz)
+
+
+def test_the_likelihood_ratio_keeps_its_promises_without_mass():
+    """No prior mass on hidden: all directions weigh alike. None on the others: without bound."""
+    heard = SignatureEvidence(("left", "right"), (1.0, 3.0), 0.5, -0.5)
+    nobody = -np.inf
+    even = np.log([0.25, 0.25, 0.25, 0.25])
+    unheard = np.array([nobody, nobody, *even[2:]])
+    assert log_lambda(unheard, heard, UNASKED) == pytest.approx(log_lambda(even, heard, UNASKED))
+    assert log_lambda(np.array([*even[:2], nobody, nobody]), heard, UNASKED) == np.inf
+    # Neither other explanation can make what the camera says, or has any mass.
+    assert log_lambda(np.array([*even[:3], nobody]), heard, Absent(0.0)) == np.inf
+    one_sided = np.array([even[0], nobody, *even[2:]])
+    other = np.log(np.mean(np.exp([0.5, -0.5])))
+    assert log_lambda(one_sided, heard, UNASKED) == pytest.approx(1.0 - other)
+
+
+@pytest.mark.parametrize("stamp_ns", [math.nan, math.inf, 1.5e9, "1500000000", None, True])
+def test_a_time_that_is_no_integer_is_refused_and_changes_nothing(stamp_ns):
+    world = after(WorldFilter(), measured(1.0, LEFT))
+    before = world.state
+    with pytest.raises(WorldstateError, match="stamp_ns: expected integer nanoseconds"):
+        world.predict_to(stamp_ns)
+    with pytest.raises(WorldstateError, match="stamp_ns: expected integer nanoseconds"):
+        world.update(replace(measured(1.1, LEFT), stamp_ns=stamp_ns))
+    with pytest.raises(WorldstateError, match="start_ns: expected integer nanoseconds"):
+        WorldFilter(start_ns=stamp_ns)
+    assert world.state == before
+
+
+def test_stamps_and_likelihoods_of_numpy_are_as_good_as_pythons():
+    """Drivers stamp with numpy integers, and a likelihood may be written without its point."""
+    plain = SignatureEvidence(("left", "right"), (6.0, 0.0), 1.0, 0.0)
+    whole = SignatureEvidence(("left", "right"), (6, 0), 1, 0)
+    world = after(WorldFilter(), measured(1.0, plain), measured(1.1, plain)).predict(0.1)
+    hops = [replace(measured(t, whole), stamp_ns=np.int64(round(t * 1e9))) for t in (1.0, 1.1)]
+    other = after(WorldFilter(start_ns=np.int64(0)), *hops).predict_to(np.int64(1_200_000_000))
+    assert other.state.to_json() == world.state.to_json()
+    assert json.dumps(other.to_dict()) == json.dumps(world.to_dict())
+
+
+def test_absurd_approach_rates_do_not_end_the_filter():
+    """Three rates that recede within the accepted range drove log r to where exp overflows."""
+    absurd = [measured(2.0 + t / 10, LEFT, approach=Approach(-1e3, 1e-3)) for t in range(1, 4)]
+    world = after(WorldFilter(), measured(1.0, LEFT), measured(2.0, LEFT), *absurd).predict(1.0)
+    (entity,) = world.state.entities
+    assert math.isfinite(entity.azimuth_rad)
+    assert math.isfinite(entity.inverse_tta_hz)
+
+
+def test_a_certain_entity_survives_a_checkpoint():
+    """Rounding must not make a probability exceed one: such a checkpoint would be refused."""
+    world, rng = WorldFilter(), np.random.default_rng(0)
+    for hop in range(1, 300):
+        certain = SignatureEvidence(("left", "right"), (float(rng.uniform(8, 40)), 0.0), 3.0, 0.0)
+        world = after(world, measured(hop / 10, certain))
+        assert WorldFilter.from_dict(world.to_dict()).state == world.state
