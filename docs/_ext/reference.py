@@ -8,6 +8,7 @@ import inspect
 import pkgutil
 from collections.abc import Iterable
 from pathlib import Path
+from types import UnionType
 from typing import TYPE_CHECKING
 
 # The tests read the exported names through this module without Sphinx.
@@ -72,8 +73,10 @@ def kind(value: object) -> str:
 
 
 def summary(value: object) -> str:
-    """Return the first sentence of a docstring; a constant is described by its value."""
+    """Return the first sentence of a docstring; a constant or a type alias is described by its value."""
     if kind(value) == "data":
+        if isinstance(value, UnionType):
+            return "Type: " + " or ".join(f":py:obj:`{one.__name__}`" for one in value.__args__)
         several = isinstance(value, Iterable) and not isinstance(value, str)
         return f"Constant: {', '.join(map(str, value)) if several else value}."
     return " ".join((inspect.getdoc(value) or "").split("\n\n")[0].split())

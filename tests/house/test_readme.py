@@ -1,28 +1,32 @@
-"""The README's first program runs as printed."""
+"""The README's first program runs as printed, and its commands are the commands that there are."""
 
 import re
-import shutil
 from pathlib import Path
 
 import pytest
 
+from worldstate.cli.main import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def first_program() -> str:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    return re.search(r"```python\n(.*?)```", text, flags=re.DOTALL).group(1)
-
-
-def test_the_eight_lines_are_eight():
-    assert len([line for line in first_program().splitlines() if line.strip()]) == 8
+    return re.search(r"```python\n(.*?)```", README, flags=re.DOTALL).group(1)
 
 
 @pytest.mark.xdist_group("approach")
-def test_the_eight_lines_run(approach, tmp_path, monkeypatch, capsys):
-    shutil.copy(approach.audio_path, tmp_path / "some.wav")
-    shutil.copy(approach.array_path, tmp_path / "mics.xml")
-    shutil.copy(approach.detections_path, tmp_path / "d.json")
+def test_the_first_program_warns_of_the_recording_that_the_demo_leaves(
+    approach, tmp_path, monkeypatch, capsys
+):
+    demo = tmp_path / "out" / "demo"
+    demo.mkdir(parents=True)
+    (demo / "recording").symlink_to(approach.folder.parents[2])
     monkeypatch.chdir(tmp_path)
     exec(compile(first_program(), "README.md", "exec"), {})
-    assert "hidden" in capsys.readouterr().out
+    assert f"hidden vehicle on the {approach.folder.parent.name}" in capsys.readouterr().out
+
+
+def test_the_table_of_commands_is_complete():
+    listed = set(re.findall(r"^\| `worldstate ([a-z-]+)", README, flags=re.MULTILINE))
+    assert listed == {name.split(".")[-1].replace("_", "-") for name in COMMANDS}

@@ -33,7 +33,14 @@ class InvalidArgumentError(WorldstateError):
 
 
 class OutOfDomainError(WorldstateError):
-    """An array, a sample rate or a feature is not what a model or a data set was made with."""
+    """An array, a sample rate or a feature is not what a model or a data set was made with.
+
+    Examples
+    --------
+    >>> error = OutOfDomainError("street.wav: not the array of the model")
+    >>> isinstance(error, WorldstateError)
+    True
+    """
 
 
 class InputFileError(WorldstateError):

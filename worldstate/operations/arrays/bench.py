@@ -96,6 +96,12 @@ def run_bench(rounds: int = 5, on_round: Callable[[], None] = lambda: None) -> B
     Returns
     -------
     BenchReport
+
+    Examples
+    --------
+    >>> report = run_bench(rounds=1)
+    >>> report.threads, report.rounds, report.total_ms > 0
+    (1, 1, True)
     """
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((SECONDS * RATE_HZ, 56), dtype=np.float32)

@@ -46,6 +46,21 @@ class RecordingReport:
         What was wrong with the microphones.
     bearings : BearingChecks
         Bearings and their prominence, beside the moving boxes of the camera.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> from worldstate.adapters import open_source
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     report = run_recording(open_source(path))
+
+    >>> report.to_dict()["lead_time_s"], report.timeline.time_s.tolist()
+    (None, [1.0, 1.1, 1.2])
     """
 
     warning: WarningSummary
@@ -87,6 +102,23 @@ def run_recording(
     ------
     InputFileError
         If a file of the source is damaged.
+
+    Examples
+    --------
+    A second and a fifth of noise:
+
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> from worldstate.adapters import open_source
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     report = run_recording(open_source(path))
+
+    >>> report.hops, report.warning.first_advisory_s
+    (3, None)
     """
     log = _HopLog(WarningMeter(source.t0_s))
     started = time.perf_counter()

@@ -134,6 +134,21 @@ def write_timeline(timeline: Timeline, path: Path) -> None:
         From `run_recording`.
     path : Path
         Exactly this file.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> n = 20
+    >>> quiet = Timeline(
+    ...     time_s=1.0 + 0.1 * np.arange(n), statistic=np.zeros(n), risk=np.zeros(n), threshold=0.8,
+    ...     alpha=0.02, advisory={"left": np.zeros(n, bool), "right": np.zeros(n, bool)},
+    ...     azimuths_rad=np.linspace(-1, 1, 9), srp=np.ones((n, 9)), srp_age_s=0.5, entities=(),
+    ...     sighting_time_s=np.empty(0), sighting_azimuth_rad=np.empty(0), t0_s=None, truth=(), title="",
+    ... )
+    >>> with TemporaryDirectory() as folder:
+    ...     write_timeline(quiet, Path(folder) / "quiet.png")
+    ...     (Path(folder) / "quiet.png").stat().st_size > 10_000
+    True
     """
     with figure_style():
         save_figure(draw_timeline(timeline), path)
