@@ -17,6 +17,7 @@ from .camera.motion_detector import MotionDetector as MotionDetector
 from .camera.onnx_detector import OnnxDetector as OnnxDetector
 from .camera.onnx_detector import open_onnx as open_onnx
 from .camera.pinhole import PinholeCamera as PinholeCamera
+from .camera.pinhole import read_camera as read_camera
 from .camera.video import open_video as open_video
 from .camera.vision_query import VisionQuery as VisionQuery
 from .camera.vision_query import VisionSettings as VisionSettings
@@ -26,7 +27,7 @@ from .datasets.feature_table import read_features as read_features
 from .datasets.feature_table import write_features as write_features
 from .datasets.ovad import OvadDataset as OvadDataset
 from .datasets.ovad import Recording as Recording
-from .files.array_file import read_array_xml as read_array_xml
+from .files.array_file import read_array as read_array
 from .files.array_file import write_array_xml as write_array_xml
 from .files.checkpoint_file import Checkpoint as Checkpoint
 from .files.checkpoint_file import read_checkpoint as read_checkpoint
@@ -36,6 +37,7 @@ from .files.model_file import Provenance as Provenance
 from .files.model_file import load_model as load_model
 from .files.model_file import read_model as read_model
 from .files.model_file import save_model as save_model
+from .listen import ListenSettings as ListenSettings
 from .listen import Source as Source
 from .listen import Step as Step
 from .listen import listen_steps as listen_steps

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
@@ -12,20 +12,25 @@ from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstim
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.camera_channel import video_degradation
-from worldstate.adapters.camera.detections import DetectionLog, read_detections
+from worldstate.adapters.camera.detection_formats import read_any_detections
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
+from worldstate.adapters.camera.detector import Detector
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
-from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.files.array_file import read_array_xml
-from worldstate.adapters.files.model_file import load_model
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.core.filter import WorldFilter
+from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
@@ -34,6 +39,85 @@ from .acoustic import AcousticAdapter, Signature
 from .acoustic_grounding import Grounding
 
 BLOCKS_PER_SECOND = 20
+
+
+@dataclass(frozen=True, slots=True)
+class ListenSettings:
+    """How a recording is listened to; the defaults are those of `worldstate run`.
+
+    Parameters
+    ----------
+    alpha : float or None
+        False-positive budget that the threshold was set for; the model file says which it holds. None takes
+        the first one, for those who only measure.
+    band_hz : (float, float), optional
+        Band of the spatial spectrum, Hz; it follows the spacing of the microphones where not given.
+    azimuth_span_deg : float
+        Width of the sector ahead that is searched, whole degrees: 180, or 360 for all round.
+    mask_dead : bool
+        Listen without silent channels, as long as half of them are left, instead of refusing them.
+    site_adaptation : bool
+        Learn what the site is like while listening, where the model compares windows with their site.
+    forgetting_s : float, optional
+        Time constant of that, seconds; see `SiteEstimateSettings`.
+    grounding : Grounding, optional
+        Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
+    ego_noise : bool or EgoNoiseSettings
+        Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
+        spatial spectrum, bearing and prominence. The signature hears what it was trained with.
+    boxes : DetectionFilter
+        Which of the camera's boxes count: classes, score, height.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the span is not a whole number of degrees from 2 to 360.
+
+    Examples
+    --------
+    >>> ListenSettings(azimuth_span_deg=360).grid_deg
+    (-180.0, 180.0)
+    """
+
+    alpha: float | None = 0.02
+    band_hz: tuple[float, float] | None = None
+    azimuth_span_deg: float = 180.0
+    mask_dead: bool = False
+    site_adaptation: bool = True
+    forgetting_s: float | None = None
+    grounding: Grounding | None = None
+    ego_noise: bool | EgoNoiseSettings = False
+    boxes: DetectionFilter = field(default_factory=DetectionFilter)
+
+    def __post_init__(self) -> None:
+        if in_range("azimuth_span_deg", self.azimuth_span_deg, 2.0, 360.0) % 1.0:
+            got = self.azimuth_span_deg
+            raise InvalidArgumentError(f"azimuth_span_deg: expected whole degrees, got {got}")
+        self.site()  # what is wrong with the time constant is said here
+
+    @property
+    def grid_deg(self) -> tuple[float, float]:
+        """First and last azimuth that is searched, degrees."""
+        return -0.5 * self.azimuth_span_deg, 0.5 * self.azimuth_span_deg
+
+    def front_end(self, array: MicrophoneArray, sample_rate_hz: float) -> FrontEndSettings:
+        """Return the front-end's settings for an array and a sample rate."""
+        ego_noise = self.ego_noise
+        return FrontEndSettings(
+            azimuth_span_deg=self.grid_deg,
+            srp_band_hz=self.band_hz or default_band_hz(array, sample_rate_hz),
+            ego_noise=(EgoNoiseSettings() if ego_noise else None)
+            if isinstance(ego_noise, bool)
+            else ego_noise,
+        )
+
+    def site(self) -> SiteEstimateSettings | None:
+        """Return how the site is learned, None for not at all."""
+        if not self.site_adaptation:
+            return None
+        return (
+            SiteEstimateSettings() if self.forgetting_s is None else SiteEstimateSettings(self.forgetting_s)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,23 +138,18 @@ class Source:
         Threshold, sustained rule and risk map.
     context : Context
         Rates, occluders, ego motion.
+    settings : ListenSettings
+        How it is listened to.
     t0_s : float or None
         Line-of-sight entry where the recording knows it, seconds from its start.
-    mask_dead : bool
-        Listen without silent channels instead of refusing them.
+    camera : PinholeCamera
+        That took the images.
     miss_rates : MissRates or None
         Measured for the camera's detector; the defaults of `VisionQuery` without.
     degradation : float or callable
         d of the camera, or a function from the stamp to it.
-    site_settings : SiteEstimateSettings or None
-        How the site is learned while listening; None for not at all, and without effect on a model that does
-        not compare windows with their site.
     site : SiteEstimate or None
         What is known of the site beforehand, from a checkpoint.
-    grounding : Grounding or None
-        Weighs the model's scores with bearing, approach and engine line, eq. (5).
-    ego_noise : EgoNoiseSettings or None
-        Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it.
     """
 
     audio_path: Path
@@ -79,20 +158,32 @@ class Source:
     model: AnySignature
     policy: CueingPolicy
     context: Context
+    settings: ListenSettings = field(default_factory=ListenSettings)
     t0_s: float | None = None
-    mask_dead: bool = False
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
     miss_rates: MissRates | None = None
     degradation: float | Callable[[int], float] = 0.0
-    site_settings: SiteEstimateSettings | None = None
     site: SiteEstimate | None = None
-    grounding: Grounding | None = None
-    ego_noise: EgoNoiseSettings | None = None
 
     def signature(self) -> Signature:
         """Return the model as it is at the start of the recording; one that learns its site learns anew."""
-        if self.site_settings is None or not isinstance(self.model, EnsembleModel):
+        site = self.settings.site()
+        if site is None or not isinstance(self.model, EnsembleModel):
             return self.model
-        return SiteSignature(self.model, self.site_settings, estimate=self.site)
+        return SiteSignature(self.model, site, estimate=self.site)
+
+    def camera_channel(self) -> VisionQuery:
+        """Return the camera as the channel that is asked for co-evidence."""
+        rates = self.miss_rates
+        return VisionQuery(
+            self.camera,
+            self.detections,
+            rates.table if rates is not None else None,
+            self.degradation,
+            VisionSettings(keep=self.settings.boxes),
+            line_of_sight=unoccluded_sector(self.context),
+            clutter=rates.clutter_rate if rates is not None else None,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,16 +200,13 @@ def open_source(
     *,
     array: Path | str | MicrophoneArray | None = None,
     detections: Path | str | DetectionLog | None = None,
-    model: Path | str | None = None,
-    alpha: float | None = 0.02,
-    context: Context | None = None,
-    mask_dead: bool = False,
+    detector: Detector | None = None,
+    camera: Path | str | PinholeCamera | None = None,
     miss_rates: Path | str | MissRates | None = None,
-    site_adaptation: bool = True,
-    forgetting_s: float | None = None,
+    model: Path | str | Model | None = None,
+    context: Context | None = None,
     site: SiteEstimate | None = None,
-    grounding: Grounding | None = None,
-    ego_noise: bool | EgoNoiseSettings = False,
+    settings: ListenSettings | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
@@ -127,65 +215,74 @@ def open_source(
     path : path
         Multichannel sound file, or a recording folder in the OVAD layout.
     array : path or MicrophoneArray, optional
-        Acoular XML; that of the data set where not given, OVAD's where it names none.
+        Acoular XML, CSV or JSON as `read_array` reads them; that of the data set where not given, OVAD's
+        where it names none.
     detections : path or DetectionLog, optional
-        Camera detections per frame; those of the recording folder where not given.
-    model : path, optional
-        Model file; the one that ships where not given.
-    alpha : float or None
-        False-positive budget that the threshold was set for; the model file says which it holds. None takes
-        the first one, for those who only measure.
-    context : Context, optional
-        Rates, occluders and ego motion; defaults where not given.
-    mask_dead : bool
-        Listen without silent channels, as long as half of them are left, instead of refusing them.
+        Camera detections per frame, in any form that `read_any_detections` knows; those of the recording
+        folder where not given.
+    detector : Detector, optional
+        Looks at the video of the recording folder, in place of `detections`.
+    camera : path or PinholeCamera, optional
+        What took the images, as `read_camera` reads it; OVAD's camera where not given.
     miss_rates : path or MissRates, optional
         What `worldstate measure-absence` wrote. Where it holds the camera's scale of health and the recording
         folder has a video, the degradation is read from that.
-    site_adaptation : bool
-        Learn what the site is like while listening, where the model compares windows with their site.
-    forgetting_s : float, optional
-        Time constant of that, seconds; see `SiteEstimateSettings`.
+    model : path or Model, optional
+        Model; the one that ships where not given.
+    context : Context, optional
+        Rates, occluders and ego motion; defaults where not given.
     site : SiteEstimate, optional
         What is known of the site beforehand, from a checkpoint.
-    grounding : Grounding, optional
-        Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
-    ego_noise : bool or EgoNoiseSettings
-        Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
-        spatial spectrum, bearing and prominence. The signature hears what it was trained with.
+    settings : ListenSettings, optional
+        How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
 
     Raises
     ------
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
-        If the model holds no threshold for `alpha` or the time constant is not positive.
+        If the model holds no threshold for the budget, or both detections and a detector are given.
     """
-    path = Path(path)
+    path, settings = Path(path), settings or ListenSettings()
     recording = Recording.open(path) if path.is_dir() else None
-    signature, policies = load_model(model)
+    chosen = model if isinstance(model, Model) else read_model(model)
+    microphones = read_array(array) if isinstance(array, Path | str) else array
+    lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
     rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
-    found = detections if detections is not None else recording and recording.detections_path
+    alpha, policies = settings.alpha, chosen.policies
     return Source(
         audio_path=recording.audio_path if recording else path,
-        array=choose_array(path, _array(array), name=array),
-        detections=found if found is None or isinstance(found, DetectionLog) else read_detections(found),
-        model=signature,
+        array=choose_array(path, microphones, name=array),
+        detections=_detections(detections, detector, recording, lens),
+        model=chosen.signature,
         policy=policies.policies[0] if alpha is None else policies.for_alpha(alpha),
         context=context or Context(),
+        settings=settings,
         t0_s=recording.t0_s if recording and recording.label != "none" else None,
-        mask_dead=mask_dead,
+        camera=lens,
         miss_rates=rates,
         degradation=_degradation(recording, rates),
-        site_settings=_site_settings(forgetting_s) if site_adaptation else None,
         site=site,
-        grounding=grounding,
-        ego_noise=(EgoNoiseSettings() if ego_noise else None) if isinstance(ego_noise, bool) else ego_noise,
     )
 
 
-def _site_settings(forgetting_s: float | None) -> SiteEstimateSettings:
-    return SiteEstimateSettings() if forgetting_s is None else SiteEstimateSettings(forgetting_s=forgetting_s)
+def _detections(
+    given: Path | str | DetectionLog | None,
+    detector: Detector | None,
+    recording: Recording | None,
+    camera: PinholeCamera,
+) -> DetectionLog | None:
+    """Return what the camera reported: as given, by a detector of the user's, or beside the recording."""
+    if detector is not None:
+        if given is not None or recording is None:
+            raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
+        video = open_video(recording.path / VIDEO_NAME)
+        found = [detector.detect(image) for image in video.frames()]
+        return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
+    if isinstance(given, DetectionLog):
+        return given
+    path = given if given is not None else recording and recording.detections_path
+    return None if path is None else read_any_detections(path, size_px=(camera.width_px, camera.height_px))
 
 
 def _degradation(recording: Recording | None, rates: MissRates | None) -> float | Callable[[int], float]:
@@ -196,23 +293,56 @@ def _degradation(recording: Recording | None, rates: MissRates | None) -> float 
     return video_degradation(open_video(path), rates) if path.is_file() else 0.0
 
 
-def _array(array: Path | str | MicrophoneArray | None) -> MicrophoneArray | None:
-    if array is None or isinstance(array, MicrophoneArray):
-        return array
-    return read_array_xml(array)
-
-
-def listen(path: Path | str, **options: object) -> Iterator[WorldState]:
+def listen(
+    path: Path | str,
+    *,
+    array: Path | str | MicrophoneArray | None = None,
+    detections: Path | str | DetectionLog | None = None,
+    detector: Detector | None = None,
+    camera: Path | str | PinholeCamera | None = None,
+    miss_rates: Path | str | MissRates | None = None,
+    model: Path | str | Model | None = None,
+    context: Context | None = None,
+    settings: ListenSettings | None = None,
+) -> Iterator[WorldState]:
     """Yield one world-state a hop (0.1 s) from a sound file or recording folder.
 
-    Takes the options of `open_source`.
+    Parameters
+    ----------
+    path : path
+        Multichannel sound file, or a recording folder in the OVAD layout.
+    array, detections, detector, camera, miss_rates, model, context, settings
+        As `open_source` takes them: files, or the objects that they hold.
+
+    Yields
+    ------
+    WorldState
+        The first after the first second of sound.
+
+    Raises
+    ------
+    InputFileError
+        If a file is missing or damaged; the message names it.
+    InvalidArgumentError
+        As `open_source`.
 
     Examples
     --------
     >>> for state in listen("some.wav", array="mics.xml", detections="d.json"):  # doctest: +SKIP
     ...     print(state.stamp_ns, state.risk)
     """
-    for step in listen_steps(open_source(path, **options)):  # type: ignore[arg-type]
+    source = open_source(
+        path,
+        array=array,
+        detections=detections,
+        detector=detector,
+        camera=camera,
+        miss_rates=miss_rates,
+        model=model,
+        context=context,
+        settings=settings,
+    )
+    for step in listen_steps(source):
         yield step.state
 
 
@@ -249,25 +379,15 @@ def measure_steps(
     InputFileError
         If the sound file is damaged or does not fit the array.
     """
-    strict, n_microphones = not source.mask_dead, source.array.n_microphones
+    strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
     with open_audio(source.audio_path, expect_channels=n_microphones, strict=strict) as audio:
-        sight = unoccluded_sector(source.context)
-        rates = source.miss_rates
-        vision = VisionQuery(
-            PinholeCamera(),
-            source.detections,
-            rates.table if rates is not None else None,
-            source.degradation,
-            line_of_sight=sight,
-            clutter=rates.clutter_rate if rates is not None else None,
-        )
         adapter = AcousticAdapter(
             source.array,
             audio.sample_rate_hz,
             source.signature(),
-            vision=vision,
-            grounding=source.grounding,
-            front_end_settings=FrontEndSettings(ego_noise=source.ego_noise),
+            vision=source.camera_channel(),
+            grounding=source.settings.grounding,
+            front_end_settings=source.settings.front_end(source.array, audio.sample_rate_hz),
         )
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):

@@ -2,12 +2,15 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.adapters.files.json_file import read_json, refused_as_file
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
@@ -19,12 +22,13 @@ class PinholeCamera:
 
     For something on the horizon in column u of a W pixels wide image, seen by a camera pitched by p,
 
-    .. math:: \tan a = \cos p \tan h \,(1 - 2u / W)
+    .. math:: \tan a = \cos p \tan h \,(2 u_0 - 2u) / W
 
-    is the azimuth a off the optical axis, left positive, with half angle of view h. The camera is not at the
-    origin of `base_link`, where the array is: the azimuth there depends on the range. It is computed at
-    `nominal_range_m` from the camera, and what it would be wrong by at another range is part of the standard
-    deviation of a sighting. For OVAD's offset the shift is 1.5 to 1.8 deg at 30 deg and 10 m.
+    is the azimuth a off the optical axis, left positive, with half angle of view h and the axis in column
+    u_0. The camera is not at the origin of `base_link`, where the array is: the azimuth there depends on the
+    range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at another range
+    is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to 1.8 deg at 30 deg
+    and 10 m.
 
     The defaults are the published facts of OVAD: half angle of view 0.6 rad, aspect 0.628, the camera 0.567 m
     behind, 0.485 m below and 0.0316 m right of the array, pitched up by 0.11979 rad. The height only matters
@@ -36,6 +40,8 @@ class PinholeCamera:
         Size of the image.
     half_angle_rad : float
         Half the horizontal angle of view, in (0, pi/2).
+    principal_px : float, optional
+        Column of the optical axis; the middle of the image where not given.
     position_m : tuple of float
         Of the camera in `base_link`, (x, y, z).
     yaw_rad, pitch_rad : float
@@ -68,6 +74,7 @@ class PinholeCamera:
     pitch_rad: float = 0.11979
     nominal_range_m: float = 10.0
     range_spread: float = 0.5
+    principal_px: float | None = None
 
     def __post_init__(self) -> None:
         in_range("width_px", self.width_px, 1, 1 << 16)
@@ -76,6 +83,8 @@ class PinholeCamera:
         in_range("yaw_rad", self.yaw_rad, -math.pi, math.pi)
         in_range("pitch_rad", self.pitch_rad, -math.pi / 2, math.pi / 2, open_low=True, open_high=True)
         in_range("range_spread", self.range_spread, 0.0, math.inf)
+        if self.principal_px is not None:
+            in_range("principal_px", self.principal_px, 0.0, self.width_px)
         x, y, _ = finite_array("position_m", self.position_m, (3,))
         in_range("nominal_range_m", self.nominal_range_m, float(np.hypot(x, y)), math.inf, open_low=True)
 
@@ -98,7 +107,7 @@ class PinholeCamera:
             Radians in (-pi, pi], left positive, same shape.
         """
         column = np.asarray(column_px, dtype=np.float64)
-        return self._to_base_link(np.arctan(self._slope * (1.0 - 2.0 * column / self.width_px)))
+        return self._to_base_link(np.arctan(self._slope * (self._middle - 2.0 * column / self.width_px)))
 
     def column(self, azimuth_rad: ArrayLike) -> FloatArray:
         """Return the image column of an azimuth in `base_link`: the inverse of `azimuth`.
@@ -115,7 +124,7 @@ class PinholeCamera:
         """
         off_axis = self.off_axis(azimuth_rad)
         ahead = np.where(np.abs(off_axis) < math.pi / 2, off_axis, np.nan)
-        return np.asarray(0.5 * self.width_px * (1.0 - np.tan(ahead) / self._slope))
+        return np.asarray(0.5 * self.width_px * (self._middle - np.tan(ahead) / self._slope))
 
     def off_axis(self, azimuth_rad: ArrayLike) -> FloatArray:
         """Return the azimuth off the optical axis, at the camera, of an azimuth in `base_link`, (-pi, pi]."""
@@ -129,7 +138,9 @@ class PinholeCamera:
 
     def sees(self, azimuth_rad: ArrayLike) -> BoolArray:
         """Tell whether an azimuth in `base_link` lies between the edges of the image."""
-        return np.asarray(np.abs(self.off_axis(azimuth_rad)) <= math.atan(self._slope))
+        left, right = (math.atan(self._slope * (self._middle - edge)) for edge in (0.0, 2.0))
+        off_axis = self.off_axis(azimuth_rad)
+        return np.asarray((right <= off_axis) & (off_axis <= left))
 
     def sighting(self, box_px: ArrayLike, label: str, score: float, *, moving: bool = True) -> Sighting:
         r"""Turn a box into a sighting.
@@ -179,6 +190,11 @@ class PinholeCamera:
         return Sighting(centre, std, label, score, width, moving)
 
     @property
+    def _middle(self) -> float:
+        """Column of the optical axis in half widths of the image; 1 in its middle."""
+        return 1.0 if self.principal_px is None else 2.0 * self.principal_px / self.width_px
+
+    @property
     def _slope(self) -> float:
         return math.cos(self.pitch_rad) * math.tan(self.half_angle_rad)
 
@@ -187,3 +203,70 @@ class PinholeCamera:
         x = self.position_m[0] + self.nominal_range_m * np.cos(seen)
         y = self.position_m[1] + self.nominal_range_m * np.sin(seen)
         return np.asarray(wrap_angle(np.arctan2(y, x)))
+
+
+def read_camera(path: str | Path) -> PinholeCamera:
+    """Read a camera from JSON.
+
+    ``{"width_px", "height_px", "horizontal_fov_deg"}`` or, in place of the field of view, ``{"fx", "cx"}`` of
+    a calibration without distortion, pixels; optional are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up
+    positive) and ``"position_m": [x, y, z]`` in `base_link`, all 0 where not given.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    PinholeCamera
+        As the file says.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing, too large, no JSON, or a number is missing or out of range.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "camera.json"
+    ...     _ = name.write_text('{"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}')
+    ...     camera = read_camera(name)
+    >>> [round(math.degrees(edge), 1) for edge in camera.view_rad]
+    [-45.0, 45.0]
+    """
+    with refused_as_file(path):
+        return decode(_CameraFile, read_json(path, "a camera file"), "camera").camera()
+
+
+@dataclass(frozen=True, slots=True)
+class _CameraFile:
+    """What a camera file holds."""
+
+    width_px: int
+    height_px: int
+    horizontal_fov_deg: float | None = None
+    fx: float | None = None
+    cx: float | None = None
+    yaw_deg: float | None = None
+    pitch_deg: float | None = None
+    position_m: tuple[float, float, float] | None = None
+
+    def camera(self) -> PinholeCamera:
+        if (self.horizontal_fov_deg is None) == (self.fx is None):
+            raise InvalidArgumentError("camera: expected either horizontal_fov_deg or fx")
+        half_angle = 0.5 * math.radians(self.horizontal_fov_deg or 0.0)
+        if self.fx is not None:
+            fx = in_range("camera.fx", self.fx, 0.0, math.inf, open_low=True)
+            half_angle = math.atan2(0.5 * self.width_px, fx)
+        return PinholeCamera(
+            width_px=self.width_px,
+            height_px=self.height_px,
+            half_angle_rad=half_angle,
+            position_m=self.position_m or (0.0, 0.0, 0.0),
+            yaw_rad=math.radians(self.yaw_deg or 0.0),
+            pitch_rad=math.radians(self.pitch_deg or 0.0),
+            principal_px=self.cx,
+        )

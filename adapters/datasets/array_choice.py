@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.files.array_file import read_array_xml
+from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.array_match import array_difference, microphone_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
@@ -55,7 +55,7 @@ def choose_array(
         return given
     if named is None:
         return ovad_array() if path.is_dir() or assumed is None else assumed
-    own = read_array_xml(named)
+    own = read_array(named)
     if given is not None:
         order = microphone_order(own.positions_m, given)
         if order is None:

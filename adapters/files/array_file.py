@@ -1,37 +1,54 @@
-"""Microphone arrays in the XML that Acoular reads: ``<MicArray><pos Name= x= y= z= /></MicArray>``."""
+"""Microphone positions in files: Acoular XML, CSV and JSON."""
 
+import csv
+import json
 import math
+import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 from xml.sax.saxutils import quoteattr
 
 import defusedxml.ElementTree as SafeElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
 
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.geometry import nearest_spacings_m
+from worldstate.frontend.array.microphone_array import MAX_MICROPHONES, MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 from .atomic import write_text
 
+Axes = Literal["acoular", "base_link"]
+
 MAX_BYTES = 1 << 20
-MAX_MICROPHONES = 1024
-# Wider than this and the file was written in millimetres.
-MAX_APERTURE_M = 100.0
+# No vehicle carries a wider array, or one with its microphones farther apart or closer together: such a file
+# was written in millimetres, centimetres or kilometres.
+MAX_APERTURE_M = 20.0
+MAX_SPACING_M = 3.0
+MIN_SPACING_M = 1e-3
+_HEADER = re.compile(r"(?:pos(?:ition)?[ _]?)?([xyz])(?:[ _]*[\[(]?m[\])]?)?", re.IGNORECASE)
 
 
-def read_array_xml(path: str | Path) -> MicrophoneArray:
-    r"""Read an array from Acoular XML, turned into `base_link` axes.
+def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
+    r"""Read microphone positions in metres, one microphone a channel, in the order of the channels.
 
-    In the file x grows to the right in the array plane, y up, and z along the look direction, metres, so that
+    Three forms are told apart by their first character:
 
-    .. math:: (x, y, z)_{base} = (z, -x, y)_{file}
+    - Acoular XML, ``<MicArray><pos Name="1" x="0.1" y="0" z="0" /> ...``, in the axes of the array plane: x
+      to the right, y up, z along the look direction, so that :math:`(x, y, z)_{base} = (z, -x, y)_{file}`.
+    - CSV, one microphone a line: x, y, z, with or without a header and a column of names; separated by comma,
+      semicolon, tab or blanks. In `base_link` axes: x forward, y left, z up.
+    - JSON, ``[[x, y, z], ...]`` or ``{"positions_m": [[x, y, z], ...], "axes": "base_link"}``, in `base_link`
+      axes unless ``"axes"`` is ``"acoular"``.
 
     Parameters
     ----------
     path : str or Path
-        The file; at most 1 MiB and 1024 microphones, in the order of the recording's channels.
+        The file; at most 1 MiB and 1024 microphones.
+    axes : {"acoular", "base_link"}, optional
+        The axes that the numbers are in, where they are not those of the form.
 
     Returns
     -------
@@ -41,33 +58,32 @@ def read_array_xml(path: str | Path) -> MicrophoneArray:
     Raises
     ------
     InputFileError
-        If the file is missing, too large, no XML, has a document type or entities, holds fewer than two
-        microphones, or a coordinate is missing, no number, not finite, or in another unit than the metre.
+        If the file is missing, too large or none of the three, has a document type or entities, holds fewer
+        than two microphones or two in one place, a coordinate is missing or not finite, the array cannot be
+        one in metres, or has no horizontal extent: a vertical line hears every azimuth alike.
 
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
-    ...     name = Path(folder) / "pair.xml"
-    ...     write_array_xml(name, MicrophoneArray(np.array([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])))
-    ...     read_array_xml(name).positions_m[:, 1]
-    array([ 0.2, -0.2])
+    ...     name = Path(folder) / "mics.csv"
+    ...     _ = name.write_text("name,x,y,z\nleft,0,0.2,1.4\nright,0,-0.2,1.4\n")
+    ...     read_array(name).positions_m.tolist()
+    [[0.0, 0.2, 1.4], [0.0, -0.2, 1.4]]
     """
     name = Path(path)
-    elements = _parse(name).findall("pos")
-    if not 2 <= len(elements) <= MAX_MICROPHONES:
-        problem = f"expected 2 to {MAX_MICROPHONES} <pos x= y= z= /> below the root, got {len(elements)}"
-        raise InputFileError(name, problem)
-    in_file = np.array([_coordinates(name, number, e) for number, e in enumerate(elements, start=1)])
-    _check_aperture(name, in_file)
-    try:
-        return MicrophoneArray(_to_base_link(in_file))
-    except InvalidArgumentError as error:
-        raise InputFileError(name, str(error)) from error
+    data = _bytes(name)
+    start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+    if start == b"<":
+        return _array(name, _xml_positions(name, data), axes or "acoular")
+    if start in (b"[", b"{"):
+        positions, said = _json_positions(name, data)
+        return _array(name, positions, axes or said)
+    return _array(name, _csv_positions(name, data), axes or "base_link")
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:
-    """Write an array as Acoular XML, whole or not at all; `read_array_xml` gives the same numbers back.
+    """Write an array as Acoular XML, whole or not at all; `read_array` gives the same numbers back.
 
     Parameters
     ----------
@@ -100,46 +116,133 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
     write_text(path, "\n".join([head, *rows, "</MicArray>", ""]))
 
 
-def _parse(path: Path) -> Any:
+def _bytes(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise InputFileError(path, f"expected an array XML file ({error.strerror})") from error
-    if len(text) > MAX_BYTES:
-        raise InputFileError(path, f"expected an array XML file of at most {MAX_BYTES} bytes")
+        raise InputFileError(path, f"expected an array file ({error.strerror})") from error
+    if len(data) > MAX_BYTES:
+        raise InputFileError(path, f"expected an array file of at most {MAX_BYTES} bytes")
+    return data
+
+
+def _array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> MicrophoneArray:
+    """Check what a file held, and turn it into `base_link` axes."""
+    if axes not in get_args(Axes):
+        raise InputFileError(path, f"axes: expected {' or '.join(get_args(Axes))}, got {axes!r:.40}")
+    if not 2 <= len(in_file) <= MAX_MICROPHONES:
+        raise InputFileError(path, f"expected 2 to {MAX_MICROPHONES} microphones, got {len(in_file)}")
+    positions = np.array(in_file, dtype=np.float64)
+    if axes == "acoular":
+        positions = positions[:, [2, 0, 1]] * [1.0, -1.0, 1.0] + 0.0
+    _check_size(path, positions)
     try:
-        return SafeElementTree.fromstring(text, forbid_dtd=True)
+        return MicrophoneArray(positions)
+    except InvalidArgumentError as error:
+        raise InputFileError(path, str(error)) from error
+
+
+def _check_size(path: Path, positions_m: FloatArray) -> None:
+    aperture_m = float(np.ptp(positions_m, axis=0).max())
+    if aperture_m > MAX_APERTURE_M:
+        problem = f"expected positions in metres, got an array {aperture_m:g} wide: millimetres?"
+        raise InputFileError(path, problem)
+    spacings_m = nearest_spacings_m(positions_m)
+    if spacings_m.mean() > MAX_SPACING_M:
+        got = f"microphones {spacings_m.mean():g} apart"
+        raise InputFileError(path, f"expected positions in metres, got {got}: centimetres?")
+    if 0.0 < spacings_m.min() < MIN_SPACING_M:
+        problem = f"expected positions in metres, got microphones {spacings_m.min():g} apart"
+        raise InputFileError(path, problem)
+    if np.ptp(positions_m[:, :2], axis=0).max() < MIN_SPACING_M and spacings_m.min() > 0.0:
+        problem = "expected a horizontal extent, got a vertical line, which hears every azimuth alike"
+        raise InputFileError(path, problem)
+
+
+def _xml_positions(path: Path, data: bytes) -> list[list[float]]:
+    try:
+        root: Any = SafeElementTree.fromstring(data, forbid_dtd=True)
     except DefusedXmlException as error:
         problem = "expected plain XML, got a document type or entities, which are refused"
         raise InputFileError(path, problem) from error
     except (SafeElementTree.ParseError, ValueError, LookupError) as error:
         raise InputFileError(path, f"expected array XML, it does not parse: {error}") from error
+    found = [[(axis, element.get(axis)) for axis in "xyz"] for element in root.findall("pos")]
+    return [_numbers(path, number, row) for number, row in enumerate(found, start=1)]
 
 
-def _coordinates(path: Path, number: int, element: Any) -> list[float]:
-    return [_coordinate(path, number, axis, element.get(axis)) for axis in ("x", "y", "z")]
-
-
-def _coordinate(path: Path, number: int, axis: str, text: str | None) -> float:
+def _csv_positions(path: Path, data: bytes) -> list[list[float]]:
     try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputFileError(path, f"microphone {number}: expected a finite number as {axis}, got {text!r}")
-    return value
+        lines = data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, "expected microphones as XML, CSV or JSON in UTF-8") from error
+    kept = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    separator = next((mark for mark in ";,\t" if kept and mark in kept[0]), None)
+    try:
+        rows = (
+            [line.split() for line in kept] if separator is None else [*csv.reader(kept, delimiter=separator)]
+        )
+    except csv.Error as error:
+        raise InputFileError(path, f"expected microphones as XML, CSV or JSON: {error}") from error
+    cells = [[cell.strip() for cell in row] for row in rows]
+    columns, has_header = _csv_columns(path, cells[0] if cells else [])
+    return [
+        _numbers(
+            path, number, [(a, row[c] if c < len(row) else None) for a, c in zip("xyz", columns, strict=True)]
+        )
+        for number, row in enumerate(cells[has_header:], start=1)
+    ]
 
 
-def _check_aperture(path: Path, positions_m: FloatArray) -> None:
-    aperture_m = float(np.ptp(positions_m, axis=0).max())
-    if aperture_m > MAX_APERTURE_M:
-        problem = f"expected positions in metres, got an array {aperture_m:g} wide: millimetres?"
+def _csv_columns(path: Path, first: list[str]) -> tuple[list[int], bool]:
+    """Return the columns of x, y and z, and whether the first line is a header."""
+    named = {m[1].lower(): i for i, cell in enumerate(first) if (m := _HEADER.fullmatch(cell))}
+    if len(named) == 3:
+        return [named[axis] for axis in "xyz"], True
+    # Without a header a fourth column, in front or behind, holds names.
+    behind = len(first) == 4 and _number(first[3]) is None
+    columns = [0, 1, 2] if len(first) == 3 or behind else [1, 2, 3]
+    if len(first) not in (3, 4) or any(_number(first[column]) is None for column in columns):
+        problem = (
+            f"expected microphones as XML, JSON or CSV with the columns x, y, z, got {','.join(first)!r:.60}"
+        )
         raise InputFileError(path, problem)
+    return columns, False
 
 
-def _to_base_link(in_file: FloatArray) -> FloatArray:
-    return in_file[:, [2, 0, 1]] * [1.0, -1.0, 1.0] + 0.0
+def _json_positions(path: Path, data: bytes) -> tuple[list[list[float]], str]:
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputFileError(path, f"expected array JSON, it does not parse: {error}") from error
+    held = document if isinstance(document, dict) else {"positions_m": document}
+    rows = held.get("positions_m")
+    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
+        raise InputFileError(path, "expected a list of positions [x, y, z], or one as positions_m")
+    found = [[*zip("xyz", row, strict=True)] for row in rows]
+    positions = [_numbers(path, number, row) for number, row in enumerate(found, start=1)]
+    return positions, held.get("axes", "base_link")
+
+
+def _numbers(path: Path, number: int, row: Sequence[tuple[str, object]]) -> list[float]:
+    values = [_number(value) for _, value in row]
+    for (axis, value), read in zip(row, values, strict=True):
+        if read is None:
+            problem = f"microphone {number}: expected a finite number as {axis}, got {value!r:.40}"
+            raise InputFileError(path, problem)
+    return [value for value in values if value is not None]
+
+
+def _number(value: object) -> float | None:
+    """Return a finite number from text or JSON, None where it is none."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        return None
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _to_file(in_base_link: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
 from worldstate.abduction.grounding.observation import GroundedObservation, Observable
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.acoustic_grounding import LINE_SPACING, Grounding, observe
-from worldstate.adapters.listen import measure_steps, open_source
+from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone_stage import ToneReading
@@ -44,7 +44,7 @@ def interpreted(frame, grounding=None):
 
 def test_off_by_default(frame, approach):
     assert interpreted(frame).signature is SCORES
-    assert open_source(approach.folder).grounding is None
+    assert open_source(approach.folder).settings.grounding is None
 
 
 def test_nothing_measured_leaves_the_scores(frame):
@@ -101,9 +101,9 @@ def test_the_engine_line_tells_the_speed():
 
 
 def test_the_whole_chain_runs_grounded(approach):
-    source = open_source(approach.folder, grounding=Grounding())
+    source = open_source(approach.folder, settings=ListenSettings(grounding=Grounding()))
     grounded = [m.signature for _, m in measure_steps(source)]
-    plain = [m.signature for _, m in measure_steps(replace(source, grounding=None))]
+    plain = [m.signature for _, m in measure_steps(replace(source, settings=ListenSettings()))]
     assert grounded != plain
     assert np.isfinite([s.log_likelihoods for s in grounded]).all()
     assert [s.none for s in grounded] == [s.none for s in plain]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import read_detections
-from worldstate.adapters.files.array_file import read_array_xml, write_array_xml
+from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import atomic_path, write_text
 from worldstate.adapters.files.model_file import load_model, read_model, save_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -174,7 +174,23 @@ EXTERNAL = '<!DOCTYPE m [<!ENTITY a SYSTEM "file:///etc/hostname">]><MicArray>&a
         (BOMB.format(TWO), "entities, which are refused"),
         (EXTERNAL.format(TWO), "entities, which are refused"),
         ('<!DOCTYPE MicArray SYSTEM "a.dtd"><MicArray/>', "refused"),
-        ("", "does not parse"),
+        ("", "as XML, JSON or CSV"),
+        ("x;y;z\n0,1;0;0\n0,2;0;0", "microphone 1: .* finite number as x, got '0,1'"),
+        ("name,left,right\na,0,0", "columns x, y, z"),
+        ("0,0.1,0\n0,0.2\n", "microphone 2: .* finite number as z, got None"),
+        ("0,0,0\n0,0,0.5\n", "vertical line"),
+        ("0,-10,0\n0,0,0\n0,10,0\n", "centimetres"),
+        ("0,1e-5,0\n0,0,0\n", "expected positions in metres"),
+        ("0,0.1,0\n0,0.1,0\n", "different places"),
+        ("[[0, 0.1, 0], [0, -0.1]]", "positions"),
+        ("[[0, 0.1, 0], [0, -0.1, true]]", "microphone 2: .* finite number as z, got True"),
+        ("[[0, 0.1, 0], [0, -0.1, NaN]]", "microphone 2"),
+        (
+            '{"positions_m": [[0, 0.1, 0], [0, -0.1, 0]], "axes": "ned"}',
+            "axes: expected acoular or base_link",
+        ),
+        ('{"positions": []}', "positions_m"),
+        ("[" * 100_000, "does not parse"),
         ("<MicArray>" + TWO, "does not parse"),
         ("<MicArray/>", "expected 2 to 1024"),
         (f"<MicArray>{POS.format(1)}</MicArray>", "got 1"),
@@ -191,14 +207,14 @@ EXTERNAL = '<!DOCTYPE m [<!ENTITY a SYSTEM "file:///etc/hostname">]><MicArray>&a
 def test_bad_arrays(tmp_path: Path, text: str, problem: str) -> None:
     name = tmp_path / "mics.xml"
     name.write_text(text)
-    expect(problem, name, lambda: read_array_xml(name))
+    expect(problem, name, lambda: read_array(name))
 
 
 def test_missing_and_huge_arrays(tmp_path: Path) -> None:
-    expect("No such file", tmp_path / "no.xml", lambda: read_array_xml(tmp_path / "no.xml"))
-    expect("array XML", tmp_path, lambda: read_array_xml(tmp_path))
+    expect("No such file", tmp_path / "no.xml", lambda: read_array(tmp_path / "no.xml"))
+    expect("array file", tmp_path, lambda: read_array(tmp_path))
     (tmp_path / "big.xml").write_bytes(b"<MicArray>" + b" " * (1 << 20) + b"</MicArray>")
-    expect("at most", tmp_path / "big.xml", lambda: read_array_xml(tmp_path / "big.xml"))
+    expect("at most", tmp_path / "big.xml", lambda: read_array(tmp_path / "big.xml"))
 
 
 @given(data=st.binary(max_size=300))
@@ -207,7 +223,7 @@ def test_any_bytes_as_an_array(tmp_path_factory: pytest.TempPathFactory, data: b
     name = tmp_path_factory.mktemp("xml") / "mics.xml"
     name.write_bytes(data)
     with pytest.raises(InputFileError):
-        read_array_xml(name)
+        read_array(name)
 
 
 # --- detections ------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
-from worldstate.adapters.listen import listen_steps, measure_steps, open_source
+from worldstate.adapters.listen import ListenSettings, listen_steps, measure_steps, open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
@@ -62,7 +62,9 @@ def heard(approach, model):
 
 
 def test_the_switch(approach, model):
-    on, off = (open_source(approach.folder, site_adaptation=flag) for flag in (True, False))
+    on, off = (
+        open_source(approach.folder, settings=ListenSettings(site_adaptation=flag)) for flag in (True, False)
+    )
     assert isinstance(replace(on, model=model).signature(), SiteSignature)
     assert replace(off, model=model).signature() is model
     published = object()
@@ -77,9 +79,9 @@ def test_every_pass_over_a_source_learns_anew(heard):
 
 
 def test_the_forgetting_time_is_handed_on(approach):
-    assert open_source(approach.folder, forgetting_s=7.0).site_settings == SiteEstimateSettings(7.0)
+    assert ListenSettings(forgetting_s=7.0).site() == SiteEstimateSettings(7.0)
     with pytest.raises(InvalidArgumentError, match="forgetting_s"):
-        open_source(approach.folder, forgetting_s=0.0)
+        ListenSettings(forgetting_s=0.0)
 
 
 @pytest.mark.parametrize("cut", [0, 1, 45])
@@ -88,7 +90,7 @@ def test_a_checkpoint_of_the_chain_continues_bit_for_bit(heard, cut, tmp_path):
     whole = [step.state for step in listen_steps(source)]
 
     def chain(world, site, part):
-        signature = SiteSignature(source.model, source.site_settings, estimate=site)
+        signature = SiteSignature(source.model, source.settings.site(), estimate=site)
         adapter = AcousticAdapter(source.array, 48_000.0, signature)
         states = []
         for frame in part:

@@ -24,7 +24,7 @@ from worldstate.adapters.datasets.ovad_layout import (
     LOG_NAME,
     TRUTH_NAME,
 )
-from worldstate.adapters.files.array_file import read_array_xml, write_array_xml
+from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
@@ -245,7 +245,7 @@ def _log_row(environment: str, approach: str, number: int, t0_frame: int) -> Log
 def _name_array(path: Path, array: MicrophoneArray) -> None:
     if not path.exists():
         write_array_xml(path, array)
-    elif not np.array_equal(read_array_xml(path).positions_m, array.positions_m):
+    elif not np.array_equal(read_array(path).positions_m, array.positions_m):
         raise InputFileError(
             path, "expected the array of these recordings; another one needs a folder of its own"
         )

@@ -8,7 +8,7 @@ import scipy.signal
 import soundfile
 
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.listen import Source, listen_steps, measure_steps, open_source
+from worldstate.adapters.listen import ListenSettings, Source, listen_steps, measure_steps, open_source
 from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.cli.main import main
@@ -48,7 +48,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recording: Path) -> None:
     bearings = {}
     for ego in (False, True):
-        steps = list(listen_steps(open_source(recording, ego_noise=ego)))
+        steps = list(listen_steps(open_source(recording, settings=ListenSettings(ego_noise=ego))))
         late = [step.frame for step in steps if step.frame.stamp_ns > (APPEARS_S + 0.4) * 1e9]
         bearings[ego] = np.degrees([frame.bearing_rad for frame in late])
     assert len(bearings[True]) > 8
@@ -60,27 +60,34 @@ def test_it_is_off_unless_asked_and_where_nobody_believes(recording: Path) -> No
     plain = [frame.srp for frame, _ in measure_steps(open_source(recording))]
     doubted: list[list[np.ndarray]] = []
     for belief in (None, lambda: 0.3):
-        source = open_source(recording, ego_noise=True)
+        source = open_source(recording, settings=ListenSettings(ego_noise=True))
         doubted.append([frame.srp for frame, _ in measure_steps(source, belief)])
     for srp, unasked, unlearned in zip(plain, *doubted, strict=True):
         np.testing.assert_array_equal(srp, unasked)
         np.testing.assert_array_equal(srp, unlearned)
-    believed = [frame.srp for frame, _ in measure_steps(open_source(recording, ego_noise=True), lambda: 1.0)]
+    believed = [
+        frame.srp
+        for frame, _ in measure_steps(
+            open_source(recording, settings=ListenSettings(ego_noise=True)), lambda: 1.0
+        )
+    ]
     assert np.abs(believed[-1] - plain[-1]).max() > 0.02
 
 
 def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
     """The posterior is the same, hop by hop: only spatial spectrum, bearing and prominence change."""
-    plain, learned = (list(listen_steps(open_source(recording, ego_noise=ego))) for ego in (False, True))
+    plain, learned = (
+        list(listen_steps(open_source(recording, settings=ListenSettings(ego_noise=ego))))
+        for ego in (False, True)
+    )
     for a, b in zip(plain, learned, strict=True):
         assert a.measurement.signature == b.measurement.signature
 
 
 def test_settings_of_one_s_own(recording: Path) -> None:
-    assert open_source(recording).ego_noise is None
-    assert open_source(recording, ego_noise=True).ego_noise == EgoNoiseSettings()
     chosen = EgoNoiseSettings(forgetting_s=3.0)
-    assert open_source(recording, ego_noise=chosen).ego_noise is chosen
+    for given, expected in ((False, None), (True, EgoNoiseSettings()), (chosen, chosen)):
+        assert ListenSettings(ego_noise=given).front_end(ARRAY, 48_000.0).ego_noise == expected
 
 
 def test_the_command_line_passes_it_on(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +100,7 @@ def test_the_command_line_passes_it_on(recording: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("worldstate.cli.common.listening.listen_with_progress", listened)
     for options in ([], ["--ego-noise"]):
         main(["run", str(recording), *options])
-    assert [source.ego_noise for source in heard] == [None, EgoNoiseSettings()]
+    assert [source.settings.ego_noise for source in heard] == [False, True]
 
 
 def test_a_belief_out_of_range_is_refused_and_without_ego_noise_ignored() -> None:

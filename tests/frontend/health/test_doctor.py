@@ -44,7 +44,7 @@ def test_a_healthy_recording(street: np.ndarray, write: Callable, capsys: pytest
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "healthy"
     assert not any(line.startswith("channel") for line in lines)
-    assert "front-back" in lines[1]
+    assert "hears front as back" in lines[1]
 
 
 def test_it_names_exactly_the_dead(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.listen import Source
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.calibration.calibration_input import find_inputs, read_input
 from worldstate.operations.recordings.hop_stream import HopStream
 from worldstate.operations.recordings.recording_report import RecordingReport, run_recording
@@ -14,13 +15,15 @@ from .progress import progress_bar, track
 
 def listen_with_progress(source: Source, *, title: str, states_path: Path | None) -> RecordingReport:
     """Listen to `source` to its end while a bar on standard error counts seconds of audio."""
-    with open_audio(source.audio_path, strict=not source.mask_dead) as audio:
+    with open_audio(source.audio_path, strict=not source.settings.mask_dead) as audio:
         hops = 10.0 * audio.frames / audio.sample_rate_hz
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
         return run_recording(source, title=title, states_path=states_path, on_hop=lambda step: bar.advance())
 
 
-def read_streams(inputs: Iterable[Path], array: Path | None, model: Path | None) -> list[HopStream]:
+def read_streams(
+    inputs: Iterable[Path], array: MicrophoneArray | None, model: Path | None
+) -> list[HopStream]:
     """Return the hop streams of data sets, recordings, sound files and what --save-streams wrote."""
     found = [item for path in inputs for item in find_inputs(path)]
     read = track(found, "listening", len(found))

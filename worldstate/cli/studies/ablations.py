@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 
@@ -31,7 +32,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         EXAMPLE,
     )
     parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set or hop streams")
-    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
+    add_array_options(parser)
     parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
     parser.add_argument("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
     parser.add_argument("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
@@ -47,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     policy = load_model(arguments.model)[1].policies[0]
     switches = AblationSwitches(alpha=arguments.alpha, sustain_hops=policy.sustain_hops)
-    streams = read_streams(arguments.inputs, arguments.array, arguments.model)
+    streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     table = ablation_table(streams, policy.reference_prior, arguments.seed, switches)
     rows = {name: asdict(row) for name, row in table.items()}
     if arguments.json:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.progress import track
@@ -42,7 +43,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         subparsers, run, "identifiability", "bounds on what any detector could reach", DESCRIPTION, EXAMPLE
     )
     add = parser.add_argument
-    add("--array", type=Path, metavar="XML", help="microphones (default: the 56-microphone roof array)")
+    add_array_options(parser, "the 56-microphone roof array")
     add("--features", type=Path, metavar="CSV", help="labelled feature windows")
     add("--group", choices=("static", "dynamic", "all"), default="static", help="of them (default: static)")
     add("--method", choices=("baseline", "worldstate"), default="worldstate", help="(default: %(default)s)")
@@ -79,12 +80,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _array(arguments: argparse.Namespace) -> "ReachOfArray":
     import numpy as np
 
-    from worldstate.adapters.files.array_file import read_array_xml
     from worldstate.frontend.array.microphone_array import roof_array_56
     from worldstate.ground.checks import in_range
     from worldstate.studies.paper.identifiability import reach_of_array
 
-    array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
+    array = given_array(arguments) or roof_array_56()
     low, high = arguments.band
     in_range("--band", low, 1.0, high)
     in_range("--snr-db", arguments.snr_db, -100.0, 100.0)

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.array_options import add_array_options, given_array, stance
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
@@ -44,9 +45,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "--array", type=Path, metavar="XML", help="microphones (default: the 56-microphone roof array)"
-    )
+    add_array_options(parser, "the 56-microphone roof array")
     parser.add_argument(
         "--frequency", type=float, default=1000.0, metavar="HZ", help="of the source (default: %(default)g)"
     )
@@ -63,7 +62,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.files.array_file import read_array_xml
     from worldstate.frontend.array.microphone_array import roof_array_56
     from worldstate.ground.checks import in_range
     from worldstate.operations.arrays.array_bounds import array_bounds
@@ -74,13 +72,13 @@ def run(arguments: argparse.Namespace) -> int:
     in_range("--seed", arguments.seed, 0, 2**63)
     for level in arguments.snr_db:
         in_range("--snr-db", level, -100.0, 100.0)
-    array = roof_array_56() if arguments.array is None else read_array_xml(arguments.array)
+    array = given_array(arguments) or roof_array_56()
     bounds = array_bounds(array, arguments.frequency, AZIMUTHS_DEG)
     found = {} if arguments.out is None else _try_estimators(array, arguments)
     if arguments.json:
         print_summary(_as_dict(bounds, arguments) | found, as_json=True)
     else:
-        print_summary(_as_table(bounds, arguments), as_json=False)
+        print_summary(_as_table(bounds, array, arguments), as_json=False)
     return 0
 
 
@@ -88,13 +86,14 @@ def _as_dict(bounds: "ArrayBounds", arguments: argparse.Namespace) -> dict[str, 
     return bounds.to_dict() | {"snapshots": arguments.snapshots, "snr_db": arguments.snr_db}
 
 
-def _as_table(bounds: "ArrayBounds", arguments: argparse.Namespace) -> dict[str, object]:
+def _as_table(
+    bounds: "ArrayBounds", array: "MicrophoneArray", arguments: argparse.Namespace
+) -> dict[str, object]:
     """One line a quantity, and one an azimuth, for people."""
     N, levels = arguments.snapshots, arguments.snr_db
     table: dict[str, object] = {
-        "microphones": bounds.microphones,
+        "array": stance(array),
         "S_xx": f"{bounds.horizontal_moment_m2:.4g} m^2",
-        "aperture": " x ".join(f"{extent:.3g}" for extent in bounds.aperture_m) + " m along x, y, z",
         "alias-free to": f"{bounds.alias_hz:.0f} Hz (mean spacing {100 * bounds.mean_spacing_m:.1f} cm)",
         "cannot tell apart": bounds.ambiguity,
         "broadside": f"azimuth {bounds.broadside_deg:.3g} deg",

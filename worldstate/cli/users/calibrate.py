@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import check_outputs
@@ -32,7 +33,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         subparsers, run, "calibrate", "set thresholds on your own hazard-free hours", DESCRIPTION, EXAMPLE
     )
     parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
-    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
+    add_array_options(parser)
     parser.add_argument("--model", type=Path, help="model file to start from (default: the one that ships)")
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
     parser.add_argument(
@@ -73,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         keep_per_hour=arguments.keep,
     )
     model = read_model(arguments.model)
-    streams = read_streams(arguments.inputs, arguments.array, arguments.model)
+    streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     if arguments.save_streams is not None:
         save_streams(arguments.save_streams, streams)
     done = calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.outputs import check_outputs
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="sound file or recording folder")
-    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
+    add_array_options(parser)
     parser.add_argument("--duration", type=float, metavar="S", help="its length by another clock, seconds")
     parser.add_argument(
         "--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)"
@@ -51,7 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.audio.sound_file import open_audio
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.ovad import Recording
-    from worldstate.adapters.files.array_file import read_array_xml
     from worldstate.operations.arrays.array_figure import write_array_figure
 
     from .doctor_report import as_json, as_text
@@ -59,8 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs(arguments, figures=("figure",))
     path: Path = arguments.input
     sound = Recording.open(path).audio_path if path.is_dir() else path
-    given = None if arguments.array is None else read_array_xml(arguments.array)
-    array = choose_array(path, given, name=arguments.array)
+    array = choose_array(path, given_array(arguments), name=arguments.array)
     with open_audio(sound, expect_channels=array.n_microphones, strict=False) as audio:
         health = examine(audio, array, arguments.duration, arguments.duration_error)
         if arguments.json:

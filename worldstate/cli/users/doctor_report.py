@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from worldstate.adapters.audio.sound_file import AudioSource
+from worldstate.cli.common.array_options import stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import Fault
 from worldstate.frontend.health.sample_clock import RateEstimate
@@ -19,6 +20,7 @@ def as_json(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray)
         "channels": audio.channels,
         "sample_rate_hz": audio.sample_rate_hz,
         "duration_s": audio.duration_s,
+        "array": stance(array),
         "ambiguity": array.ambiguity,
         "coherence": None if isinstance(health.coherence, NotUsable) else health.coherence,
         "masked_microphones": [channel + 1 for channel in health.masked_channels],
@@ -48,7 +50,7 @@ def as_text(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray)
     """Yield the lines of the report."""
     alias = array.alias_hz()
     yield f"{audio.path}: {audio.channels} channels, {audio.sample_rate_hz} Hz, {audio.duration_s:.1f} s"
-    yield f"array: ambiguity {array.ambiguity}, alias-free to {alias:.0f} Hz"
+    yield f"array: {stance(array)}, alias-free to {alias:.0f} Hz"
     if health.verdicts:
         yield ""
         yield from _table(health.verdicts)

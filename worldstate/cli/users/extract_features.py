@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from worldstate.cli.common.array_options import add_array_options, given_array, stance
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import check_outputs
@@ -43,9 +44,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
-    parser.add_argument(
-        "--array", type=Path, metavar="XML", help="microphones (default: array.xml of DATASET, else OVAD's)"
-    )
+    add_array_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -55,17 +54,16 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table
     from worldstate.adapters.datasets.feature_table import write_features
-    from worldstate.adapters.files.array_file import read_array_xml
 
     check_outputs(arguments, "out")
-    given = None if arguments.array is None else read_array_xml(arguments.array)
-    array = choose_array(arguments.dataset, given, name=arguments.array)
+    array = choose_array(arguments.dataset, given_array(arguments), name=arguments.array)
     windows, left_out = _windows(arguments)
     features = list(track(extract_features(windows, array), "extracting", len(windows)))
     table = feature_table(windows, features)
     write_features(arguments.out, table)
     summary = {
         "out": str(arguments.out),
+        "array": stance(array),
         "n_windows": len(table),
         "n_left_out": left_out,
         "n_recordings": len(np.unique(table.recording_keys)),

@@ -2,10 +2,16 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from worldstate.cli.common.array_options import add_array_options, add_search_options, given_array, stance
+from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.ground.errors import InputFileError
+
+if TYPE_CHECKING:
+    from worldstate.adapters.listen import Source
 
 DESCRIPTION = """\
 Listen to a recording and keep the world-state.
@@ -19,7 +25,7 @@ coverage, where only prominent peaks are kept."""
 
 EXAMPLE = """\
 examples:
-  worldstate run some.wav --array mics.xml --detections d.json --out states.jsonl
+  worldstate run some.wav --array mics.csv --detections d.json --camera camera.json --out states.jsonl
   worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png"""
 
 
@@ -33,8 +39,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="sound file or recording folder")
-    parser.add_argument("--array", type=Path, metavar="XML", help="microphone positions, Acoular XML")
-    parser.add_argument("--detections", type=Path, metavar="JSON", help="camera detections per frame")
+    add_array_options(parser)
+    add_search_options(parser)
+    _add_model_options(parser)
+    add_camera_options(parser)
+    _add_output_options(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_model_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
     parser.add_argument(
         "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
@@ -43,59 +56,41 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
     )
     parser.add_argument(
-        "--miss-rates", type=Path, metavar="JSON", help="of the camera, as measure-absence wrote them"
-    )
-    parser.add_argument(
-        "--site-adaptation",
-        action=argparse.BooleanOptionalAction,
-        default=True,
+        "--site-adaptation", action=argparse.BooleanOptionalAction, default=True,
         help="learn what the site is like while listening (default: on)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)"
     )
     parser.add_argument(
-        "--grounded",
-        action="store_true",
+        "--grounded", action="store_true",
         help="weigh the signature with bearing and approach, eq. (5) (default: off)",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--ego-noise",
-        action="store_true",
+        "--ego-noise", action="store_true",
         help="learn the own vehicle's noise while nothing is there and hear past it (default: off)",
-    )
-    parser.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
-    parser.add_argument(
+    )  # fmt: skip
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    group.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
+    group.add_argument(
         "--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence"
     )
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(run=run)
+    group.add_argument("--json", action="store_true", help="print the summary as one JSON object")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.acoustic_grounding import Grounding
     from worldstate.adapters.audio.sound_file import SilentChannelsError
-    from worldstate.adapters.listen import open_source
     from worldstate.cli.common.listening import listen_with_progress
     from worldstate.operations.recordings.bearing_gating import write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
     check_outputs(arguments, "out", figures=("figure", "gating"))
-    source = open_source(
-        arguments.input,
-        array=arguments.array,
-        detections=arguments.detections,
-        model=arguments.model,
-        alpha=arguments.alpha,
-        mask_dead=arguments.mask_dead,
-        miss_rates=arguments.miss_rates,
-        site_adaptation=arguments.site_adaptation,
-        forgetting_s=arguments.forgetting,
-        grounding=Grounding() if arguments.grounded else None,
-        ego_noise=arguments.ego_noise,
-    )
+    source = _source(arguments)
     try:
         report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
     except SilentChannelsError as error:
@@ -104,9 +99,38 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
     if arguments.figure is not None:
         write_timeline(report.timeline, arguments.figure)
-    summary = report.to_dict()
+    summary = report.to_dict() | {
+        "array": stance(source.array),
+        "detections": box_counts(source, as_json=arguments.json),
+    }
     if arguments.gating is not None:
         write_gating_figure(report.bearings, arguments.gating, title=str(arguments.input))
         summary |= report.bearings.figures()
     print_summary(summary, as_json=arguments.json)
     return 0
+
+
+def _source(arguments: argparse.Namespace) -> "Source":
+    from worldstate.adapters.acoustic_grounding import Grounding
+    from worldstate.adapters.listen import ListenSettings, open_source
+
+    settings = ListenSettings(
+        alpha=arguments.alpha,
+        band_hz=None if arguments.band is None else (arguments.band[0], arguments.band[1]),
+        azimuth_span_deg=arguments.azimuth_span,
+        mask_dead=arguments.mask_dead,
+        site_adaptation=arguments.site_adaptation,
+        forgetting_s=arguments.forgetting,
+        grounding=Grounding() if arguments.grounded else None,
+        ego_noise=arguments.ego_noise,
+        boxes=boxes_of(arguments),
+    )
+    return open_source(
+        arguments.input,
+        array=given_array(arguments),
+        detections=arguments.detections,
+        camera=arguments.camera,
+        miss_rates=arguments.miss_rates,
+        model=arguments.model,
+        settings=settings,
+    )

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.progress import progress_bar
@@ -48,12 +49,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     parser.add_argument(
         "--preset", choices=PRESETS, default=PRESETS[0], help="how busy the street is (default: %(default)s)"
     )
-    parser.add_argument(
-        "--array",
-        type=Path,
-        metavar="XML",
-        help="microphones that listen (default: OVAD's); D/array.xml names them",
-    )
+    add_array_options(parser, "OVAD's")
     parser.add_argument("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
@@ -62,7 +58,6 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
-    from worldstate.adapters.files.array_file import read_array_xml
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
@@ -81,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         rows = write_dataset(
             arguments.out,
             settings,
-            array=None if arguments.array is None else read_array_xml(arguments.array),
+            array=given_array(arguments),
             jobs=arguments.jobs,
             progress=lambda row: bar.advance(),
         )

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from worldstate.adapters.datasets.ovad import OvadDataset, Recording
 from worldstate.adapters.datasets.ovad_layout import LOG_NAME
-from worldstate.adapters.listen import measure_steps, open_source
+from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, load_streams
 
@@ -18,11 +19,13 @@ def find_inputs(path: Path) -> list[Path]:
     return [path]
 
 
-def read_input(path: Path, *, array: Path | None = None, model: Path | None = None) -> list[HopStream]:
+def read_input(
+    path: Path, *, array: MicrophoneArray | None = None, model: Path | None = None
+) -> list[HopStream]:
     """Listen to a recording or read streams; a sound file counts as hazard-free."""
     if path.suffix == ".npz":
         return load_streams(path)
-    source = open_source(path, array=array, model=model, alpha=None)
+    source = open_source(path, array=array, model=model, settings=ListenSettings(alpha=None))
     measured = (measurement for _, measurement in measure_steps(source))
     if not path.is_dir():
         return [hop_stream(measured, name=str(path))]

@@ -1,0 +1,73 @@
+"""Arrays of users' own: every form says the same places, and nothing right is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldstate.adapters.files.array_file import read_array, write_array_xml
+from worldstate.cli.common.array_options import stance
+from worldstate.frontend.array.default_band import default_band_hz
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+
+PLACES = [[0.5, 0.2, 1.4], [0.5, -0.2, 1.4], [0.1, 0.0, 1.5]]
+
+SAME = {
+    "plain.csv": "0.5,0.2,1.4\n0.5,-0.2,1.4\n0.1,0,1.5\n",
+    "header.csv": "\ufeffx,y,z\n0.5,0.2,1.4\n0.5,-0.2,1.4\n0.1,0,1.5\n",
+    "names.csv": "name,x [m],y [m],z [m]\nleft,0.5,0.2,1.4\nright,0.5,-0.2,1.4\nback,0.1,0,1.5\n",
+    "order.csv": "z_m;y_m;x_m\n1.4;0.2;0.5\n1.4;-0.2;0.5\n1.5;0;0.1\n",
+    "index.txt": "# my array\n1 0.5 0.2 1.4\n2 0.5 -0.2 1.4\n\n3 0.1 0 1.5\n",
+    "behind.tsv": "0.5\t0.2\t1.4\tleft\n0.5\t-0.2\t1.4\tright\n0.1\t0\t1.5\tback\n",
+    "list.json": json.dumps(PLACES),
+    "object.json": json.dumps({"positions_m": PLACES, "maker": "me"}),
+    "acoular.json": json.dumps({"positions_m": [[-y, z, x] for x, y, z in PLACES], "axes": "acoular"}),
+    "mics.xml": "<MicArray>"
+    + "".join(f'<pos x="{-y}" y="{z}" z="{x}"/>' for x, y, z in PLACES)
+    + "</MicArray>",
+}
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_every_form_says_the_same_places(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(SAME[name])
+    np.testing.assert_array_equal(read_array(tmp_path / name).positions_m, PLACES)
+
+
+def test_axes_may_be_those_of_the_other_convention(tmp_path: Path) -> None:
+    write_array_xml(tmp_path / "mics.xml", MicrophoneArray(PLACES))
+    (tmp_path / "mics.csv").write_text("-0.2,1.4,0.5\n0.2,1.4,0.5\n0,1.5,0.1")
+    np.testing.assert_array_equal(read_array(tmp_path / "mics.csv", "acoular").positions_m, PLACES)
+    turned = read_array(tmp_path / "mics.xml", "base_link").positions_m
+    np.testing.assert_array_equal(turned[0], [-0.2, 1.4, 0.5])
+
+
+def test_an_array_along_the_vehicle_is_told_from_one_across() -> None:
+    roof = roof_array_56()
+    assert stance(roof) == (
+        "56 microphones, 0.00 m along x (forward), 0.78 m along y (left), 0.65 m along z (up); "
+        "hears front as back"
+    )
+    # What the roof's file says where base_link axes are written into Acoular's form.
+    sideways = MicrophoneArray(roof.positions_m[:, [2, 0, 1]] * [1.0, -1.0, 1.0])
+    assert "no extent across the vehicle" in stance(sideways)
+
+
+@pytest.mark.parametrize(
+    ("spacing_m", "rate_hz", "band_hz"),
+    [
+        (0.5, 48_000, (300, 1800)),
+        (0.088, 48_000, (300, 1800)),
+        (0.0419, 48_000, (600, 3600)),
+        (0.01, 48_000, (1200, 7200)),
+        (0.01, 8_000, (600, 3600)),
+    ],
+)
+def test_the_band_follows_the_spacing(spacing_m: float, rate_hz: float, band_hz: tuple[float, float]) -> None:
+    pair = MicrophoneArray([[0, spacing_m, 0], [0, 0, 0]])
+    assert default_band_hz(pair, rate_hz) == band_hz
+
+
+def test_the_roof_keeps_the_papers_band_exactly() -> None:
+    assert default_band_hz(roof_array_56(), 47_998) == (300.0, 1800.0)

@@ -1,0 +1,52 @@
+"""Options of the camera that is asked about what is heard: its detections, its lens, which boxes count."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from worldstate.adapters.camera.detections import DetectionFilter
+    from worldstate.adapters.listen import Source
+
+HELP = """\
+--detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. --camera takes JSON:
+{"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
+the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "position_m": [x, y, z] in base_link."""
+
+
+def add_camera_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --detections, --camera, --miss-rates and which boxes count."""
+    parser.description = f"{parser.description}\n\n{HELP}"
+    group = parser.add_argument_group("camera")
+    group.add_argument("--detections", type=Path, metavar="PATH", help="what its detector reported")
+    group.add_argument("--camera", type=Path, metavar="JSON", help="its lens (default: OVAD's camera)")
+    group.add_argument(
+        "--min-box-px", type=float, default=100.0, metavar="PX", help="boxes must be higher (100)"
+    )
+    group.add_argument("--min-score", type=float, default=0.75, metavar="P", help="lowest score (0.75)")
+    group.add_argument(
+        "--classes", nargs="+", default=["car", "motorcycle"], metavar="NAME",
+        help="classes that count as road users (car motorcycle)",
+    )  # fmt: skip
+    group.add_argument(
+        "--miss-rates", type=Path, metavar="JSON", help="how often it misses, as measure-absence wrote it"
+    )
+
+
+def boxes_of(arguments: argparse.Namespace) -> "DetectionFilter":
+    """Return which boxes count."""
+    from worldstate.adapters.camera.detections import DetectionFilter
+
+    return DetectionFilter(frozenset(arguments.classes), arguments.min_score, arguments.min_box_px)
+
+
+def box_counts(source: "Source", *, as_json: bool) -> object:
+    """Say how many boxes count and why the others do not; None without a camera."""
+    from dataclasses import asdict
+
+    from worldstate.adapters.camera.static_boxes import ParkedRule, count_boxes
+
+    if source.detections is None:
+        return None
+    counts = count_boxes(source.detections, source.settings.boxes, ParkedRule())
+    return asdict(counts) if as_json else str(counts)
