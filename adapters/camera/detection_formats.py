@@ -1,6 +1,5 @@
 """Detections as other tools write them: COCO results and YOLO text, beside OVAD's JSON."""
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -9,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from worldstate.adapters.files.json_file import read_json
+from worldstate.adapters.files.text_file import read_text
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
@@ -29,6 +30,7 @@ COCO_CATEGORIES: Mapping[int, str] = {
 YOLO_CLASSES: Mapping[int, str] = {
     0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck",
 }  # fmt: skip
+MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
 _FRAME_NUMBER = re.compile(r"(\d{1,9})\.txt$", re.ASCII)
 
 Row = tuple[tuple[float, float, float, float], float, str]
@@ -103,7 +105,7 @@ def read_coco_results(
     [(('car',), [[1.0, 2.0, 4.0, 6.0]]), ((), [])]
     """
     name = Path(path)
-    found = _decoded(name)
+    found = read_json(name, "a detections file", MAX_BYTES)
     if not isinstance(found, list) or len(found) > MAX_FRAMES * 10:
         raise InputFileError(name, "expected a list of COCO results")
     rows: dict[int, list[Row]] = {}
@@ -148,20 +150,6 @@ def read_yolo_text(
     return _log(folder, rows, frames, frame_rate_hz)
 
 
-def _decoded(path: Path) -> Any:
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputFileError(path, f"expected a detections file ({error.strerror})") from error
-    if len(text) > MAX_BYTES:
-        raise InputFileError(path, f"expected a detections file of at most {MAX_BYTES} bytes")
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputFileError(path, f"expected JSON, it does not parse: {error}") from error
-
-
 def _coco_row(item: Any, categories: Mapping[int, str]) -> tuple[int, Row]:
     if not isinstance(item, dict):
         raise InvalidArgumentError("expected an object")
@@ -181,16 +169,8 @@ def _coco_row(item: Any, categories: Mapping[int, str]) -> tuple[int, Row]:
 
 def _yolo_rows(path: Path, size_px: tuple[int, int], classes: Mapping[int, str]) -> list[Row]:
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
-        if len(text) > MAX_BYTES:
-            raise InputFileError(path, f"expected a text file of at most {MAX_BYTES} bytes")
-        lines = text.decode("utf-8").splitlines()
+        lines = read_text(path, "a text file", MAX_TEXT_BYTES).splitlines()
         return [_yolo_row(line, size_px, classes) for line in lines if line.strip()]
-    except OSError as error:
-        raise InputFileError(path, f"expected a text file ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputFileError(path, "expected text in UTF-8") from error
     except InvalidArgumentError as error:
         raise InputFileError(path, str(error)) from error
 

@@ -1,14 +1,14 @@
 """What a camera's detector reported, frame by frame."""
 
-import json
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
+from worldstate.adapters.files.json_file import read_json
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IntArray
@@ -200,7 +200,7 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int
     """
     in_range("frame_rate_hz", frame_rate_hz, 0.0, MAX_FRAME_RATE_HZ, open_low=True)
     name = Path(path)
-    document = _load(name)
+    document = read_json(name, "a detections file", MAX_BYTES)
     rows = document.get("detections_per_frame") if isinstance(document, dict) else None
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
@@ -210,24 +210,6 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int
         return _stamp(name, rows, frames, frame_rate_hz, start_ns)
     except InvalidArgumentError as error:
         raise InputFileError(name, str(error)) from error
-
-
-def _load(path: Path) -> Any:
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputFileError(path, f"expected a detections file ({error.strerror})") from error
-    if len(text) > MAX_BYTES:
-        raise InputFileError(path, f"expected a detections file of at most {MAX_BYTES} bytes")
-    try:
-        return json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputFileError(path, f"expected detections as JSON, it does not parse: {error}") from error
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
 
 
 def _frame(path: Path, number: int, row: Any) -> DetectionFrame:

@@ -43,11 +43,10 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
     # wanted: File, relative to the data set; End, seconds from the start of the file; T0. Where no File is
     # given, ``<Environment>/<Class>/<ID>/out_multi.wav`` and ``<ID>.wav`` are looked for.
     name, root = Path(path), Path(dataset)
-    present = _optional_columns(name)
-    rows = read_rows(name, (*REQUIRED, *present))
-    if not rows:
+    windows = [_labelled(name, root, line, row) for line, row in read_rows(name, REQUIRED, OPTIONAL)]
+    if not windows:
         raise InputFileError(name, "expected at least one window below the header")
-    return [_labelled(name, root, line, row) for line, row in rows]
+    return windows
 
 
 def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[FloatArray]:
@@ -123,18 +122,6 @@ def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
         if at_frame >= end:
             break
     return np.concatenate(kept)
-
-
-def _optional_columns(path: Path) -> tuple[str, ...]:
-    """Return which of the optional columns are there."""
-    found = []
-    for column in OPTIONAL:
-        try:
-            read_rows(path, (column,))
-        except InputFileError:
-            continue
-        found.append(column)
-    return tuple(found)
 
 
 def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:

@@ -21,6 +21,7 @@ from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 
 N_FEATURES = 60
 FEATURE_COLUMNS = tuple(f"feat{i}" for i in range(N_FEATURES))
+LONGEST_NAME = 100
 LABEL_COLUMNS = ("Class", "ID", "Environment", "T0", "Recording ID")
 
 Group = Literal["static", "dynamic", "all"]
@@ -214,7 +215,7 @@ def read_ids(path: str | Path) -> frozenset[str]:
 
 def _window(
     path: str | Path, line: int, row: dict[str, str]
-) -> tuple[list[float], tuple[str, ...], int | None]:
+) -> tuple[FloatArray, tuple[str, ...], int | None]:
     labels = tuple(row[column] for column in ("Class", "ID", "Environment", "Recording ID"))
     if labels[0] not in CLASSES:
         raise InputFileError(path, f"line {line}: expected a class {CLASSES}, got {labels[0][:40]!r}")
@@ -222,8 +223,10 @@ def _window(
         raise InputFileError(path, f"line {line}: expected an environment S.. or D.., got {labels[2][:40]!r}")
     if not labels[3]:
         raise InputFileError(path, f"line {line}: expected a Recording ID")
+    if max(map(len, labels)) > LONGEST_NAME:
+        raise InputFileError(path, f"line {line}: expected names of at most {LONGEST_NAME} characters")
     try:
-        features = [float(row[column]) for column in FEATURE_COLUMNS]
+        features = np.array([float(row[column]) for column in FEATURE_COLUMNS])
         t0_frame = int(row["T0"]) if row["T0"] else None
     except ValueError as error:
         raise InputFileError(path, f"line {line}: {error}") from error

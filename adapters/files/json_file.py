@@ -7,23 +7,15 @@ from pathlib import Path
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode_json
 
+from .text_file import read_text
+
 MAX_BYTES = 16 << 20
 
 
-def read_json(path: str | Path, what: str) -> object:
-    """Return what a JSON file of at most 16 MiB holds, decoded strictly."""
+def read_json(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> object:
+    """Return what a JSON file holds, decoded strictly."""
     with refused_as_file(path):
-        try:
-            with Path(path).open("rb") as file:
-                data = file.read(MAX_BYTES + 1)
-            text = data.decode("utf-8")
-        except OSError as error:
-            raise InputFileError(path, f"expected {what} ({error.strerror})") from error
-        except UnicodeDecodeError as error:
-            raise InputFileError(path, f"expected {what} in UTF-8") from error
-        if len(data) > MAX_BYTES:
-            raise InputFileError(path, f"expected {what} of at most {MAX_BYTES >> 20} MiB")
-        return decode_json(text, what)
+        return decode_json(read_text(path, what, max_bytes), what)
 
 
 @contextmanager

@@ -33,7 +33,9 @@ Read: TypeAlias = Callable[[Any], Any]
 # How values of a type are written, and how they are read.
 Plan: TypeAlias = tuple[Write, Read]
 
-MOST_CHARACTERS = 64_000_000
+MOST_CHARACTERS = 64 << 20
+# A list of two characters takes 80 bytes when decoded, so what bounds the memory is how many there are.
+MOST_VALUES = 4_000_000
 MOST_ITEMS = 1_000_000
 
 
@@ -190,6 +192,9 @@ def decode_json(text: str, where: str) -> object:
     """
     if len(text) > MOST_CHARACTERS:
         raise InvalidArgumentError(f"{where}: expected at most {MOST_CHARACTERS} characters, got {len(text)}")
+    values = sum(map(text.count, "[{:,"))
+    if values > MOST_VALUES:
+        raise InvalidArgumentError(f"{where}: expected at most {MOST_VALUES} values, got {values}")
     try:
         return json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:

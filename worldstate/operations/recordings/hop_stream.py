@@ -16,7 +16,8 @@ from worldstate.measurement.measurement import Measurement
 
 HOP_S = 0.1
 UNQUERIED, ABSENT, PRESENT = 0, 1, 2
-MAX_BYTES = 1 << 30
+MAX_BYTES = 512 << 20
+MAX_STREAMS = 100_000
 VERSION = 1
 
 
@@ -179,6 +180,8 @@ def _streams(arrays: dict[str, np.ndarray]) -> list[HopStream]:
     if int(arrays["version"]) != VERSION:
         raise InvalidArgumentError(f"version: expected {VERSION}, got {int(arrays['version'])}")
     hops = arrays["hops"].astype(np.int64)
+    if hops.size > MAX_STREAMS:
+        raise InvalidArgumentError(f"hops: expected at most {MAX_STREAMS} streams, got {hops.size}")
     check_shape("names", arrays["names"].shape, (hops.size,))
     if (hops < 0).any() or hops.sum() != len(arrays["time_s"]):
         raise InvalidArgumentError("hops: expected counts that sum to the number of rows")

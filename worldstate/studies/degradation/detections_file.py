@@ -15,6 +15,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from .degraded_detections import StagedLooks
 
 MAX_BYTES = 64 << 20
+MAX_FRAMES = 500_000
 
 
 def save_looks(path: str | Path, looks: StagedLooks, origin: str) -> None:
@@ -62,6 +63,8 @@ def _read(values: dict[str, np.ndarray], origin: str, rates: MissRates) -> Stage
 
 def _frames(values: dict[str, Any]) -> list[DetectionFrame]:
     counts = values["counts"]
+    if counts.size > MAX_FRAMES:
+        raise InvalidArgumentError(f"counts: expected at most {MAX_FRAMES} frames, got {counts.size}")
     if (counts < 0).any() or not counts.sum() == len(values["boxes_px"]) == len(values["scores"]):
         raise InvalidArgumentError("counts: expected those of the boxes")
     edges = np.cumsum(counts)[:-1]

@@ -1,0 +1,110 @@
+"""Files within their limit whose content is many times as large in memory: at most 1 GB, and soon refused."""
+
+import json
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.recordings.hop_stream import HopStream, load_streams, save_streams
+
+MIB = 1 << 20
+MOST_KB = 1_000_000
+# An address space of 4 GB keeps the machine alive where a bound fails.
+MEASURE = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
+from worldstate.adapters.camera.detection_formats import read_any_detections
+from worldstate.adapters.datasets.feature_extraction import read_labels
+from worldstate.adapters.datasets.feature_table import read_features, read_ids
+from worldstate.adapters.datasets.ovad import read_id_list
+from worldstate.adapters.files.checkpoint_file import read_checkpoint
+from worldstate.adapters.files.model_file import read_model
+from worldstate.ground.errors import WorldstateError
+for name, reader, path in zip(*[iter(sys.argv[1:])] * 3):
+    try:
+        globals()[reader](path, *(["."] if reader == "read_labels" else []))
+    except WorldstateError as error:
+        assert len(str(error)) < 1000, len(str(error))
+    print(name, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, sep=";")
+"""
+
+
+def repeated(piece: str, size: int, head: str = "", tail: str = "") -> bytes:
+    return (head + piece * ((size - len(head) - len(tail)) // len(piece)) + tail).encode()
+
+
+def json_list(piece: str, size: int, values: int | None = None) -> bytes:
+    """Return a JSON list of `size` bytes, or of so many values."""
+    wanted = size if values is None else min(size, values // sum(map(piece.count, "[{:,")) * len(piece) - 8)
+    return repeated(piece, wanted, "[", "0]")
+
+
+def keys(count: int) -> bytes:
+    return json.dumps({f"{i:x}": i + 300 for i in range(count)}).encode()
+
+
+COLUMNS = [*(f"feat{i}" for i in range(60)), "Class", "ID", "Environment", "T0", "Recording ID"]
+HEADER, ROW = ",".join(COLUMNS) + "\n", "0," * 60 + "none,a,S,,b\n"
+LONG_NAME = HEADER + ROW.replace("a", "a" * 100_000)
+LABELS = "ID,Class,Environment,Recording ID\n"
+FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
+    "empty lists": ("read_any_detections", lambda: json_list("[],", 64 * MIB)),
+    "as many lists as may be": ("read_any_detections", lambda: json_list("[],", 64 * MIB, 4_000_000)),
+    "as many keys as may be": ("read_any_detections", lambda: keys(1_900_000)),
+    "wide text": ("read_any_detections", lambda: ('["\N{GRINNING FACE}' + "a" * (60 * MIB) + '"]').encode()),
+    "empty objects": ("read_model", lambda: json_list("{},", 16 * MIB, 4_000_000)),
+    "numbers": ("read_checkpoint", lambda: json_list("1.5,", 16 * MIB)),
+    "short ids": ("read_ids", lambda: repeated("a\n", 16 * MIB, "ID\n")),
+    "as many ids as may be": ("read_id_list", lambda: "\n".join(["ID", *map(str, range(199_000))]).encode()),
+    "a wide line": ("read_ids", lambda: repeated("ab,", 16 * MIB, "ID,", "\n")),
+    "a wide header": ("read_features", lambda: repeated("a\n", 16 * MIB, HEADER[:-1] + ",b" * MIB + "\n")),
+    "one long name": ("read_features", lambda: repeated(ROW, 8 * MIB, LONG_NAME)),
+    "windows": ("read_features", lambda: repeated(ROW, 8 * MIB, HEADER)),
+    "labels": ("read_labels", lambda: repeated("a,none,S,b\n", 16 * MIB, LABELS)),
+}
+
+
+def test_no_file_within_its_limit_takes_a_gigabyte(tmp_path: Path) -> None:
+    words: list[str] = []
+    for number, (name, (reader, content)) in enumerate(FILES.items()):
+        path = tmp_path / str(number)
+        path.write_bytes(content())
+        words += [name, reader, str(path)]
+    command = [sys.executable, "-c", MEASURE, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120.0)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert done.returncode == 0, done.stderr
+    peaks = {name: int(peak) for name, peak in (line.split(";") for line in done.stdout.splitlines())}
+    assert list(peaks) == list(FILES)
+    assert max(peaks.values()) < MOST_KB, peaks
+
+
+def test_arrays_are_measured_before_they_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "streams.npz"
+    save_streams(path, [HopStream.blank("a", 3)])
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("more.npy", "w") as member:
+        header = {"descr": "|i1", "fortran_order": False, "shape": (70_000_000,)}
+        np.lib.format.write_array_header_1_0(member, header)
+        member.write(bytes(1000))
+    with pytest.raises(InputFileError, match="at most 512 MiB"):
+        load_streams(path)
+
+
+def test_many_members_and_many_empty_streams_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "streams.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(2000):
+            archive.writestr(f"{number}.npy", b"")
+    with pytest.raises(InputFileError, match="short list of members"):
+        load_streams(path)
+    empty = {name: np.zeros(0) for name in ("time_s", "names", "labels", "t0_s")}
+    np.savez_compressed(path, version=1, hops=np.zeros(1_000_000, np.int64), **empty)
+    with pytest.raises(InputFileError, match="at most 100000 streams"):
+        load_streams(path)
