@@ -1,6 +1,7 @@
-"""Samples into numbers: arrays, spectra, bearing, approach rate, signatures and their bounds.
+"""The acoustic front-end: arrays, spectra, bearing, approach rate, signatures and their bounds.
 
-This folder knows no world: it imports nothing of the library but `errors`, `checks` and `values`.
+Nothing here depends on the world-state: the only imports from the rest of the library are those of its ground
+floor (types, errors, checks, values).
 """
 
 import lazy_loader

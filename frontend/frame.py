@@ -1,4 +1,4 @@
-"""What the front-end says every hop."""
+"""The result of the front-end for one hop."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,17 @@ from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
-_NOT_WATCHED = NotUsable("microphones were not watched")
+_NOT_MONITORED = NotUsable("microphones were not monitored")
 TONE_IS_OFF = NotUsable("the tone is off: see FrontEndSettings.tone_band_hz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AcousticFrame:
-    """Everything the front-end reads from the sound up to one instant.
+    r"""Results of the front-end at the end of one hop.
+
+    .. math:: \hat\theta = \arg\max_\theta P(\theta), \qquad \rho = P(\hat\theta) / \mathrm{median}_\theta P
+
+    with the bearing, its prominence rho, and the SRP-PHAT spectrum P of the last `bearing_hops` hops.
 
     Parameters
     ----------
@@ -26,39 +30,39 @@ class AcousticFrame:
     sample_index : int
         Number of samples up to there.
     azimuths_rad : ndarray, shape (A,)
-        Grid of `srp`, ascending from right (negative) to left.
+        Grid of `srp`, radians, ascending from right (negative) to left.
     srp : ndarray of float64, shape (A,)
-        SRP-PHAT of the decision window, 0..1; where elevations are searched, the highest over them.
+        SRP-PHAT of the decision window, 0..1; the maximum over elevations where these are searched.
     elevations_rad : ndarray, shape (E,)
-        Rows of `srp_map`, ascending.
+        Rows of `srp_map`, ascending, radians, up positive.
     srp_map : ndarray of float64, shape (E, A)
         SRP-PHAT of the decision window over elevation and azimuth.
     bearing_rad, bearing_std_rad : float
-        Strongest peak over the last `bearing_hops` hops.
+        Azimuth of the highest peak over the last `bearing_hops` hops and its standard deviation, radians.
     prominence : float
         Peak-to-median ratio of the spectrum that the bearing was read from.
     elevation_rad : float
-        Elevation of that peak.
+        Elevation of that peak, radians.
     peaks : tuple of Peak
         All peaks of that spectrum, highest first, at most `max_peaks`; the first is the bearing.
     ambiguity : str
-        What the array cannot tell apart: see `MicrophoneArray.ambiguity`.
+        Directions that the array cannot distinguish: see `MicrophoneArray.ambiguity`.
     mirror_bearing_rad : float or NotUsable
-        The azimuth that sounds the same as the bearing to this array.
+        Azimuth with the same delays as the bearing (front-back ambiguity), radians.
     music : MusicReading or NotUsable
         MUSIC on the decision window; not usable when it is off.
-    band_log_energy : ndarray of float64, shape (16,)
-        ln mean square of the last hop per band.
+    band_log_energy : ndarray of float64, shape (level_bands,)
+        Natural logarithm of the mean square of the last hop per band.
     looming : Looming or NotUsable
         Approach rate at the end of the window.
     feature : ndarray of float64, shape (60,)
         The published feature of the decision window: two halves x thirty azimuths, from left to right.
     bearing_age_s : float
-        How long before `stamp_ns` the middle of the bearing's interval was, seconds.
+        From the middle of the interval of the bearing to `stamp_ns`, seconds.
     health : ArrayHealth or NotUsable
-        What is wrong with the microphones, and which were left out; not usable in frames made by hand.
+        Faults of the microphones and which were left out.
     tone : ToneReading or NotUsable
-        Engine line over the last `tone_hops` hops; not usable when it is off, or none stands out.
+        Engine line over the last `tone_hops` hops; not usable when it is off or no tone exceeds the noise.
 
     Examples
     --------
@@ -90,5 +94,5 @@ class AcousticFrame:
     looming: Looming | NotUsable
     feature: FloatArray
     bearing_age_s: float = 0.0
-    health: ArrayHealth | NotUsable = _NOT_WATCHED
+    health: ArrayHealth | NotUsable = _NOT_MONITORED
     tone: ToneReading | NotUsable = TONE_IS_OFF

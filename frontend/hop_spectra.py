@@ -1,4 +1,4 @@
-"""From the samples of one hop to the sums that every window is made of."""
+"""From the samples of one hop to the sums that windows are made of."""
 
 from dataclasses import dataclass
 
@@ -27,28 +27,20 @@ Steered = tuple[Complex64Array, Steering]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HopSums:
-    """Sums over the frames that end within one hop.
+    """Sums over the STFT frames that end within one hop."""
 
-    Examples
-    --------
-    >>> health = ArrayHealth.unknown(n_channels=2)
-    >>> sums = HopSums(19, 2400.0, np.zeros(181), np.zeros(30, complex), np.ones(2), health)
-    >>> sums.n_frames
-    19
-    """
-
-    n_frames: int  # Number of these frames
-    centre: float  # Mean of their middles, samples from the start of the stream
-    # shape (E * A,): Steered power: see `steered_power`. Where microphones are left out, power and pairs
-    # are scaled to what all would give.
+    n_frames: int
+    centre: float  # Mean of the middles of these frames, samples from the start of the stream
+    # shape (E * A,): Steered power. Where microphones are left out, power and pairs are scaled to the value
+    # for all of them.
     power: FloatArray
-    pairs: Complex128Array  # shape (30,): Pair sums: see `worldstate.frontend.direction.feature.pair_sum`
+    pairs: Complex128Array  # shape (30,): Pair sums of the published feature
     energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
-    health: ArrayHealth  # What is wrong with the array, and which microphones counted
+    health: ArrayHealth  # Faults of the array, and the microphones used
 
 
 class HopSpectra:
-    """Transform, whiten and steer, hop by hop; only the transform remembers the past.
+    """Transform, whiten and steer one hop; only the transform and the optional stages have a memory.
 
     Examples
     --------
@@ -76,15 +68,12 @@ class HopSpectra:
         self._nfft = nfft
         self._n_frames = 0
         self.music = self._music(array.n_microphones, settings)
-        self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not watched")
+        self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
         self.monitor = self._monitor(array, sample_rate_hz, settings)
         self.ego_noise = self._ego_noise(array, sample_rate_hz, bins, settings)
 
     def push(self, samples: Float32Array) -> HopSums:
-        """Sum over the frames that these samples (n, M) complete; at least one frame.
-
-        Shapes: samples (n, M).
-        """
+        """Return the sums over the frames that these samples (n, M) complete; at least one."""
         spectra = self._stft.push(samples)
         powers = power(spectra)
         whitened = whiten(spectra, powers)
@@ -117,20 +106,20 @@ class HopSpectra:
             return []
         mask.silence(spectra)
         prewhitened = self.ego_noise.process(spectra)
-        for heard, _ in prewhitened:
-            mask.silence(heard)
+        for whitened, _ in prewhitened:
+            mask.silence(whitened)
         return prewhitened
 
     def _push_music(
         self, music: MusicStage, spectra: Complex64Array, powers: Float32Array, prewhitened: list[Steered]
     ) -> None:
-        """MUSIC hears raw spectra, or whitened ones at the level of the raw ones."""
+        """Give MUSIC the raw spectra, or the prewhitened ones at the level of the raw ones."""
         if not prewhitened or prewhitened[0][1] is self._beams:
             music.push(spectra[:, self._srp])
         else:
-            heard, beams = prewhitened[0]
+            whitened, beams = prewhitened[0]
             level = np.sqrt(powers[:, self._srp].mean(axis=2, keepdims=True))
-            music.push(heard * level, beams)
+            music.push(whitened * level, beams)
 
     def _sums(
         self,
@@ -139,7 +128,7 @@ class HopSpectra:
         matrices: Complex64Array,
         mask: ChannelMask,
     ) -> tuple[FloatArray, Complex128Array]:
-        """Steered power and pair sums of one hop, as of all microphones."""
+        """Return steered power and pair sums of one hop, scaled to all microphones."""
         srp = prewhitened[0] if prewhitened else (whitened[:, self._srp], self._beams)
         if len(prewhitened) > 1:
             pairs = pair_sum(*prewhitened[1])
@@ -174,9 +163,9 @@ class HopSpectra:
         if chosen.feature:
             beams.append((self._feature_beams, self._feature))
         part = spanned(part for _, part in beams)
-        heard = bins[part]
-        engine = HarmonicCanceller(heard, sample_rate_hz, nfft, harmonics=chosen.harmonics)
-        frequencies, speed = bin_frequencies_hz(heard, sample_rate_hz, nfft), settings.speed_of_sound_m_s
+        learned = bins[part]
+        engine = HarmonicCanceller(learned, sample_rate_hz, nfft, harmonics=chosen.harmonics)
+        frequencies, speed = bin_frequencies_hz(learned, sample_rate_hz, nfft), settings.speed_of_sound_m_s
         split = ElevationSplit.of(array, frequencies, speed) if chosen.only_below_horizon else None
         frames_per_s = 2.0 * sample_rate_hz / nfft
         return EgoNoise(chosen, frames_per_s, array.n_microphones, beams, engine, split)

@@ -1,4 +1,4 @@
-"""Band levels of a stream, from a few of its microphones."""
+"""Band levels of a stream from a few of its microphones."""
 
 import numpy as np
 
@@ -10,13 +10,12 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 from .settings import FrontEndSettings
 
-# Highest frequency that the anti-aliasing filters of usual converters leave alone, as a share of the sample
-# rate.
+# Highest frequency that the anti-aliasing filters of usual converters pass, relative to the sample rate.
 _HIGHEST = 0.45
 
 
 class LevelMeter:
-    """Log-energy per band and hop: microphones hear the same sound, so that a few say what all would.
+    """Log-energy per band and hop, averaged over a few microphones: the level is the same at all of them.
 
     Examples
     --------
@@ -38,13 +37,11 @@ class LevelMeter:
         self._stft = StreamingStft(-(-n_channels // step), settings.nfft, self._bins)
 
     def push(self, samples: Float32Array, keep: BoolArray | None = None) -> FloatArray:
-        r"""Log-energy (bands,) of the frames that these samples (n, M) complete; at least one frame.
+        r"""Return the log-energy (bands,) of the frames that these samples (n, M) complete; at least one.
 
         .. math:: L_b = \ln \sum_{k \in b} \overline{x^2}[k]
-
-        Shapes: samples (n, M), keep (M,).
         """
-        # Of the picked microphones those count that are to be kept (M,), all if none of them is.
+        # Only the picked microphones that are kept (M,) are averaged, or all picked ones if none is.
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         kept = None if keep is None else keep[self._channels]
         if kept is not None and kept.any() and not kept.all():

@@ -1,4 +1,4 @@
-"""What a user may set of the front-end, with the values of the paper."""
+"""Settings of the front-end, with the values of the paper."""
 
 from dataclasses import dataclass
 
@@ -28,43 +28,42 @@ class FrontEndSettings:
     window_hops : int
         Hops in the decision window of `srp` and `feature`, even: the feature has two segments.
     bearing_hops : int
-        Hops behind `bearing_rad`, at most `window_hops`. More suppress noise, but a car that passes turns
-        by tens of degrees a second, and the bearing is that of the middle of the interval.
+        Hops in the bearing, at most `window_hops`. More suppress noise, but the azimuth of a passing car
+        changes by tens of degrees per second, and the bearing is that of the middle of the interval.
     azimuth_span_deg : (float, float)
-        First and last azimuth searched, left positive.
+        First and last azimuth searched, degrees, left positive.
     azimuth_step_deg : float
-        Step of that grid; it must divide the span.
+        Step of that grid, degrees; it must divide the span.
     elevation_span_deg : (float, float)
-        First and last elevation searched, up positive; only the horizon by default.
+        First and last elevation searched, degrees, up positive; only the horizon by default.
     elevation_step_deg : float
-        Step of that grid; it must divide the span.
+        Step of that grid, degrees; it must divide the span.
     max_peaks : int
-        At most so many peaks are listed.
+        Largest number of peaks listed.
     music_sources : int
-        Sources that MUSIC shall expect, at most as many as microphones less one; 0 leaves MUSIC out.
+        Number of sources assumed by MUSIC, below the number of microphones; 0 switches MUSIC off.
     tone_band_hz : (float, float), optional
-        Look for an engine line there, e.g. (20, 400) Hz: see `tone_stage`. None, the
-        default, leaves it out.
+        Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
     tone_hops : int
         Hops in the window of the tone fit.
     tone_channels : int
-        The tone is heard by so many microphones, those next to the middle of the array.
+        Number of microphones averaged for the tone, those nearest to the centre of the array.
     srp_band_hz, feature_band_hz, looming_band_hz, level_band_hz : (float, float)
         Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
     level_bands : int
         Number of bands of `band_log_energy`.
     level_channels : int
-        Band levels are averaged over at most so many microphones, evenly picked.
+        Largest number of microphones, evenly picked, over which band levels are averaged.
     looming_hops : int
         Hops in the window of the looming fit, >= 4.
     bearing_std_rad : float
-        Standard deviation of a prominent bearing at broadside.
+        Standard deviation of a prominent bearing at broadside, radians.
     speed_of_sound_m_s : float
-        Speed of sound.
+        Speed of sound c, m/s.
     ego_noise : EgoNoiseSettings, optional
-        Learn the noise of the own vehicle and prewhiten with it: see `FrontEnd.learn_ego_noise`.
+        Settings of ego-noise suppression, used with `FrontEnd.learn_ego_noise`; None switches it off.
     watch_channels : bool
-        Look for microphones that misbehave and leave them out: see `channel_health`.
+        Detect faulty microphones and leave them out.
 
     Raises
     ------
@@ -135,7 +134,7 @@ class FrontEndSettings:
         _divides("elevation_step_deg", self.elevation_step_deg, highest - lowest)
 
     def azimuths_rad(self) -> FloatArray:
-        """Grid of azimuths, ascending from right to left, radians, shape (A,).
+        """Return the grid of azimuths, ascending from right to left.
 
         ``theta_i = first + i step``
 
@@ -147,7 +146,7 @@ class FrontEndSettings:
         return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
 
     def elevations_rad(self) -> FloatArray:
-        """Grid of elevations, ascending, radians, shape (E,).
+        """Return the grid of elevations, ascending.
 
         ``phi_i = first + i step``
 
@@ -164,7 +163,7 @@ class FrontEndSettings:
         return _grid_rad(self.elevation_span_deg, self.elevation_step_deg)
 
     def directions_rad(self) -> tuple[FloatArray, FloatArray]:
-        """Azimuth and elevation of every direction, row by row of elevations, shape (E * A,) each.
+        """Return azimuth and elevation of every direction, row by row of elevations.
 
         ``(theta, phi)_i = (theta_(i mod A), phi_(i div A))``
 

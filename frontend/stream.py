@@ -1,4 +1,4 @@
-"""The streaming acoustic front-end: samples in, one `AcousticFrame` a hop out."""
+"""The streaming acoustic front-end: samples in, one `AcousticFrame` per hop out."""
 
 from collections import deque
 
@@ -30,36 +30,42 @@ from .settings import FrontEndSettings
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
-# Far above any converter's full scale; its power over a frame still fits single precision.
+# Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
 _MUSIC_IS_OFF = NotUsable("MUSIC is off: see FrontEndSettings.music_sources")
 
 
 class FrontEnd:
-    """Bearing, approach rate and signature of the sound around an array, every tenth of a second.
+    r"""Bearing, approach rate and signature of the sound around an array, once per hop (0.1 s).
 
-    A frame of the transform belongs to the hop in whose samples it ends. Hop k ends at sample floor(k fs /
-    10 + 1/2), so that a decision never drifts; the first falls on the end of the first full window. Sums
-    are kept per hop, so that a running second costs only its new frames, and hops are cut before anything
-    is computed, so that the same samples give the same frames in blocks of any length. Memory does not
-    grow.
+    .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k} \Big| \sum_m \overline{a_{k,m}(\theta)}\,
+              \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2, \qquad \hat\theta = \arg\max_\theta P(\theta)
+
+    The SRP spectrum over the T STFT frames of the window is one of the results; `AcousticFrame` lists all. An
+    STFT frame belongs to the hop in whose samples it ends. Hop k ends at sample floor(k fs / 10 + 1/2),
+    without drift; the first result is at the end of the first full window. Sums are kept per hop, so that a
+    window of one second costs only its newest hop, and hops are cut before any computation, so that the
+    result does not depend on the length of the blocks. Memory does not grow.
 
     Parameters
     ----------
     array : MicrophoneArray
-        In the order of the channels. A planar array mounted across the vehicle hears sources behind it
-        mirrored to the front: see `MicrophoneArray.ambiguity`.
+        One microphone a channel, in the order of the channels. A planar array across the vehicle shows
+        sources behind it mirrored to the front: see `MicrophoneArray.ambiguity`.
     sample_rate_hz : float
         Samples per second; more than twice the highest frequency of the bands.
     settings : FrontEndSettings, optional
-        The paper's values by default.
+        Bands, windows, grids and stages; the values of the paper by default.
     start_ns : int
         Time of the first sample, nanoseconds.
 
     Raises
     ------
     InvalidArgumentError
-        If a band lies beyond half the sample rate, or a hop is shorter than a frame.
+        If a band exceeds half the sample rate, or a hop is shorter than an STFT frame.
+
+    References ---------- "Evidence of Absence", section IV; J. DiBiase, H. Silverman and M. Brandstein,
+    "Robust localization in reverberant rooms", in *Microphone Arrays*, 2001 (SRP-PHAT).
 
     Examples
     --------
@@ -101,26 +107,34 @@ class FrontEnd:
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
 
     def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
-        """Take the next samples, give one frame for every hop that they complete after the first window.
+        """Take the next samples; return one result for every hop that they complete after the first window.
 
         Parameters
         ----------
         block : array_like, shape (n, M)
-            Any n, from a single sample to a whole file; converted to float32.
+            Samples, any n from one sample to a whole file; converted to float32.
         captured_ns : int, optional
-            When the last of these samples was captured by the caller's clock, nanoseconds; measures the
-            sample rate (`AcousticFrame.health`) and changes nothing else.
+            Capture time of the last of these samples by the caller's clock, nanoseconds. It measures the
+            sample rate (`AcousticFrame.health`) and has no other effect.
 
         Returns
         -------
         list of AcousticFrame
-            In order of time; empty where no hop is complete.
+            In order of time; empty if no hop is complete.
 
         Raises
         ------
         InvalidArgumentError
-            On another number of channels, values that are no numbers, NaN, infinity or beyond 1e15; the
-            stream is left as it was.
+            On another number of channels, values that are no numbers, NaN, infinity or beyond 1e15; the state
+            is unchanged.
+
+        Examples
+        --------
+        >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
+        >>> front_end = FrontEnd(array, 8000)
+        >>> blocks = np.random.default_rng(0).standard_normal((5, 2000, 3))
+        >>> [len(front_end.process(block)) for block in blocks]
+        [0, 0, 0, 1, 2]
         """
         samples = self._checked(block)
         self._n_taken += len(samples)
@@ -130,11 +144,10 @@ class FrontEnd:
         return [frame for frame in frames if frame is not None]
 
     def learn_ego_noise(self, none_probability: float) -> None:
-        """Say how likely it is that no source is there, so that what is got is the own vehicle's noise.
+        """Set the probability that no source is present, with which the sound is learned as ego-noise.
 
-        It holds for every hop that ends from now on, until told otherwise; before the first call nothing is
-        learned and nothing changes. A caller with a filter passes its posterior of "none" after every
-        update; one that knows better (a calibration drive, an empty road) passes 1, then 0.
+        It holds for all hops from now on; before the first call nothing is learned. A caller with a filter
+        passes its posterior of "none" after every update; on a calibration drive one passes 1, then 0.
 
         Parameters
         ----------
@@ -145,27 +158,41 @@ class FrontEnd:
         ------
         InvalidArgumentError
             Out of range, or `settings.ego_noise` is None.
+
+        Examples
+        --------
+        >>> from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+        >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
+        >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=EgoNoiseSettings()))
+        >>> front_end.learn_ego_noise(1.0)
         """
         self._ego_noise().weight = in_range("none_probability", none_probability, 0.0, 1.0)
 
     def follow_engine(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
-        """Say the fundamental of the own engine, whose lines are then cancelled; None stops it.
+        """Set the fundamental of the own engine, whose harmonics are then cancelled; None stops it.
 
-        It holds for every hop that ends from now on. Between two calls it is tracked, so that a call a hop
-        follows a changing speed best and a call now and then will do while it is steady.
+        It is tracked between calls: one call per hop follows a changing speed best, an occasional one is
+        enough at a steady speed.
 
         Parameters
         ----------
         fundamental_hz : float or None
-            Engine speed times the number of lines a turn (the firing frequency: revolutions a second times
-            half the number of cylinders), or the last value of `harmonics.track_fundamental`.
+            Firing frequency, Hz: revolutions per second times half the number of cylinders (four-stroke), or
+            the last value of `track_fundamental`.
         tolerance : float
-            How wrong it may be, as a share.
+            Largest relative error of it, in [0, 0.5].
 
         Raises
         ------
         InvalidArgumentError
             Out of range, or `settings.ego_noise` is None.
+
+        Examples
+        --------
+        >>> from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+        >>> array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
+        >>> front_end = FrontEnd(array, 8000, FrontEndSettings(ego_noise=EgoNoiseSettings()))
+        >>> front_end.follow_engine(60.0)
         """
         engine = self._ego_noise().engine
         if engine is not None:
@@ -183,17 +210,17 @@ class FrontEnd:
         except (TypeError, ValueError) as error:
             raise InvalidArgumentError(f"block: expected numbers, got {type(block).__name__}") from error
         check_shape("block", samples.shape, (None, self.array.n_microphones))
-        # One pass without a copy: a sum of squares this small holds no NaN, no infinity and nothing too loud.
+        # One pass without a copy: a finite sum of squares below the limit holds no NaN and no infinity.
         flat = samples.ravel()
         with np.errstate(over="ignore", invalid="ignore"):
             energy = float(flat @ flat)
         if not energy <= _LOUDEST**2:
-            self._refuse_unless_quiet(samples)
+            self._refuse_if_too_loud(samples)
         return samples
 
     @staticmethod
-    def _refuse_unless_quiet(samples: Float32Array) -> None:
-        # NaN compares false.
+    def _refuse_if_too_loud(samples: Float32Array) -> None:
+        # Written so that NaN, for which every comparison is false, is refused.
         loud = ~(np.abs(samples).max(axis=0) <= _LOUDEST)
         if loud.any():
             channels = np.flatnonzero(loud).tolist()
@@ -242,7 +269,7 @@ class FrontEnd:
 
     @property
     def _keep(self) -> BoolArray:
-        """Microphones that count now."""
+        """Microphones that are used in the newest hop."""
         return self._hops[-1].health.mask.keep
 
     def _srp(self, n_hops: int) -> FloatArray:
@@ -297,7 +324,8 @@ class FrontEnd:
         hops = self._last(settings.looming_hops)
         if len(hops) < settings.looming_hops:
             return NotUsable(f"needs {settings.looming_hops} hops, got {len(hops)}")
-        # The same microphones throughout: one that fails within the window makes no step.
+        # The same microphones in the whole window: one that fails within it must not look like a step of
+        # level.
         keep = self._keep if self._keep.any() else slice(None)
         energies = np.array([hop.energies for hop in hops])[:, keep].mean(axis=1)
         if energies.min() <= SILENCE:

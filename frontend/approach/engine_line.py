@@ -21,7 +21,7 @@ from .partials import Fundamental, Windows, measure_fundamental
 
 __all__ = ["HarmonicSettings", "HarmonicTrack", "track_fundamental"]
 
-# Each pass measures along the track and the slope of the one before; a fourth changes nothing visible.
+# Each pass measures along the track and the slope of the one before.
 PASSES = 3
 # Longest signal at one call: an hour at 48 kHz is 1.7e8 samples.
 MAX_SAMPLES = 200_000_000

@@ -19,7 +19,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from worldstate.ground.typing import FloatArray
 
-# Limits of the fit: a slower source has no visible S-curve, a farther one is not heard.
+# Limits of the fit: a slower source has no visible S-curve, a farther one no audible line.
 SLOWEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 0.3, 300.0
 # Starting points of the fit, because chi-squared has local minima: times of the closest approach as shares of
 # the track, and pairs of speed and range.

@@ -26,7 +26,7 @@ FEWEST_SAMPLES = 8
 # A grid of a quarter of the resolution puts the coarse peak within an eighth of it: well inside the main
 # lobe.
 ZERO_PADDING = 4
-# From an eighth of the resolution three steps reach rounding; the rest is a margin for low SNR.
+# The steps converge quadratically and end by their tolerance; this many are for a low SNR.
 STEPS = 8
 # Ridge of the 2 x 2 normal equations, which are singular for a tone at 0 Hz.
 _ROUNDING = 4.0 * float(np.finfo(np.float64).eps)

@@ -1,18 +1,15 @@
-r"""Beam power at a few directions says it at all others.
+r"""Interpolate steered power over azimuth from a few node directions.
 
 A quadratic form :math:`\sum_k a_k(\theta)^H Q_k\, a_k(\theta)` is a smooth function of the direction,
-whatever the Q_k: below the alias frequency of an array it lives in some thirty dimensions, however fine the
-grid. So many directions are computed, the rest follow by one small product.
+whatever the Q_k: below the alias frequency of an array it lies in a space of some thirty dimensions, however
+fine the grid. So it is computed at that many directions, and the others follow by one small product.
 
-The directions are chosen by a pivoted Cholesky factorisation of the kernel
+The directions are chosen by a pivoted Cholesky factorisation (N. J. Higham, "Analysis of the Cholesky
+decomposition of a semi-definite matrix", 1990) of the kernel
 
 .. math:: G(\theta, \phi) = \sum_k \big| a_k(\theta)^H a_k(\phi) \big|^2,
 
-each where the ones before foretell least, until all are foretold.
-
-References
-----------
-N. J. Higham, "Analysis of the Cholesky decomposition of a semi-definite matrix", 1990.
+each where the ones before predict the power worst, until all are predicted.
 """
 
 from dataclasses import dataclass
@@ -21,17 +18,18 @@ import numpy as np
 
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
-# What no direction's power is missed by, relative to the largest that there can be: single precision's own.
+# Largest error of the power in any direction, relative to the largest possible power: that of single
+# precision.
 _TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngularInterpolation:
-    """Directions that are computed, and how the others follow.
+    """Node directions, and the weights that give the power in all others.
 
     Examples
     --------
-    Two microphones: power is a constant and a wave, so that three directions say it all.
+    With two microphones the power is a constant plus one wave, so that three directions suffice.
 
     >>> phase = np.linspace(-1.5, 1.5, 31)
     >>> nodes = AngularInterpolation.of(np.stack([np.exp(1j * phase), np.exp(-1j * phase)])[None])
@@ -40,18 +38,16 @@ class AngularInterpolation:
     (3, True)
     """
 
-    index: IndexArray  # shape (N,): Among all directions
-    spread: FloatArray  # shape (N, directions): Power at all directions is power at the nodes times this
+    index: IndexArray  # shape (N,): Nodes among all directions
+    spread: FloatArray  # shape (N, directions): Power in all directions is the power at the nodes times this
 
     @classmethod
     def of(cls, vectors: Complex128Array) -> "AngularInterpolation | None":
-        r"""Choose for steering vectors (bins, M, directions); None where more than half would be needed.
+        r"""Choose nodes for steering vectors (bins, M, directions); None if more than half would be needed.
 
         .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta), \qquad s = G_{NN}^{-1} G_{N\theta}
 
-        with the kernel G of the module's head and N the directions chosen.
-
-        Shapes: vectors (bins, M, directions).
+        with the kernel G above and N the nodes.
         """
         count = vectors.shape[2]
         rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)

@@ -1,9 +1,9 @@
-r"""Leaving microphones out, exactly and without new steering vectors.
+r"""Leave microphones out exactly, without new steering vectors.
 
 A whitened channel that is set to zero adds nothing to a sum over microphones, so that the beams of the whole
-array steer any part of it. What changes is the scale: with n of M microphones left, beam power is smaller by
-(n / M)^2 and the sum over pairs by n (n - 1) / (M (M - 1)). Sums are scaled back when they are made, so that
-windows may hold hops of different masks.
+array serve for any part of it. Only the scale changes: with n of M microphones, beam power is smaller by (n /
+M)^2 and the sum over pairs by n (n - 1) / (M (M - 1)). Sums are scaled back per hop, so that a window may
+hold hops with different masks.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from worldstate.ground.typing import BoolArray, Complex64Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelMask:
-    """Which microphones count.
+    """Microphones that are used.
 
     Examples
     --------
@@ -28,17 +28,17 @@ class ChannelMask:
 
     @classmethod
     def all_of(cls, n_channels: int) -> "ChannelMask":
-        """Leave none out."""
+        """Return the mask that keeps all microphones."""
         return cls(np.ones(n_channels, bool))
 
     @property
     def n_kept(self) -> int:
-        """Number of microphones left."""
+        """Number n of microphones kept."""
         return int(np.count_nonzero(self.keep))
 
     @property
     def is_whole(self) -> bool:
-        """Whether all are left."""
+        """Whether all microphones are kept."""
         return bool(self.keep.all())
 
     @property
@@ -53,26 +53,12 @@ class ChannelMask:
         return whole * (whole - 1) / (kept * (kept - 1))
 
     def silence(self, spectra: Complex64Array) -> None:
-        """Set the channels left out to zero in place, (..., M).
-
-        Shapes: spectra (..., M).
-        """
-        # ``X_m = 0`` where microphone m does not count.
+        """Set the channels left out of spectra (..., M) to zero, in place."""
         if not self.is_whole:
             spectra[..., ~self.keep] = 0.0
 
     def cross(self, matrices: Complex64Array) -> Complex64Array:
-        """Return cross-spectra (..., M, M) without the channels left out; the same array if there are none.
-
-        Shapes: matrices (..., M, M).
-
-        Examples
-        --------
-        >>> ChannelMask(np.array([True, False])).cross(np.ones((1, 2, 2), np.complex64))[0].real
-        array([[1., 0.],
-               [0., 0.]], dtype=float32)
-        """
-        # ``R'_ij = k_i k_j R_ij`` with k one for the channels kept and else zero.
+        """Return cross-spectra ``R'_ij = k_i k_j R_ij``, (..., M, M); the same array if all are kept."""
         if self.is_whole:
             return matrices
         return np.asarray(matrices * (self.keep[:, None] & self.keep))

@@ -1,8 +1,8 @@
-r"""The other direction that an array cannot tell from a bearing: said, not hidden.
+r"""Mirror direction of a planar or linear array (front-back ambiguity).
 
-A planar array hears u and its mirror image in the array plane alike, u' = u - 2 (u . n) n with the unit
-normal n; a linear one with axis a hears the whole cone around it, which meets the horizontal plane again at
-u' = 2 (u . a) a - u if the axis is level.
+A planar array has the same delays for u and for its mirror image in the array plane, u' = u - 2 (u . n) n
+with the unit normal n; a linear one with axis a has the same delays on the whole cone around it, which meets
+the horizontal plane again at u' = 2 (u . a) a - u if the axis is level.
 """
 
 import math
@@ -14,19 +14,15 @@ from worldstate.ground.values import NotUsable
 
 from .microphone_array import MicrophoneArray
 
-# Horizontal part of an axis below which a cone holds every azimuth.
+# Horizontal part of a unit axis below which it is vertical and its cone holds every azimuth: rounding of the
+# SVD.
 _LEVEL = 1e-6
 
 
 def mirror_reflection(array: MicrophoneArray) -> FloatArray | NotUsable:
-    r"""Matrix that turns a horizontal direction into its twin, shape (3, 3).
+    r"""Return the matrix that maps a horizontal direction to its mirror direction, shape (3, 3).
 
     .. math:: T = I - 2 n n^T \text{ (planar)}, \qquad T = 2 a a^T - I \text{ (linear, level)}
-
-    References
-    ----------
-    A. S. Householder, "Unitary triangularization of a nonsymmetric matrix", J. ACM 5, 1958 (the reflection).
-    Derived here: delays hold u in the products p . u only, which T leaves alone.
 
     Examples
     --------
@@ -36,23 +32,23 @@ def mirror_reflection(array: MicrophoneArray) -> FloatArray | NotUsable:
            [ 0.,  1.,  0.],
            [ 0.,  0.,  1.]])
     """
-    # Not usable where there is none in another azimuth, or where every azimuth is one.
+    # Delays depend on u through the products p . u only, which T preserves.
     if array.ambiguity == "none":
-        return NotUsable("a three-dimensional array has no twin directions")
+        return NotUsable("a three-dimensional array has no mirror direction")
     if array.ambiguity == "up-down":
-        return NotUsable("the twin is up or down, at the same azimuth")
+        return NotUsable("the mirror direction is up or down, at the same azimuth")
     axes = np.linalg.svd(array.centred_m, full_matrices=True)[2]
     if array.ambiguity != "cone":
         normal = axes[2]
         return np.asarray(np.eye(3) - 2.0 * np.outer(normal, normal))
     axis = axes[0]
     if math.hypot(axis[0], axis[1]) < _LEVEL:
-        return NotUsable("a vertical line of microphones hears every azimuth alike")
+        return NotUsable("a vertical line of microphones cannot distinguish azimuths")
     return np.asarray(2.0 * np.outer(axis, axis) - np.eye(3))
 
 
 def mirror_azimuth_rad(reflection: FloatArray | NotUsable, azimuth_rad: float) -> float | NotUsable:
-    r"""Azimuth that sounds the same as this one, in (-pi, pi].
+    r"""Return the azimuth of the mirror direction, in (-pi, pi].
 
     .. math:: \theta' = \mathrm{atan2}(u'_y, u'_x), \qquad u' = T\, (\cos\theta, \sin\theta, 0)^T
 

@@ -1,4 +1,4 @@
-"""Pure geometry of microphones and far-field directions, in `base_link` axes (x forward, y left, z up)."""
+"""Geometry of microphones and far-field directions, in `base_link` axes (x forward, y left, z up)."""
 
 from typing import Literal
 
@@ -8,18 +8,19 @@ from numpy.typing import ArrayLike
 from worldstate.ground.typing import FloatArray
 
 SPEED_OF_SOUND_M_S = 343.0
-"""In dry air at 20 degrees Celsius; the value that pyroomacoustics assumes."""
+"""Speed of sound in dry air at 20 degrees Celsius."""
 
 Ambiguity = Literal["cone", "front-back", "up-down", "mirror", "none"]
 
-# Spread across an axis, relative to the largest, below which an array counts as flat there.
+# Extent along a principal axis, relative to the largest, below which an array is flat: a millimetre in a
+# metre, the accuracy of mounting.
 _FLAT = 1e-3
-# Direction cosine above which a normal counts as lying along an axis of the vehicle.
+# Direction cosine, 10 degrees, above which a normal points along an axis of the vehicle.
 _ALONG_AXIS = 0.985
 
 
 def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) -> FloatArray:
-    r"""Give unit vectors that point towards far-field sources.
+    r"""Return unit vectors towards far-field sources, shape (..., 3).
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
 
@@ -37,7 +38,7 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
 
 
 def nearest_spacings_m(positions_m: FloatArray) -> FloatArray:
-    r"""Distance from every microphone to its nearest neighbour, metres.
+    r"""Return the distance from every microphone to its nearest neighbour, metres.
 
     .. math:: d_m = \min_{j \ne m} \|p_m - p_j\|
 
@@ -54,7 +55,7 @@ def nearest_spacings_m(positions_m: FloatArray) -> FloatArray:
 
 
 def ambiguity(positions_m: FloatArray) -> Ambiguity:
-    r"""Directions that an array of this shape cannot tell apart, whatever the algorithm.
+    r"""Return which directions an array of this shape cannot distinguish, whatever the algorithm.
 
     With the singular values :math:`s_1 \ge s_2 \ge s_3` of the centred positions and n the direction of the
     last, an array is linear for :math:`s_2 < 10^{-3} s_1` and else planar for :math:`s_3 < 10^{-3} s_1`,
@@ -67,10 +68,10 @@ def ambiguity(positions_m: FloatArray) -> Ambiguity:
     >>> ambiguity(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]))
     'front-back'
     """
-    # A linear array knows only the angle to its axis (``cone``). A planar one cannot tell a direction from
-    # its mirror image in its own plane: ``front-back`` if it stands across the road, ``up-down`` if it lies
-    # flat, ``mirror`` if it is tilted or faces sideways. A three-dimensional array has no such twin
-    # (``none``).
+    # A linear array measures the angle to its axis only (``cone``). A planar one does not distinguish a
+    # direction from its mirror image in the array plane: ``front-back`` if the plane is across the road,
+    # ``up-down`` if it is horizontal, ``mirror`` if it is tilted or faces sideways. A three-dimensional array
+    # has no mirror direction.
     spread, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=True)[1:]
     thickness = np.pad(spread, (0, 3 - len(spread)))
     if thickness[1] < _FLAT * thickness[0]:

@@ -1,4 +1,4 @@
-"""The microphone array: where the microphones are and what their places allow."""
+"""The microphone array: positions, delays, steering vectors and what they allow."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,12 @@ from worldstate.ground.typing import Complex128Array, FloatArray
 
 from .geometry import SPEED_OF_SOUND_M_S, Ambiguity, ambiguity, direction_vectors, nearest_spacings_m
 
+# Covariances grow with the square: 40 bins of 1024 channels take 0.3 GB.
 MAX_MICROPHONES = 1024
 
-# Our own placing of 56 microphones: 7 staggered rows of 8, every place moved off its row by a
-# low-discrepancy sequence (against grating lobes), then the columns pulled in by a power. The constants
-# were searched for once; the tests hold the result.
+# Our own placement of 56 microphones: 7 staggered rows of 8, each moved off its row by a low-discrepancy
+# sequence (against grating lobes), then the columns drawn in by a power. The constants come from one search;
+# the tests hold the result.
 _COLUMNS, _ROWS = 8, 7
 _WIDTH_M, _HEIGHT_M = 0.78, 0.65
 _JITTER = 0.57
@@ -24,7 +25,7 @@ _COLUMN_POWER = 1.013
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MicrophoneArray:
-    r"""Microphones at fixed places on the vehicle.
+    r"""Microphones at fixed positions on the vehicle.
 
     A plane wave from direction u reaches microphone m at
 
@@ -41,7 +42,7 @@ class MicrophoneArray:
     Raises
     ------
     InvalidArgumentError
-        On another shape, numbers that are not finite, or two microphones in one place.
+        On another shape, numbers that are not finite, or two microphones in one position.
 
     Examples
     --------
@@ -64,7 +65,7 @@ class MicrophoneArray:
         if spacings.min() == 0.0:
             coincident = np.flatnonzero(spacings == 0.0).tolist()
             raise InvalidArgumentError(
-                f"positions_m: expected different places, got microphones {coincident} in one"
+                f"positions_m: expected different positions, got microphones {coincident} in one"
             )
         positions.flags.writeable = False
         object.__setattr__(self, "positions_m", positions)
@@ -95,14 +96,14 @@ class MicrophoneArray:
         return float(nearest_spacings_m(self.positions_m).mean())
 
     def alias_hz(self, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S) -> float:
-        """Frequency up to which the mean spacing d samples every direction without aliasing, Hz.
+        """Return the frequency to which the mean spacing d samples every direction without aliasing, Hz.
 
         .. math:: f = c / (2 d)
 
         Parameters
         ----------
         speed_of_sound_m_s : float
-            c.
+            c, m/s.
 
         Returns
         -------
@@ -123,7 +124,7 @@ class MicrophoneArray:
 
     @property
     def ambiguity(self) -> Ambiguity:
-        """Directions that no algorithm can tell apart here: see `ambiguity`."""
+        """Kind of directions that the array cannot distinguish: see `geometry.ambiguity`."""
         return ambiguity(self.positions_m)
 
     def delays_s(
@@ -132,16 +133,16 @@ class MicrophoneArray:
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> FloatArray:
-        r"""Far-field arrival time at every microphone relative to the origin, seconds, shape (..., M).
+        r"""Return the far-field arrival time at every microphone relative to the origin, seconds.
 
         .. math:: \tau_m(\theta, \phi) = -p_m^T u(\theta, \phi) / c
 
         Parameters
         ----------
         azimuths_rad, elevations_rad : array_like, broadcast together
-            Azimuth, left positive, and elevation, up positive.
+            Azimuth, left positive, and elevation, up positive, radians.
         speed_of_sound_m_s : float
-            c.
+            c, m/s.
 
         Returns
         -------
@@ -167,16 +168,18 @@ class MicrophoneArray:
         elevations_rad: ArrayLike = 0.0,
         speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
     ) -> Complex128Array:
-        r"""Steering vectors :math:`a_m = e^{-j 2 \pi f \tau_m}`, shape (frequencies, M, directions).
+        r"""Return steering vectors at given frequencies and directions.
+
+        .. math:: a_m(f, \theta, \phi) = e^{-j 2 \pi f \tau_m(\theta, \phi)}
 
         Parameters
         ----------
         frequencies_hz : array_like, shape (F,)
             Hz.
         azimuths_rad, elevations_rad : array_like, broadcast to shape (D,)
-            Azimuth, left positive, and elevation, up positive.
+            Azimuth, left positive, and elevation, up positive, radians.
         speed_of_sound_m_s : float
-            c.
+            c, m/s.
 
         Returns
         -------
@@ -198,10 +201,11 @@ class MicrophoneArray:
 
 
 def roof_array_56() -> MicrophoneArray:
-    """Build our own roof array: 56 microphones in the y-z plane, across the vehicle, centred at the origin.
+    """Return a roof array of 56 microphones in the y-z plane, across the vehicle, centred at the origin.
 
     It has the dimensions of the array in the paper (section IV): aperture 0.78 m x 0.65 m, S_xx = 3.03 m^2,
-    mean nearest spacing 8.8 cm, hence alias-free to about 1.9 kHz. The places themselves are ours.
+    mean nearest spacing 8.8 cm, hence alias-free to about 1.9 kHz. The positions themselves are this
+    library's own.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Steering matrices for beams at many directions, factored where few dimensions carry them."""
+"""Steering matrices for many directions, factored where few dimensions suffice."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,7 @@ from .angular_interpolation import AngularInterpolation
 from .geometry import SPEED_OF_SOUND_M_S
 from .microphone_array import MicrophoneArray
 
-# Largest part of a steering vector, relative to its length, that the factors may miss: single precision's
-# own.
+# Largest error of a steering vector by the factors, relative to its length: that of single precision.
 _TOLERANCE = 1e-6
 
 
@@ -30,16 +29,15 @@ class Steering:
     (3, True)
     """
 
-    # Beams across azimuth at one elevation, below the alias frequency, span few of the M dimensions (15 to 20
-    # of 56), so that B (M x r) and C (r x directions) cost a third of W = B C. The rest is cut where no
-    # steering vector is missed by more than 1e-6 of its length: nothing that single precision would show.
+    # Beams over azimuth at one elevation, below the alias frequency, span few of the M dimensions (15 to 20
+    # of 56), so that B (M x r) and C (r x directions) cost a third of W = B C.
 
-    # shape (bins, M, r): Orthonormal columns; None where the factors would not be thinner than the weights.
+    # shape (bins, M, r): Orthonormal columns; None if the factors would be no smaller than the weights.
     basis: Complex64Array | None
     weights: Complex64Array  # shape (bins, r or M, directions): C and its conjugate
     conjugate: Complex64Array
-    # The same beams at the few directions that say the power at all the others; None where there are no
-    # such few.
+    # The same beams at the node directions from which the power in all others is interpolated; None if that
+    # does not save work.
     nodes: "NodeBeams | None" = None
 
     @classmethod
@@ -56,11 +54,6 @@ class Steering:
         .. math:: W_k = \overline{A_k}, \qquad W_k \approx B_k C_k, \quad C_k = B_k^H W_k
 
         Shapes: frequencies_hz (bins,), azimuths_rad, elevations_rad (directions,).
-
-        References
-        ----------
-        H. L. Van Trees, *Optimum Array Processing*, 2002, section 2.2 (steering vectors); the factors by
-        Gram-Schmidt with pivoting, cut at the precision of complex64.
         """
         centred = MicrophoneArray(array.centred_m)
         weights = centred.steering(frequencies_hz, azimuths_rad, elevations_rad, speed_of_sound_m_s).conj()
@@ -82,18 +75,13 @@ class Steering:
         r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
 
         .. math:: Q_k = \sum_t (B_k^T x_{t,k}) (B_k^T x_{t,k})^H
-
-        Shapes: spectra (frames, bins, M).
         """
         by_bin = spectra.transpose(1, 0, 2)
         projected = by_bin if self.basis is None else by_bin @ self.basis
         return cross_spectra(projected)
 
     def compress(self, matrices: Complex64Array) -> Complex64Array:
-        r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r).
-
-        Shapes: matrices (bins, M, M).
-        """
+        r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r)."""
         if self.basis is None:
             return matrices
         return np.asarray(self.basis.transpose(0, 2, 1) @ (matrices @ self.basis.conj()))
@@ -102,8 +90,6 @@ class Steering:
         r"""Sum quadratic forms of the beams over bins, (bins, r, r) -> (directions,).
 
         .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
-
-        Shapes: matrices (bins, r, r).
         """
         beams = self if self.nodes is None else self.nodes
         products = matrices @ beams.conjugate
@@ -112,11 +98,9 @@ class Steering:
         return total if self.nodes is None else total @ self.nodes.spread
 
     def power_within(self, vectors: Complex64Array) -> FloatArray:
-        r"""Power within columns (bins, M, k), -> (bins, directions).
+        r"""Return the power of steering vectors within orthonormal columns (bins, M, k): (bins, directions).
 
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
-
-        Shapes: vectors (bins, M, k).
         """
         beams = self if self.nodes is None else self.nodes
         rows = vectors.transpose(0, 2, 1)
@@ -125,11 +109,9 @@ class Steering:
         return np.asarray(power if self.nodes is None else power @ self.nodes.spread)
 
     def squared_lengths(self, keep: BoolArray) -> FloatArray:
-        r"""Squared length of steering vectors over the microphones kept (M,), (bins, directions).
+        r"""Return the squared length of steering vectors over the microphones kept, (bins, directions).
 
         .. math:: \|a_k(\theta)\|^2 = \sum_{m \in kept} |a_{k,m}(\theta)|^2
-
-        Shapes: keep (M,).
         """
         if self.basis is None:
             kept = self.weights[:, keep]
@@ -141,7 +123,7 @@ class Steering:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeBeams:
-    """Beams at a few directions: see `worldstate.frontend.array.angular_interpolation`.
+    """Beams at the node directions of `AngularInterpolation`.
 
     Examples
     --------
@@ -153,16 +135,11 @@ class NodeBeams:
 
     weights: Complex64Array  # shape (bins, r or M, N): C at the nodes, and its conjugate
     conjugate: Complex64Array
-    spread: FloatArray  # shape (N, directions): From power there to power everywhere
+    spread: FloatArray  # shape (N, directions): From the power at the nodes to that in all directions
 
     @classmethod
     def of(cls, weights: Complex128Array) -> "NodeBeams | None":
-        r"""Choose them for all directions (bins, r or M, directions).
-
-        .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta)
-
-        Shapes: weights (bins, r or M, directions).
-        """
+        r"""Choose nodes for weights (bins, r or M, directions); None if that saves no work."""
         nodes = AngularInterpolation.of(weights)
         if nodes is None:
             return None
@@ -171,30 +148,27 @@ class NodeBeams:
 
 
 def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:
-    """Orthonormal columns (bins, M, r) that span all weights (bins, M, directions) within the tolerance."""
-    # Gram-Schmidt with pivoting: the vector that is missed most is the next column. None if `max_rank` are
-    # not enough.
-    missed = weights.copy()
+    """Orthonormal columns (bins, M, r) that span all weights to the tolerance; None if too many."""
+    # Gram-Schmidt with pivoting: the vector with the largest remainder gives the next column.
+    remainder = weights.copy()
     columns: list[Complex128Array] = []
     limit = _TOLERANCE * np.sqrt(weights.shape[1])
     for _ in range(max_rank):
-        lengths = np.linalg.norm(missed, axis=1)
+        lengths = np.linalg.norm(remainder, axis=1)
         worst = lengths.argmax(axis=1)[:, None]
         length = np.take_along_axis(lengths, worst, axis=1)
         if length.max() < limit:
             return np.stack(columns, axis=2)
-        column = np.take_along_axis(missed, worst[:, None], axis=2)[:, :, 0]
-        # A bin that is spanned already gets a column of zeros.
+        column = np.take_along_axis(remainder, worst[:, None], axis=2)[:, :, 0]
+        # A bin that is complete gets a column of zeros.
         column = np.where(length < limit, 0.0, column / np.maximum(length, limit))
         columns.append(column)
-        missed -= column[:, :, None] * (column.conj()[:, None] @ missed)
+        remainder -= column[:, :, None] * (column.conj()[:, None] @ remainder)
     return None
 
 
 def cross_spectra(spectra: Complex64Array) -> Complex64Array:
     r"""Sum over frames :math:`R_{ij} = \sum_t x_{t,i} \overline{x_{t,j}}`, (bins, frames, M) -> (bins, M, M).
-
-    Shapes: spectra (bins, frames, M).
 
     Examples
     --------

@@ -1,7 +1,7 @@
-r"""Cramer-Rao bounds of everything the front-end estimates: the variance no unbiased estimator can beat.
+r"""Cramer-Rao bounds of what the front-end estimates: the least variance of any unbiased estimator.
 
-All follow from one line, :math:`\mathrm{var} \ge J^{-1}` with J the Fisher information. Signal-to-noise
-ratios are power ratios, not decibels.
+All follow from :math:`\mathrm{var} \ge J^{-1}` with J the Fisher information. Signal-to-noise ratios are
+power ratios, not decibels.
 """
 
 import numpy as np
@@ -12,12 +12,13 @@ from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
-# Information below this share of its largest possible value is called none.
+# Information below this share of its largest possible value is taken for zero: rounding of the inner
+# products.
 NEGLIGIBLE = 1e-12
 
 
 def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: float) -> float:
-    r"""Bound on the variance of the delay between two microphones, eq. (3).
+    r"""Return the bound on the variance of the delay between two microphones, eq. (3).
 
     .. math:: \mathrm{var}(\hat\tau) \ge \Big[2T \int_0^\infty (2\pi f)^2 \frac{C(f)}{1 - C(f)}\,df\Big]^{-1}
 
@@ -26,9 +27,9 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
 
     Parameters
     ----------
-    frequencies_hz : (bins,) float
+    frequencies_hz : array_like, shape (bins,)
         Ascending, >= 0, Hz.
-    coherence : (bins,) float
+    coherence : array_like, shape (bins,)
         Magnitude-squared coherence C, in [0, 1).
     duration_s : float
         Observation time T, seconds, > 0.
@@ -36,21 +37,19 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
     Returns
     -------
     float
-        Seconds squared; infinite where nothing is coherent.
+        Seconds squared; infinite without coherence.
 
     Raises
     ------
     InvalidArgumentError
         On wrong shapes or values out of range.
 
-    Notes
-    -----
-    Small-error bound: below a threshold SNR the peak jumps to another lobe and the variance is far larger.
+    Notes ----- A bound for small errors: below a threshold SNR the peak jumps to another lobe and the
+    variance is far larger.
 
-    References
-    ----------
-    "Evidence of Absence", eq. (3), after C. Knapp and G. C. Carter 1976 (see `gcc`) and G. C. Carter,
-    "Coherence and time delay estimation", Proc. IEEE 75, 1987.
+    References ---------- "Evidence of Absence", eq. (3), after C. Knapp and G. C. Carter, "The generalized
+    correlation method for estimation of time delay", IEEE Trans. ASSP 24, 1976, and G. C. Carter, "Coherence
+    and time delay estimation", Proc. IEEE 75, 1987.
 
     Examples
     --------
@@ -81,7 +80,7 @@ def bearing_crb_rad2(
     random_signal: bool = False,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> float:
-    r"""Bound on the variance of an azimuth, eq. (4) for any array.
+    r"""Return the bound on the variance of an azimuth, eq. (4) for any array.
 
     With u the unit vector to the source and :math:`S = \sum_m (p_m - \bar p)(p_m - \bar p)^T`,
 
@@ -94,24 +93,24 @@ def bearing_crb_rad2(
 
     Parameters
     ----------
-    positions_m : (M, 3) float
-        Microphones in `base_link` axes, metres.
+    positions_m : array_like, shape (M, 3)
+        Microphones in `base_link` axes (x forward, y left, z up), metres.
     azimuth_rad : float
-        Of the source, left positive.
-    frequencies_hz : float or (bins,) float
-        Narrowband frequency, or several bins whose information adds.
-    snr : float or (bins,) float
+        Azimuth of the source, radians, left positive.
+    frequencies_hz : float or array_like, shape (bins,)
+        Narrowband frequency, or several bins whose information adds, Hz.
+    snr : float or array_like, shape (bins,)
         Per microphone and snapshot, power ratio, spatially white noise.
     snapshots : int
         Number N of independent snapshots per bin.
     elevation_rad : float
-        Of the source.
+        Elevation of the source, radians, up positive.
     elevation_known : bool
         False: the elevation is estimated with the azimuth, which never lowers the bound.
     random_signal : bool
         True: the unconditional bound, for a Gaussian signal, larger by 1 + 1 / (M SNR). False: the paper's.
     speed_of_sound_m_s : float
-        c.
+        c, m/s.
 
     Returns
     -------
@@ -158,7 +157,7 @@ def bearing_information(
     random_signal: bool = False,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> FloatArray:
-    r"""Fisher information of (azimuth, elevation) from an array, planar or not.
+    r"""Return the Fisher information of (azimuth, elevation), shape (2, 2).
 
     .. math:: J = \frac{8\pi^2 N}{c^2} \Big(\sum_b f_b^2\,\mathrm{SNR}_b\Big)\, D^T S D,
               \qquad D = [\dot u_\theta\ \dot u_\phi]
@@ -184,13 +183,12 @@ def bearing_information(
 
 
 def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> FloatArray:
-    r"""Bearing information relative to the array's best direction: the lateral corollary.
+    r"""Return the bearing information relative to the array's best direction.
 
     .. math:: \frac{J(\theta)}{\max_\theta J(\theta)} = \frac{\dot u^T S \dot u}{\lambda_{max}(S_{xy})}
 
-    It is :math:`\cos^2\theta` for an array across the vehicle, and vanishes at endfire. The information on
-    presence and on the radial speed does not depend on the bearing: what remains of a laterally approaching
-    source is that it is there, how fast it comes and its coarse side.
+    It is :math:`\cos^2\theta` for an array across the vehicle and vanishes at endfire; the information on
+    existence and radial speed does not depend on the bearing.
 
     Shapes: positions_m (M, 3).
 
@@ -207,7 +205,7 @@ def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> Floa
 
 
 def broadside_rad(positions_m: ArrayLike) -> float:
-    r"""Azimuth at which an array tells bearings best: where `endfire_information` is one.
+    r"""Return the azimuth with the largest bearing information.
 
     .. math:: \theta = \arg\max_\theta \dot u_\theta^T S\, \dot u_\theta
 
@@ -224,22 +222,21 @@ def broadside_rad(positions_m: ArrayLike) -> float:
 
 
 def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
-    r"""Bound on the variance of a single tone's frequency, amplitude and phase unknown.
+    r"""Return the bound on the variance of a tone's frequency, amplitude and phase unknown.
 
     .. math:: \mathrm{var}(\hat f) \ge \frac{12}{(2\pi)^2\,\eta\,N_s (N_s^2 - 1)\,T_s^2}
 
     Parameters
     ----------
     snr : float
-        :math:`\eta`, a power ratio. A real tone :math:`A\cos` in white noise of variance :math:`\sigma^2` has
-        :math:`\eta = A^2 / 2\sigma^2`. A complex one :math:`A e^{j\cdot}` has :math:`\eta = A^2 / \sigma^2`
-        with
-        :math:`\sigma^2` the variance of the real and of the imaginary part each (of Rife and Boorstyn), i.e.
-        twice its power over that of the noise.
+        :math:`\eta`, a power ratio, > 0. A real tone :math:`A\cos` in white noise of variance
+        :math:`\sigma^2` has :math:`\eta = A^2 / 2\sigma^2`. A complex one :math:`A e^{j\cdot}` has
+        :math:`\eta = A^2 / \sigma^2` with :math:`\sigma^2` the variance of the real and of the imaginary part
+        each (of Rife and Boorstyn), i.e. twice its power over that of the noise.
     samples : int
-        N_s >= 2.
+        Number of samples N_s >= 2.
     sample_rate_hz : float
-        1 / T_s.
+        Samples per second, 1 / T_s.
 
     Returns
     -------
@@ -274,18 +271,18 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
 def radial_speed_crb_m2_s2(
     frequency_variance_hz2: float, rest_frequency_hz: float, *, speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
 ) -> float:
-    r"""Variance of a radial speed read from a tone whose frequency at rest is known.
+    r"""Return the variance of a radial speed read from a tone of known frequency at rest.
 
     .. math:: \mathrm{var}(\hat v_r) = (c / f_0)^2\, \mathrm{var}(\hat f)
 
     Parameters
     ----------
     frequency_variance_hz2 : float
-        Of the received tone, Hz squared, for example `tone_crb_hz2`.
+        Variance of the received frequency, Hz squared, for example from `tone_crb_hz2`.
     rest_frequency_hz : float
-        f_0 > 0.
+        f_0 > 0, Hz.
     speed_of_sound_m_s : float
-        c.
+        c, m/s.
 
     Returns
     -------
@@ -299,11 +296,10 @@ def radial_speed_crb_m2_s2(
 
     Notes
     -----
-    The tone's own stability, not this bound, limits what one sees in a street.
+    In a street the stability of the tone itself, not this bound, limits the accuracy.
 
-    References
-    ----------
-    "Evidence of Absence", section IV.
+    References ---------- "Evidence of Absence", section IV; P. M. Morse and K. U. Ingard, *Theoretical
+    Acoustics*, 1968, section 11.2.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The bearing of the strongest source, with a standard deviation and the prominence it was read with."""
+"""Bearing of the strongest source with its standard deviation and prominence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from worldstate.ground.typing import FloatArray
 
 from .peaks import Peak, find_peaks
 
-# Prominence less one at which noise doubles the variance of a bearing.
+# Excess of the prominence over one at which noise doubles the variance of a bearing.
 _PROMINENCE_KNEE = 0.15
 # Beyond 78 degrees from broadside the law 1/cos is cut: it has no meaning within a beamwidth of endfire.
 _MIN_COSINE = 0.2
@@ -17,13 +17,7 @@ _MIN_COSINE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class AcousticBearing:
-    """Peak of a spatial spectrum as a measurement.
-
-    Examples
-    --------
-    >>> AcousticBearing(0.3, 0.06, 1.4).std_rad
-    0.06
-    """
+    """Peak of a spatial spectrum as a measurement."""
 
     azimuth_rad: float  # Left positive
     std_rad: float  # Standard deviation
@@ -45,9 +39,9 @@ def bearing_std_rad(
     >>> np.degrees(sigma).round(1)
     array([ 3.4,  6.8, 10.8])
     """
-    # sigma_0 is what a prominent line-of-sight source shows on the road; the cosine is the geometry of eq.
-    # (4); the root lets the prominence rho fade into ignorance, which is uniform over the searched
-    # span Delta. An empirical model, not a bound.
+    # An empirical model, not a bound: sigma_0 is measured on prominent line-of-sight sources, the cosine is
+    # the geometry of eq. (4), and with falling prominence the error becomes uniform over the searched span
+    # Delta.
     uniform = span_rad / np.sqrt(12.0)
     excess = prominence - 1.0
     if excess <= 0.0:
@@ -59,7 +53,7 @@ def bearing_std_rad(
 def strongest_bearing(
     spectrum: FloatArray, azimuths_rad: FloatArray, broadside_std_rad: float
 ) -> AcousticBearing:
-    r"""Read the highest peak of a spatial spectrum; in silence the middle, with the span's uncertainty.
+    r"""Return the highest peak of a spectrum as a bearing; in silence the middle with the span's uncertainty.
 
     .. math:: \hat\theta = \arg\max_\theta P(\theta), \qquad \rho = P(\hat\theta) / \mathrm{median}_\theta P
 
@@ -79,17 +73,7 @@ def strongest_bearing(
 
 
 def bearing_of(peaks: Sequence[Peak], azimuths_rad: FloatArray, broadside_std_rad: float) -> AcousticBearing:
-    """Take the first of the peaks that were found on a grid, highest first, for a bearing.
-
-    Shapes: azimuths_rad (A,).
-
-    Examples
-    --------
-    >>> bearing_of([Peak(0.3, 0.5, 2.0)], np.linspace(-1.5, 1.5, 31), 0.06).prominence
-    2.0
-    """
-    # ``theta = theta_1`` with ``sigma = bearing_std_rad(theta_1, rho_1)``; in silence ``theta = (first +
-    # last) / 2`` with ``sigma = span / sqrt(12)``.
+    """Return the first of the peaks of a grid as a bearing; the middle of the grid if there is none."""
     span = float(azimuths_rad[-1] - azimuths_rad[0])
     if not peaks:
         middle = float(0.5 * (azimuths_rad[0] + azimuths_rad[-1]))

@@ -1,21 +1,12 @@
-r"""The published 60-value feature: phase-transformed pair sums in two segments and thirty azimuths.
+r"""The published 60-value feature: pair sums after the phase transform, two segments x thirty azimuths.
 
 .. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
           \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta) \Big|,
           \qquad Z = X / |X|
 
 over the T_s frames of segment s, K bins of 50-1500 Hz and the P = M (M - 1) / 2 pairs: the modulus of a
-complex sum, the diagonal left out, between 0 and 1. The released features of Schulz et al. were made in
-this form; later releases of the same library return another scale. The sum is not real, so that its modulus
-depends (by about one per cent) on the order of the microphones, which is the order of the array file.
-
-Azimuths run from -90 to 90 degrees counted to the RIGHT, as in that data: index 0 of each segment is the
-far left, +90 degrees in this library's own convention.
-
-References
-----------
-Y. Schulz, A. Mattar, T. Hehn and J. Kooij, Hearing what you cannot see: acoustic vehicle detection around
-corners, IEEE Robotics and Automation Letters, 2021.
+complex sum without the diagonal, between 0 and 1. Azimuths run from -90 to 90 degrees counted to the RIGHT,
+as in the released data: index 0 of each segment is +90 degrees, the far left, in this library's convention.
 """
 
 from collections.abc import Sequence
@@ -39,6 +30,10 @@ FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
 """The published azimuths in this library's convention (left positive), in the published order."""
 FEATURE_AZIMUTHS_RAD.flags.writeable = False
 
+# The values of the released data. The released features were made with pyroomacoustics 0.3.1, whose sum is
+# not real: later releases of it return another scale, and a classifier fed with that transfers worse. The
+# modulus of the complex sum depends, by about one per cent, on the order of the microphones, which is that of
+# the array file.
 FEATURE_BAND_HZ = (50.0, 1500.0)
 FEATURE_NFFT = 512
 FEATURE_SEGMENTS = 2
@@ -51,7 +46,7 @@ def feature_steering(
     nfft: int = FEATURE_NFFT,
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
 ) -> Steering:
-    r"""Beams at the thirty published azimuths.
+    r"""Return the beams at the thirty published azimuths.
 
     .. math:: w_k(\theta_i) = \overline{a_k(\theta_i)}, \qquad \theta_i = 90^\circ - i\, 180^\circ / 29
 
@@ -65,29 +60,20 @@ def feature_steering(
 
 
 def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
-    r"""Complex sum over frames, bins and microphone pairs i < j: what running sums are made of.
+    r"""Return the complex sum over frames, bins and microphone pairs i < j.
 
     .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
               \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta)
 
     Shapes: whitened (frames, bins, M).
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array.steering import Steering
-    >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0])
-    >>> pair_sum(np.array([[[1.0, 1j]]], np.complex64), steering).round(3)
-    array([0.-1.j])
     """
     return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
 
 
 def pair_sum_of(matrices: Complex64Array, steering: Steering) -> Complex128Array:
-    r"""Complex sum over microphone pairs i < j of cross-spectra (bins, M, M) that are at hand already.
+    r"""Return the complex sum over microphone pairs i < j from cross-spectra (bins, M, M).
 
     .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
-
-    Shapes: matrices (bins, M, M).
 
     Examples
     --------
@@ -103,7 +89,7 @@ def pair_sum_of(matrices: Complex64Array, steering: Steering) -> Complex128Array
 def segment_feature(
     sums: Sequence[Complex128Array], n_frames: int, n_bins: int, n_microphones: int
 ) -> FloatArray:
-    r"""Modulus of summed pair sums, per frame, bin and pair.
+    r"""Return the modulus of summed pair sums, per frame, bin and pair.
 
     .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_s S_s(\theta) \Big|, \qquad P = M (M - 1) / 2
 
@@ -119,7 +105,7 @@ def segment_feature(
 
 
 def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float) -> FloatArray:
-    r"""Compute the feature of one whole window in the published way, its zero-padded edge frames included.
+    r"""Compute the published feature of one window, with its zero-padded edge frames as in the released data.
 
     .. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
               \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta) \Big|
@@ -129,7 +115,7 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     window : array_like, shape (n, M)
         About one second of sound, any unit; n >= 512.
     array : MicrophoneArray
-        In the order of the channels.
+        One microphone a channel, in the order of the channels.
     sample_rate_hz : float
         Samples per second.
 
@@ -143,9 +129,8 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     InvalidArgumentError
         On another shape, a window shorter than a frame, NaN or infinity.
 
-    References
-    ----------
-    Y. Schulz, A. Mattar, T. Hehn and J. Kooij 2021: see `worldstate.frontend.direction.feature`.
+    References ---------- Y. Schulz, A. Mattar, T. Hehn and J. Kooij, "Hearing what you cannot see: acoustic
+    vehicle detection around corners", IEEE Robotics and Automation Letters 6, 2021.
 
     Examples
     --------

@@ -3,8 +3,7 @@ r"""Prominence gating: a bearing is kept where its peak stands out, which trades
 .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
           e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
 
-over n bearings with peak-to-median ratios rho_i and errors epsilon_i. `AcousticSettings.min_prominence` of
-the acoustic adapter is such a threshold.
+over n bearings with peak-to-median ratios rho_i and errors epsilon_i.
 """
 
 from dataclasses import dataclass
@@ -20,7 +19,10 @@ from worldstate.ground.values import NotUsable, wrap_angle
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatingCurve:
-    """What thresholds on prominence do, from keeping all to keeping few.
+    r"""Coverage and median error of bearings over the threshold on their prominence.
+
+    .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
+              e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
 
     Parameters
     ----------
@@ -29,7 +31,7 @@ class GatingCurve:
     coverage : ndarray, shape (T,)
         Share of the bearings kept, in (0, 1].
     median_error_rad : ndarray, shape (T,)
-        Median of the absolute errors of these.
+        Median absolute error of the bearings kept, radians.
 
     Examples
     --------
@@ -43,7 +45,7 @@ class GatingCurve:
     median_error_rad: FloatArray
 
     def threshold_for(self, median_error_rad: float) -> float | NotUsable:
-        r"""Return the lowest threshold from which on the median error stays within the given one.
+        r"""Return the lowest threshold from which on the median error stays within a limit.
 
         .. math:: \rho^* = \min\{\rho_0 : e(\rho) \le e_{max} \text{ for all } \rho \ge \rho_0\}
 
@@ -55,7 +57,7 @@ class GatingCurve:
         Returns
         -------
         float or NotUsable
-            A prominence.
+            Peak-to-median ratio; not usable if no threshold keeps the limit.
 
         Examples
         --------
@@ -100,7 +102,7 @@ class GatingCurve:
 
 
 def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int = 200) -> GatingCurve:
-    r"""Trade coverage for accuracy on bearings whose errors are known.
+    r"""Compute coverage and median error over the prominence threshold from bearings with known errors.
 
     .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
               e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}

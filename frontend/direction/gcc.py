@@ -5,12 +5,9 @@ The weighted cross-correlation of a pair (i, j) over the observed bins is
 .. math:: R_{ij}(\tau) = \mathrm{Re} \sum_f \Psi(f)\, G_{ij}(f)\, e^{j 2\pi f \tau},
           \qquad G_{ij}(f) = \langle X_i X_j^* \rangle_{frames}
 
-and peaks at the delay of microphone i after microphone j. The sum is the band-limited interpolation of
-itself: its derivatives are known in closed form, so the peak is found between samples by Newton steps, not by
-a parabola.
-
-Source: C. Knapp and G. C. Carter, "The generalized correlation method for estimation of time delay", IEEE
-Trans. ASSP 24, 1976.
+with its maximum at the delay of microphone i after microphone j. The sum is band-limited and its derivatives
+are known in closed form, so that Newton steps find the peak between lags; a parabola through three lags is
+biased.
 """
 
 from dataclasses import dataclass
@@ -29,6 +26,7 @@ WEIGHTINGS: tuple[Weighting, ...] = ("none", "phat", "scot", "ml")
 
 # Lags per period of the highest frequency: the nearest one is then pi/8 rad from the peak at most.
 LAGS_PER_PERIOD = 8
+# Newton steps converge quadratically from there.
 NEWTON_STEPS = 4
 # An estimated coherence of exactly one would weigh its bin infinitely.
 LARGEST_COHERENCE = 1.0 - 1e-6
@@ -36,15 +34,17 @@ LARGEST_COHERENCE = 1.0 - 1e-6
 
 @dataclass(frozen=True, slots=True)
 class PairDelays:
-    """Delays of all asked pairs.
+    r"""Delays of microphone pairs.
+
+    .. math:: \hat\tau_{ij} = \arg\max_\tau R_{ij}(\tau)
 
     Parameters
     ----------
-    pairs : (P, 2) int
-        Microphone indices (i, j).
-    delay_s : (P,) float
+    pairs : ndarray of int, shape (P, 2)
+        Microphone indices (i, j), from 0.
+    delay_s : ndarray, shape (P,)
         Arrival at i minus arrival at j, seconds.
-    peak : (P,) float
+    peak : ndarray, shape (P,)
         Height of the peak over its largest possible value, <= 1: near one for a single coherent source.
 
     Examples
@@ -103,7 +103,7 @@ def gcc_delays(
     pairs: ArrayLike | None = None,
     weighting: Weighting = "phat",
 ) -> PairDelays:
-    r"""Estimate the delay of every pair, sub-sample, over the bins given.
+    r"""Estimate the delay of every pair, between samples, by generalised cross-correlation.
 
     .. math:: \hat\tau_{ij} = \arg\max_{|\tau| \le \tau_{max}}
               \mathrm{Re} \sum_f \Psi(f)\, G_{ij}(f)\, e^{j 2\pi f \tau}
@@ -111,20 +111,20 @@ def gcc_delays(
     Cross-spectra are averaged over frames first and weighted afterwards:
 
     - ``none``: :math:`\Psi = 1`;
-    - ``phat``: :math:`1 / |G_{ij}|`, whitens; with a flat coherence it is maximum likelihood;
+    - ``phat``: :math:`1 / |G_{ij}|`; with a flat coherence it is maximum likelihood;
     - ``scot``: :math:`1 / \sqrt{G_{ii} G_{jj}}`;
     - ``ml``: :math:`C / (|G_{ij}| (1 - C))` of Hannan and Thomson, with the coherence estimated from the same
       frames.
 
     Parameters
     ----------
-    spectra : (frames, bins, M) complex
+    spectra : array_like of complex, shape (frames, bins, M)
         STFT of the microphones, convention e^{-j 2 pi f t}.
-    frequencies_hz : (bins,) float
+    frequencies_hz : array_like, shape (bins,)
         Centre of each bin, Hz, ascending.
-    max_delay_s : float or (P,) float
+    max_delay_s : float or array_like, shape (P,)
         Largest delay to search, seconds; for microphones at distance d this is d / c.
-    pairs : (P, 2) int, optional
+    pairs : array_like of int, shape (P, 2), optional
         Microphone indices; every pair i < j if not given.
     weighting : {"phat", "none", "scot", "ml"}
         As above.
@@ -140,9 +140,8 @@ def gcc_delays(
         On wrong shapes or values, an unknown weighting, ``ml`` with a single frame, or a search range in
         which equally spaced bins repeat themselves (max_delay_s >= 1 / (2 bin spacing)).
 
-    References
-    ----------
-    C. Knapp and G. C. Carter 1976, table I (the weightings): see `worldstate.frontend.direction.gcc`.
+    References ---------- C. Knapp and G. C. Carter, "The generalized correlation method for estimation of
+    time delay", IEEE Trans. ASSP 24, 1976, table I (the weightings).
 
     Examples
     --------
@@ -215,7 +214,7 @@ def _newton_step(cross: ComplexArray, omega: FloatArray, delay: FloatArray) -> F
     steered = cross * np.exp(1j * delay[:, None] * omega)
     slope = -(steered.imag @ omega)
     curvature = -(steered.real @ omega**2)
-    # Outside the concave part of the peak a Newton step would lead away from it.
+    # Outside the concave part of the peak a Newton step would move away from it.
     step = np.divide(slope, curvature, out=np.zeros_like(delay), where=curvature < 0)
     return np.asarray(delay - step)
 

@@ -1,14 +1,13 @@
-r"""Wideband MUSIC on any steering set.
+r"""Wideband MUSIC for any set of steering vectors.
 
-In each bin the covariance of the microphones is split into k signal eigenvectors E_s and the rest; a
-direction is scored by how little of its steering vector a falls outside the signal subspace,
+In each bin the covariance of the microphones is split into k signal eigenvectors E_s and the noise subspace;
+the spectrum is the reciprocal of the part of a steering vector a outside the signal subspace,
 
 .. math::
     P_b(\theta) = \frac{1}{a_b^H (I - E_s E_s^H) a_b}, \qquad
     P(\theta) = \frac1B \sum_b w_b P_b(\theta),
 
-with w_b = 1, or 1 / max P_b so that every bin counts alike. Source: R. O. Schmidt, "Multiple emitter location
-and signal parameter estimation", IEEE Trans. AP 34, 1986.
+with w_b = 1, or 1 / max P_b so that every bin has the same weight.
 """
 
 from dataclasses import dataclass
@@ -23,13 +22,7 @@ from worldstate.ground.typing import ComplexArray, FloatArray, RealArray
 
 @dataclass(frozen=True, slots=True)
 class Subspace:
-    """Signal subspace of every bin.
-
-    Examples
-    --------
-    >>> Subspace(np.array([[[0.0], [1.0]]]), np.array([[5.0]])).vectors.shape
-    (1, 2, 1)
-    """
+    """Signal subspace of every bin."""
 
     vectors: ComplexArray  # Orthonormal columns, strongest last
     eigenvalues: RealArray  # Power along them, ascending
@@ -51,7 +44,7 @@ def covariance(spectra: ArrayLike) -> ComplexArray:
 
 
 def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
-    r"""Signal subspace straight from frames, by the smaller of two eigenproblems.
+    r"""Return the signal subspace from frames, by the smaller of two eigenproblems.
 
     With fewer frames T than microphones M the non-zero eigenvalues of :math:`X X^H / T` (M x M) are those of
     the Gram matrix :math:`X^H X / T` (T x T), and :math:`E_s = X V \Lambda^{-1/2} / \sqrt T`: exact, and (M /
@@ -83,7 +76,7 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
 
 
 def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
-    r"""Signal subspace of given covariances by a full eigendecomposition.
+    r"""Return the signal subspace of given covariances by a full eigendecomposition.
 
     .. math:: R\, e_i = \lambda_i e_i, \quad \lambda_i \le \lambda_{i+1}, \qquad E_s = [e_{M-k+1} \dots e_M]
 
@@ -99,25 +92,26 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
 
 
 def music_spectrum(subspace: Subspace, steering: ArrayLike, *, normalised: bool = False) -> FloatArray:
-    r"""Score every direction of a steering set, combined over bins.
+    r"""Compute the MUSIC spectrum of a set of steering vectors, averaged over bins.
 
     .. math:: P(\theta) = \frac1B \sum_b \frac{w_b}{\|a_b\|^2 - \|E_s^H a_b\|^2}
 
     Parameters
     ----------
     subspace : Subspace
-        Of the same bins and microphones.
-    steering : (bins, M, D) complex
+        Signal subspace of the same bins and microphones.
+    steering : array_like of complex, shape (bins, M, D)
         :math:`a_{bm}(\theta) = e^{+j 2\pi f_b\, u(\theta) \cdot p_m / c}` for a plane wave from direction u,
-        so that X = S a with the STFT convention e^{-j 2 pi f t}. Any other response will do.
+        so that X = S a with the STFT convention e^{-j 2 pi f t}; or any measured response.
     normalised : bool
-        False: bins are averaged as they are, so that the sharpest dominate. True: each bin is divided by its
-        own maximum first. Both as pyroomacoustics does (its `frequency_normalization`, off by default).
+        False: bins are averaged as they are, so that those with the sharpest peaks dominate. True: each bin
+        is divided by its maximum first. Both as pyroomacoustics does (`frequency_normalization`, off by
+        default).
 
     Returns
     -------
-    (D,) float
-        > 0; at most 1 if normalised.
+    ndarray, shape (D,)
+        Positive, no unit; at most 1 if normalised.
 
     Raises
     ------
@@ -126,13 +120,13 @@ def music_spectrum(subspace: Subspace, steering: ArrayLike, *, normalised: bool 
 
     References
     ----------
-    R. O. Schmidt 1986: see `worldstate.frontend.direction.music`.
+    R. O. Schmidt, "Multiple emitter location and signal parameter estimation", IEEE Trans. AP 34, 1986.
 
     Examples
     --------
     >>> steering = np.exp(1j * np.outer([-1.0, 1.0], np.linspace(-1, 1, 5)))[None]
-    >>> heard = signal_subspace(np.tile(steering[..., 3], (2, 1, 1)), sources=1)
-    >>> int(np.argmax(music_spectrum(heard, steering)))
+    >>> subspace = signal_subspace(np.tile(steering[..., 3], (2, 1, 1)), sources=1)
+    >>> int(np.argmax(music_spectrum(subspace, steering)))
     3
     """
     E = subspace.vectors
@@ -142,7 +136,7 @@ def music_spectrum(subspace: Subspace, steering: ArrayLike, *, normalised: bool 
 
 def _spectrum(E: ComplexArray, A: ComplexArray, norm: RealArray, normalised: bool) -> FloatArray:
     outside = norm - _power(E.conj().transpose(0, 2, 1) @ A, axis=1)
-    # Rounding may leave a tiny or negative remainder where the steering vector lies in the subspace.
+    # Round-off may leave a tiny or negative remainder where the steering vector lies in the subspace.
     floor = np.finfo(outside.dtype).eps * norm
     score = 1.0 / np.maximum(outside, floor).astype(np.float64)
     if normalised:
@@ -169,15 +163,7 @@ def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
 
 
 def checked_covariance(covariance_matrix: ArrayLike, sources: int) -> ComplexArray:
-    """Return covariances (bins, M, M) that are finite and large enough for a subspace of this dimension.
-
-    Shapes: covariance_matrix (bins, M, M).
-
-    Examples
-    --------
-    >>> checked_covariance(np.eye(3)[None], sources=2).shape
-    (1, 3, 3)
-    """
+    """Return covariances (bins, M, M) that are finite and large enough for a subspace of this dimension."""
     R = finite_complex("covariance", covariance_matrix, (None, None, None))
     if R.shape[1] != R.shape[2]:
         raise InvalidArgumentError(f"covariance: expected shape (bins, M, M), got {R.shape}")

@@ -1,4 +1,4 @@
-"""MUSIC on a stream: the covariance of the running window, its subspace from hop to hop, a bearing."""
+"""MUSIC on a stream: the covariance of a running window, its tracked subspace, and the spectrum."""
 
 from dataclasses import dataclass
 
@@ -17,24 +17,18 @@ from .subspace import SubspaceTracker
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MusicReading:
-    """What MUSIC says of one window.
-
-    Examples
-    --------
-    >>> MusicReading(0.3, 4.0, np.ones(3)).azimuth_rad
-    0.3
-    """
+    """MUSIC spectrum of one window and its highest peak."""
 
     azimuth_rad: float  # Highest peak, left positive
     prominence: float  # Its ratio to the median of the spectrum
-    # shape (A,): Over the grid of azimuths, the highest over elevations; every bin counts alike: at most 1.
+    # shape (A,): Maximum over elevations; every bin has the same weight, so at most 1.
     spectrum: FloatArray
 
 
 class MusicStage:
-    r"""Running covariance of a window of spectra, its signal subspace, and the spectrum over a grid.
+    r"""Running covariance of a window of spectra, its signal subspace, and the MUSIC spectrum over a grid.
 
-    Fed with prewhitened spectra and read with prewhitened beams it is the generalised eigenvalue form: the
+    With prewhitened spectra and beams it is the generalised eigenvalue form: the
     eigenvectors of :math:`R^{-1/2} R_x R^{-1/2}`, R being the noise (`prewhitening`).
 
     Examples
@@ -67,11 +61,9 @@ class MusicStage:
         self._tracker = SubspaceTracker(sources)
 
     def push(self, spectra: Complex64Array, beams: Steering | None = None) -> None:
-        r"""Take the frames of a hop (frames, K, M), and their beams if they are whitened.
+        r"""Take the frames of a hop (frames, K, M), and the beams that belong to them if they are whitened.
 
         .. math:: R_k = \sum_{t \in window} x_{t,k}\, x_{t,k}^H
-
-        Shapes: spectra (frames, K, M).
         """
         by_bin = spectra.transpose(1, 0, 2)
         np.matmul(by_bin.transpose(0, 2, 1), by_bin.conj(), out=self._window.open_slot())
@@ -79,7 +71,7 @@ class MusicStage:
         self._whitened = beams
 
     def read(self, mask: ChannelMask) -> MusicReading | NotUsable:
-        r"""Score the grid by the window so far, with the microphones of a mask.
+        r"""Return the spectrum of the window over the grid, from the microphones of a mask.
 
         .. math:: P(\theta) = \frac1K \sum_k \frac{\min_{\theta'} D_k(\theta')}{D_k(\theta)}, \qquad
                   D_k = \|a_k\|^2 - \|E_k^H a_k\|^2
@@ -90,15 +82,15 @@ class MusicStage:
         if not np.einsum("kmm->", covariance).real > 0.0:
             return NotUsable("silence")
         subspace = self._tracker.follow(covariance)
-        heard = self._spectrum(subspace.vectors, mask)
-        profile = heard.reshape(-1, len(self._azimuths)).max(axis=0)
+        spectrum = self._spectrum(subspace.vectors, mask)
+        profile = spectrum.reshape(-1, len(self._azimuths)).max(axis=0)
         peak = find_peaks(profile, self._azimuths, max_peaks=1)[0]
         return MusicReading(peak.azimuth_rad, peak.prominence, profile)
 
     def _spectrum(self, vectors: ComplexArray, mask: ChannelMask) -> FloatArray:
-        """MUSIC as in `music.music_spectrum`, normalised."""
+        """Return the normalised spectrum of `music_spectrum` on the factored beams."""
         beams = self._beams if self._whitened is None else self._whitened
-        # A plain steering vector has the length of its microphones.
+        # A plain steering vector has modulus one at every microphone.
         length = mask.n_kept if self._whitened is None else beams.squared_lengths(mask.keep)
         floor = np.finfo(np.float32).eps * mask.n_kept
         outside = np.maximum(length - beams.power_within(vectors), floor)

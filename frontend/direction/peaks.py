@@ -1,4 +1,4 @@
-"""Peaks of a spatial spectrum: where, how high, how far above the rest."""
+"""Peaks of a spatial spectrum: azimuth, height and prominence."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,16 @@ from worldstate.ground.typing import FloatArray, IndexArray
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A local maximum of a spatial spectrum.
+    r"""A local maximum of a spatial spectrum.
+
+    .. math:: \rho = \hat P / \mathrm{median}_\theta P
 
     Parameters
     ----------
     azimuth_rad : float
-        Left positive.
+        Azimuth at the interpolated maximum, radians, left positive.
     value : float
-        Height at the interpolated vertex, in the unit of the spectrum.
+        Height there, in the unit of the spectrum.
     prominence : float
         Peak-to-median ratio, >= 1 for the highest peak.
 
@@ -45,16 +47,16 @@ def find_peaks(
               \hat\theta = \theta_i + \delta\, \Delta\theta, \qquad
               \hat P = P_i - \tfrac14 (P_{i-1} - P_{i+1})\, \delta.
 
-    A spectrum without any height (silence) has no peak. A maximum at an end of the grid stays there.
+    A spectrum of zeros (silence) has no peak. A maximum at an end of the grid is not interpolated.
 
     Parameters
     ----------
     spectrum : array_like, shape (A,)
-        Non-negative.
+        Non-negative, any unit.
     azimuths_rad : array_like, shape (A,)
-        Ascending, evenly spaced; A >= 3.
+        Ascending, evenly spaced, radians; A >= 3.
     max_peaks : int
-        At most so many, highest first.
+        Largest number of peaks.
     min_prominence : float
         Smallest peak-to-median ratio.
 
@@ -89,7 +91,7 @@ def find_peaks(
 
 
 def _local_maxima(values: FloatArray) -> IndexArray:
-    """Find the points that rise from the left and do not rise to the right; of a plateau the first."""
+    """Return the indices of local maxima; of a plateau the first."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     return np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
 

@@ -1,12 +1,9 @@
-r"""How many sources are there: information criteria on the eigenvalues of the spatial covariance.
+r"""Number of sources from the eigenvalues of the spatial covariance, by information criteria.
 
-All three assume noise that is white across the microphones and frames that are independent. A real street has
+All criteria assume noise that is white across the microphones and independent frames. A real street has
 neither: reflections are coherent with their source, wind and ego-noise are not white, overlapping frames are
-not independent. Read the number as "how many plane waves the noise model cannot explain", not as vehicles.
-
-Sources: M. Wax and T. Kailath, "Detection of signals by information theoretic criteria", IEEE Trans. ASSP 33,
-1985 (AIC, MDL). R. R. Nadakuditi and A. Edelman, "Sample eigenvalue based detection of high-dimensional
-signals in white noise using relatively few samples", IEEE Trans. SP 56, 2008.
+not independent. The result is the number of plane waves that the noise model does not explain, not of
+vehicles.
 """
 
 from typing import Literal
@@ -35,7 +32,7 @@ def count_sources(
         \mathrm{AIC} = 2 L + 2 k (2M - k), \qquad
         \mathrm{MDL} = L + \tfrac12 k (2M - k) \ln T.
 
-    MDL is consistent; AIC finds weaker sources and claims one too many now and then. Both need T > M, for the
+    MDL is consistent; AIC finds weaker sources and overestimates now and then. Both need T > M, because the
     geometric mean of a singular covariance is zero. ``few`` is the criterion of Nadakuditi and Edelman, which
     compares the second moment of the smallest eigenvalues with that of a Wishart matrix and holds for T < M
     too:
@@ -48,7 +45,7 @@ def count_sources(
 
     Parameters
     ----------
-    eigenvalues : (M,) or (bins, M) float
+    eigenvalues : array_like, shape (M,) or (bins, M)
         All M eigenvalues of each covariance, any order, >= 0; zeros included where T < M.
     frames : int
         Number T of independent frames behind the covariance.
@@ -60,17 +57,16 @@ def count_sources(
     Returns
     -------
     int
-        0 .. max_sources.
+        Number of sources, 0 .. max_sources.
 
     Raises
     ------
     InvalidArgumentError
         On wrong shapes, negative eigenvalues, an unknown criterion, or MDL or AIC with T <= M.
 
-    References
-    ----------
-    M. Wax and T. Kailath 1985 (AIC, MDL), R. R. Nadakuditi and A. Edelman 2008 (few): see
-    `worldstate.frontend.direction.source_count`.
+    References ---------- M. Wax and T. Kailath, "Detection of signals by information theoretic criteria",
+    IEEE Trans. ASSP 33, 1985 (AIC, MDL); R. R. Nadakuditi and A. Edelman, "Sample eigenvalue based detection
+    of high-dimensional signals in white noise using relatively few samples", IEEE Trans. SP 56, 2008 (few).
 
     Examples
     --------

@@ -3,13 +3,8 @@ r"""Steered response power with the phase transform (SRP-PHAT).
 .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}
           \Big| \sum_m \overline{a_{k,m}(\theta)}\, \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2
 
-over T frames, K bins and M microphones: 1 for a lone plane wave from theta, 1/M for noise that is
-independent between microphones. pyroomacoustics' SRP is M^2 / pairs = 2 M / (M - 1) times as large.
-
-References
-----------
-J. DiBiase, H. Silverman and M. Brandstein, Robust localization in reverberant rooms, in: Microphone Arrays,
-2001.
+over T frames, K bins and M microphones: 1 for a single plane wave from theta, 1/M for noise that is
+independent between microphones. The SRP of pyroomacoustics is M^2 / pairs = 2 M / (M - 1) times as large.
 """
 
 import numpy as np
@@ -21,23 +16,24 @@ from worldstate.ground.typing import Complex64Array, FloatArray
 
 
 def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
-    r"""Sum of beam powers over frames and bins: what running sums are made of.
+    r"""Sum the beam powers over frames and bins, the part of SRP that adds up over a running window.
 
     .. math:: S(\theta) = \sum_{t,k} \Big| \sum_m \overline{a_{k,m}(\theta)}\, Z_{t,k,m} \Big|^2
 
     Parameters
     ----------
     whitened : ndarray of complex64, shape (frames, bins, M)
+        Spectra Z of modulus one.
     steering : Steering
-        For the same bins.
+        Beams for the same bins.
 
     Returns
     -------
     ndarray of float64, shape (directions,)
+        Sum of |beam|^2, at most frames x bins x M^2.
 
-    References
-    ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.direction.srp`.
+    References ---------- J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in reverberant
+    rooms", in *Microphone Arrays*, 2001.
 
     Examples
     --------
@@ -50,7 +46,7 @@ def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
 
 
 def normalised(total: FloatArray, n_frames: int, n_bins: int, n_microphones: int) -> FloatArray:
-    r"""Scale a sum of beam powers to 0..1; rounding below zero is cut.
+    r"""Scale a sum of beam powers to 0..1; negative round-off is set to zero.
 
     .. math:: P(\theta) = \frac{\max(S(\theta), 0)}{T K M^2}
 
@@ -65,7 +61,7 @@ def normalised(total: FloatArray, n_frames: int, n_bins: int, n_microphones: int
 
 
 def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
-    r"""SRP-PHAT of a set of frames: 1 for a lone plane wave, 1/M for independent noise.
+    r"""Compute SRP-PHAT of a set of frames: 1 for a single plane wave, 1/M for independent noise.
 
     .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}
               \Big| \sum_m \overline{a_{k,m}(\theta)}\, \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2
@@ -73,22 +69,22 @@ def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     Parameters
     ----------
     spectra : ndarray of complex64, shape (frames, bins, M)
-        At least one frame.
+        STFT of the microphones, at least one frame, any unit.
     steering : Steering
-        For the same bins.
+        Beams for the same bins.
 
     Returns
     -------
     ndarray of float64, shape (directions,)
+        Between 0 and 1.
 
     Raises
     ------
     InvalidArgumentError
         If the spectra have other axes or another number of bins.
 
-    References
-    ----------
-    J. DiBiase, H. Silverman and M. Brandstein 2001: see `worldstate.frontend.direction.srp`.
+    References ---------- J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in reverberant
+    rooms", in *Microphone Arrays*, 2001.
 
     Examples
     --------

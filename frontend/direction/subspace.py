@@ -1,15 +1,16 @@
-r"""Signal subspace of a covariance that changes little from hop to hop: a warm-started, filtered basis.
+r"""Track the signal subspace of a covariance from hop to hop by filtered subspace iteration.
 
-The basis of the last hop is a good guess for this one. A Chebyshev polynomial of the covariance amplifies
-what lies above the noise and keeps the rest down, a Rayleigh-Ritz step sorts what comes out. The degree
-follows the eigenvalues of the last hop: one or two where a source stands out, up to eight in noise without
-any. Two things can go wrong, and both are looked for on every hop:
+The basis of the last hop is the initial value for this one. A Chebyshev polynomial of the covariance
+amplifies eigenvalues above the noise (Y. Zhou et al., J. Comput. Phys. 219, 2006) and a Rayleigh-Ritz step
+orders the result. The degree follows the eigenvalues of the last hop: one or two with a strong source, up to
+eight in noise alone. Two failures are checked on every hop:
 
-- *The guess has lost the source.* A basis orthogonal to a new source stays so for ever under any polynomial.
-  One probe is therefore added: the column of the covariance which the last basis explains worst.
-- *It has not converged.* The sine of the angle to the true subspace is at most
-  :math:`\|R e - \lambda e\| / (\lambda_k - \lambda_{k+1})` (Davis and Kahan). Bins in which that is too large
-  go round again, and are decomposed in full where even that does not help.
+- *A new source is orthogonal to the basis* and stays so under any polynomial. One probe vector is therefore
+added:
+  the column of the covariance that the last basis explains worst.
+- *No convergence.* The sine of the angle to the true subspace is at most
+  :math:`\|R e - \lambda e\| / (\lambda_k - \lambda_{k+1})` (Davis and Kahan). Bins in which that is too
+  large are iterated once more, and then decomposed in full.
 """
 
 import numpy as np
@@ -21,18 +22,20 @@ from worldstate.ground.typing import ComplexArray, RealArray
 
 from .music import Subspace, checked_covariance
 
+# Bins that two rounds do not settle are decomposed in full.
 ROUNDS = 2
+# Beyond it single precision is lost: see `_SPREAD`.
 _MAX_DEGREE = 8
-# How much more than the noise the weakest signal eigenvector shall be amplified, and at most.
+# Least and largest amplification of the weakest signal eigenvector over the noise.
 _GAIN, _MOST_GAIN = 100.0, 3000.0
-# How much more the strongest may be amplified than the weakest: of seven digits some must remain.
+# Largest amplification of the strongest over the weakest: of seven digits some must remain.
 _SPREAD = 1e4
-# Eigenvalues, relative to the largest, that single precision does not tell from each other.
+# Gap of eigenvalues, relative to the largest, that single precision does not resolve.
 _LEAST_GAP = 1e-4
 
 
 class SubspaceTracker:
-    r"""Follows the k strongest eigenvectors of a running covariance.
+    r"""Track the k strongest eigenvectors of a running covariance.
 
     Examples
     --------
@@ -43,10 +46,6 @@ class SubspaceTracker:
     >>> tracker.full_decompositions
     1
     """
-
-    # Sources: Y. Zhou, Y. Saad, M. Tiago and J. Chelikowsky, "Self-consistent-field calculations using
-    # Chebyshev-filtered subspace iteration", J. Comput. Phys. 219, 2006; C. Davis and W. Kahan, "The rotation
-    # of eigenvectors by a perturbation III", 1970.
 
     def __init__(self, sources: int, *, guard: int = 3, tolerance: float = 0.05) -> None:
         if sources < 1 or guard < 0:
@@ -64,19 +63,12 @@ class SubspaceTracker:
         .. math:: V \leftarrow \mathrm{Ritz}\big(T_m(2 R / c - I)\, [V, r]\big), \qquad
                   \sin\angle(e, E_s) \le \frac{\|R e - \lambda e\|}{\lambda_k - \lambda_{k+1}}
 
-        with the Chebyshev polynomial T_m, the edge of the noise c and the probe r.
-
-        Shapes: covariance (bins, M, M).
+        with the Chebyshev polynomial T_m, the edge c of the noise and the probe r.
         """
         return self.follow(checked_covariance(covariance, self._sources))
 
     def follow(self, R: ComplexArray) -> Subspace:
-        r"""Do what `update` does, unchecked.
-
-        .. math:: V \leftarrow \mathrm{Ritz}\big(T_m(2 R / c - I)\, [V, r]\big)
-
-        Shapes: R (bins, M, M).
-        """
+        """Do what `update` does, without checks."""
         width = min(self._sources + self._guard, R.shape[1] - 1)
         if self._basis is None or self._values is None or self._basis.shape != (len(R), width, R.shape[1]):
             self._basis, self._values = self._decomposed(R, width)
@@ -88,7 +80,7 @@ class SubspaceTracker:
     def _refreshed(
         self, R: ComplexArray, basis: ComplexArray, values: RealArray
     ) -> tuple[ComplexArray, RealArray]:
-        """Bring all bins up to date, then those again that need more."""
+        """Update all bins, then again those that have not converged."""
         basis, values, angle = _improved(R, basis, values, self._sources)
         for _ in range(ROUNDS - 1):
             late = np.flatnonzero(~(angle <= self._tolerance))
@@ -110,9 +102,9 @@ class SubspaceTracker:
 def _improved(
     R: ComplexArray, basis: ComplexArray, values: RealArray, sources: int
 ) -> tuple[ComplexArray, RealArray, RealArray]:
-    """One round: vectors as rows v^H (so that R works from the right), ascending values, angle missed."""
-    guess = np.concatenate([_probe(R, basis, values), basis], axis=1)
-    rows, found, angle = _ritz(R, _filtered(R, guess, values, sources), sources)
+    """Return one iteration: vectors as rows v^H, ascending values, bound of the angle to the true ones."""
+    initial = np.concatenate([_probe(R, basis, values), basis], axis=1)
+    rows, found, angle = _ritz(R, _filtered(R, initial, values, sources), sources)
     return rows[:, 1:], found[:, 1:], angle
 
 
@@ -130,7 +122,7 @@ def _filtered(R: ComplexArray, rows: ComplexArray, values: RealArray, sources: i
     strongest, weakest = values[:, -1], values[:, -sources]
     noise = np.maximum(values[:, 0], 1e-3 * weakest) + np.finfo(values.dtype).tiny
     degree = _degree(strongest, weakest, noise)
-    # No more gain than is needed: the noise may as well begin higher.
+    # No more gain than needed: the assumed edge of the noise may be higher.
     edge = 2.0 * weakest / (1.0 + np.cosh(np.arccosh(_MOST_GAIN) / degree))
     scale = (2.0 / np.maximum(noise, edge)).astype(values.dtype)[:, None, None]
     before, now = rows, (rows * scale) @ R - rows
@@ -154,7 +146,7 @@ def _degree(strongest: RealArray, weakest: RealArray, noise: RealArray) -> int:
 
 
 def _ritz(R: ComplexArray, rows: ComplexArray, sources: int) -> tuple[ComplexArray, RealArray, RealArray]:
-    """Rayleigh-Ritz: orthonormal rows, ascending values, and a bound of the sine of the angle missed."""
+    """Rayleigh-Ritz step: orthonormal rows, ascending values, bound of the sine of the angle."""
     Q = np.ascontiguousarray(np.linalg.qr(rows.transpose(0, 2, 1))[0].transpose(0, 2, 1))
     QR = Q @ R
     values, rotation = np.linalg.eigh(QR @ Q.conj().transpose(0, 2, 1))
@@ -163,6 +155,6 @@ def _ritz(R: ComplexArray, rows: ComplexArray, sources: int) -> tuple[ComplexArr
     image -= basis[:, -sources:] * values[:, -sources:, None]
     miss = np.sqrt((np.square(image.real) + np.square(image.imag)).sum(axis=2).max(axis=1))
     gap = values[:, -sources] - values[:, -sources - 1]
-    # What single precision cannot tell apart, no decomposition would.
+    # A gap below the resolution of single precision is not resolved by a full decomposition either.
     least = np.maximum(_LEAST_GAP * values[:, -1], np.finfo(values.dtype).tiny)
     return basis, values, miss / np.maximum(gap, least)

@@ -3,25 +3,21 @@ r"""Ego-noise: a noise covariance learned while no source is likely, and the spe
 .. math:: \hat R_k \leftarrow \frac{\lambda^{w} W \hat R_k + w \sum_t \tilde x_{t,k} \tilde x_{t,k}^H}
           {\lambda^{w} W + w T}, \qquad \tilde x = \sqrt{M}\, x / \|x\|
 
-over the T frames of a hop that is learned with weight w; W is the weight so far. Frames count by their
-direction in microphone space, not by their level, so that one loud moment does not decide and the level may
-follow the speed. Only what is learned makes forget: a closed gate keeps what is known.
+over the T frames of a hop that is learned with weight w; W is the weight so far. Snapshots have unit length
+(D. E. Tyler, "Statistical analysis for the angular central Gaussian distribution on the sphere", 1987), so
+that one loud moment does not decide and the level may follow the speed. The forgetting factor advances only
+with accepted updates.
 
-The gate is the caller's: `EgoNoise.weight`, the probability that no source is there. A hop is learned only
-after the next `guard_hops` hops have passed, with the least weight of all these, so that a source is not
-learned in the moments before anybody believes in it.
+The weight is set by the caller: `EgoNoise.weight`, the probability that no source is present. A hop is
+learned after the next `guard_hops` hops with the minimum weight of all these (guard cells, as in a CFAR
+detector), so that a source is not learned in the moments before it is detected.
 
-What is heard is learned, and what was learned used, as far as it comes from below, where the own vehicle is
-and no street: see `elevation_split`. A gate that opens by mistake, or because the vehicle stands, changes
-nothing.
+Sound is learned, and what was learned is used, as far as it comes from below the horizon, where the own
+vehicle is and no street: see `elevation_split`. A wrong weight therefore changes nothing.
 
-Whitened noise that has changed since it was learned, with the speed say, leaves a level c above that of white
-noise. Its mean over all directions is learned by the same gate, and the steered power is divided by it: as in
-any detector of constant false-alarm rate, noise reads 1/M in a slow drive and in a fast one.
-
-Sources: the references of `prewhitening` and `elevation_split`; unit-length snapshots as in D. E. Tyler,
-"Statistical analysis for the angular central Gaussian distribution on the sphere", 1987; guard cells as in
-any detector of constant false-alarm rate.
+Whitened noise that has changed since it was learned, with the speed say, has a level c above that of white
+noise. Its mean over all directions is learned with the same weight, and the steered power is divided by it:
+noise then reads 1/M at any speed.
 """
 
 import math
@@ -44,42 +40,45 @@ from .prewhitening import shrunk_inverse_root, white_share
 from .whitened_beams import WhitenedBeams
 
 _TINY = np.float32(1e-30)
-# Shares from below at which noise begins to be whitened, and is wholly. Simulated streets: below 0.1; drives
-# at walking pace, where the street is as loud: above 0.6.
+# Shares of below-horizon power at which whitening begins and is complete. Simulated streets: below 0.1;
+# drives at walking pace, where the street is as loud: above 0.6.
 _STREET_SHARE, _EGO_SHARE = 0.3, 0.6
-# Hops over which is judged whether to learn at all: a street must not linger when the vehicle sets off.
+# Memory, hops, of the decision whether to learn: longer, the street would still count when the vehicle sets
+# off.
 _RECENT_HOPS = 5.0
-# So many bins a hop are brought up to date where the share has changed so much, and whenever so many times as
-# much has been learned: the first roots are made from a handful of frames.
+# Bins updated per hop after a change of the share by this much, and whenever twice as many frames have been
+# learned: the first inverse roots come from a few frames.
 _URGENT_BINS, _ANOTHER_SHARE, _ANOTHER_LENGTH = 4, 0.2, 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class EgoNoiseSettings:
-    """How ego-noise is learned and how far it is suppressed.
+    r"""Settings of learning and suppressing the noise of the own vehicle.
+
+    .. math:: y = \hat R^{-1/2} x, \qquad \hat R \leftarrow (1 - s)\, \hat R / p + s I
+
+    with the learned noise covariance R, its mean power p, and the shrinkage s.
 
     Parameters
     ----------
     forgetting_s : float
-        Time constant of what is learned, seconds of learning time.
+        Time constant of the covariance, seconds of learning time.
     guard_hops : int
-        A hop is learned so many hops late, with the least weight since.
+        Delay, hops, after which a hop is learned with the minimum weight of the interval.
     min_weight : float
-        Hops of a lower weight are not learned at all: a source of some likelihood must not leak in.
+        Hops of a lower weight, in [0, 1], are not learned: a likely source must not enter.
     min_shrinkage : float
-        Least shrinkage towards white noise, in (0, 1]: no direction is amplified by more than its inverse
-        root.
+        Least shrinkage s towards white noise, in (0, 1]: no direction is amplified by more than 1 / sqrt(s).
     refresh_hops : int
-        Every so many hops the whitening of one bin, in turn, is brought up to date; several bins every hop
-        at first, and again where the vehicle starts or stops. It costs an M x M eigendecomposition.
+        Period, hops, after which the whitening of one bin, in turn, is updated, an M x M eigendecomposition;
+        several bins per hop at first and when the vehicle starts or stops.
     harmonics : int
-        Lines of the engine that are cancelled before, once `FrontEnd.follow_engine` says its speed.
+        Number of engine harmonics that are cancelled before, once `FrontEnd.follow_engine` gives the speed.
     feature : bool
-        Compute the published feature from prewhitened sound too. Off, because its classifier was trained
-        without.
+        Compute the published feature from prewhitened sound, too; its classifier was trained without.
     only_below_horizon : bool
-        Use what was learned as far as it comes from under the array. Off, everything that is learned is
-        whitened, the street's own noise too.
+        Use the covariance as far as it comes from below the horizon. False: all of it is whitened, including
+        the noise of the street.
 
     Raises
     ------
@@ -111,7 +110,7 @@ class EgoNoiseSettings:
 
 
 class EgoNoise:
-    """Learns the ego-noise of a stream and whitens its spectra, hop by hop.
+    """Learn the ego-noise of a stream and whiten its spectra, hop by hop.
 
     Examples
     --------
@@ -126,8 +125,8 @@ class EgoNoise:
     (39.6, (20, 1, 2))
     """
 
-    # Until something from below has been learned, spectra are what they were, bit for bit. Set `weight` to
-    # the probability that no source is there: it holds for all hops from then on.
+    # Until noise from below the horizon has been learned, spectra are unchanged, bit for bit. `weight` is the
+    # probability that no source is present, for all hops from then on.
 
     def __init__(
         self,
@@ -140,8 +139,8 @@ class EgoNoise:
     ) -> None:
         self.weight = 0.0
         self.engine = engine
-        self.elevation_split = 0.0
-        self._judge = elevation_split
+        self.ego_share = 0.0
+        self._split = elevation_split
         self._beams = [WhitenedBeams(plain) for plain, _ in beams]
         self._bins = spanned(bins for _, bins in beams)
         first, n_bins = self._bins.start, self._bins.stop - self._bins.start
@@ -162,7 +161,7 @@ class EgoNoise:
 
     @property
     def learned_frames(self) -> float:
-        """Number of frames that the covariance remembers; those of every second hop are learned."""
+        """Number of frames in the covariance; every second hop is learned."""
         return self._covariance.n_frames
 
     def process(self, spectra: Complex64Array) -> list[tuple[Complex64Array, Steering]]:
@@ -170,19 +169,16 @@ class EgoNoise:
 
         .. math:: y = \hat R^{-1/2}\, (x - \ell), \qquad Z_m = y_m / |y_m|
 
-        with the lines l of the engine and the covariance R learned so far, shrunk as far as it is the
-        street's.
-
-        Shapes: spectra (frames, bins, M).
+        with the engine lines l and the covariance R learned so far, shrunk by the share of the street.
         """
-        heard = spectra[:, self._bins]
+        inside = spectra[:, self._bins]
         if self.engine is not None:
-            heard = self.engine.cancel(heard)
-        self._learn(heard)
+            inside = self.engine.cancel(inside)
+        self._learn(inside)
         self._refresh()
-        whitened = self._whitened(heard)
+        whitened = self._whitened(inside)
         both = zip(self._slices, self._beams, strict=True)
-        used = bool(self.elevation_split)
+        used = bool(self.ego_share)
         return [(whitened[:, bins], beams.steering if used else beams.plain) for bins, beams in both]
 
     def levelled(self, power: FloatArray, n_frames: int) -> FloatArray:
@@ -191,35 +187,29 @@ class EgoNoise:
         .. math:: P'(\theta) = P(\theta) / c^{\,u}, \qquad
                   c = \Big\langle \frac{\langle P \rangle_\theta}{T K M} \Big\rangle_{\text{learned hops}}
 
-        with u in [0, 1], how far what was learned is used.
-
-        Shapes: power (directions,).
-
-        References
-        ----------
-        H. M. Finn and R. S. Johnson, "Adaptive detection mode with threshold control as a function of
-        spatially sampled clutter-level estimates", RCA Review 29, 1968 (constant false-alarm rate).
+        with u in [0, 1] the share of ego-noise (CFAR: H. M. Finn and R. S. Johnson, RCA Review 29, 1968).
         """
-        if not self._aim_frames or not self.elevation_split:
+        if not self._aim_frames or not self.ego_share:
             return power
         n_bins = self._slices[0].stop - self._slices[0].start
         white = n_frames * n_bins * self._roots.shape[1]
         level = self._level.push(float(power.mean()) / white, self._gated())
-        return np.asarray(power / max(level, 1e-6) ** self.elevation_split)
+        return np.asarray(power / max(level, 1e-6) ** self.ego_share)
 
     def _gated(self) -> float:
         return self.weight if self.weight >= self._settings.min_weight else 0.0
 
-    def _whitened(self, heard: Complex64Array) -> Complex64Array:
-        if not self.elevation_split:
-            return whiten(heard)
-        by_bin = heard.transpose(1, 0, 2) @ self._roots.transpose(0, 2, 1)
+    def _whitened(self, spectra: Complex64Array) -> Complex64Array:
+        if not self.ego_share:
+            return whiten(spectra)
+        by_bin = spectra.transpose(1, 0, 2) @ self._roots.transpose(0, 2, 1)
         return whiten(by_bin).transpose(1, 0, 2)
 
     def _learn(self, spectra: Complex64Array) -> None:
-        """Put this hop in the queue, take the one that has waited long enough."""
+        """Delay this hop by the guard interval and learn the one that leaves it."""
         weight = self._gated()
-        # Ego-noise is steady: every second hop says nearly everything.
+        # Ego-noise is stationary over seconds: every second hop gives nearly the same covariance at half the
+        # cost.
         self._is_odd = not self._is_odd
         total = _direction_sum(spectra) if weight > 0.0 and self._is_odd else None
         ripe = self._guard.push((total, len(spectra)), weight)
@@ -233,42 +223,42 @@ class EgoNoise:
                 self._stale = len(self._roots)
 
     def _refresh(self) -> None:
-        """Bring the next bins up to date if it is time, until all have seen what was learned last."""
+        """Update the whitening of the next bins if it is due, until all use the newest covariance."""
         self._hops_since_refresh += 1
         grown = self.learned_frames > _ANOTHER_LENGTH * self._aim_frames
         due = grown or self._urgent or self._hops_since_refresh >= self._settings.refresh_hops
         if not (self._stale and due):
             return
-        self._judge_share()
+        self._update_share()
         for _ in range(min(_URGENT_BINS, self._urgent) or 1):
             self._update(self._next_bin)
             self._next_bin = (self._next_bin + 1) % len(self._roots)
             self._stale, self._urgent = max(self._stale - 1, 0), max(self._urgent - 1, 0)
         self._hops_since_refresh = 0
 
-    def _judge_share(self) -> None:
-        """Decide how far what was learned is used; where that has changed, all bins are urgent."""
-        self.elevation_split = self._share_used()
-        is_another = abs(self.elevation_split - self._aim) > _ANOTHER_SHARE
+    def _update_share(self) -> None:
+        """Update the share of ego-noise; if it has changed much, all bins are updated at once."""
+        self.ego_share = self._share_used()
+        is_another = abs(self.ego_share - self._aim) > _ANOTHER_SHARE
         if is_another or self.learned_frames > _ANOTHER_LENGTH * self._aim_frames:
-            self._aim, self._aim_frames = self.elevation_split, self.learned_frames
+            self._aim, self._aim_frames = self.ego_share, self.learned_frames
             self._urgent = self._stale = len(self._roots)
 
     def _share_used(self) -> float:
-        """How far what was learned is used: 0 for a street, 1 for a vehicle's own noise."""
-        return 1.0 if self._judge is None else _use_of(*self._judge.powers(self._covariance.total))
+        """Share of the covariance that is used: 0 for a street, 1 for ego-noise."""
+        return 1.0 if self._split is None else _use_of(*self._split.powers(self._covariance.total))
 
     def _recent_share(self, total: Complex64Array) -> float:
-        """How far the last second that could be learned, this hop the newest, is the vehicle's own noise."""
-        if self._judge is None:
+        """Share of ego-noise in the hops accepted for learning of late."""
+        if self._split is None:
             return 1.0
         kept = math.exp(-1.0 / _RECENT_HOPS)
-        self._recent = kept * self._recent + self._judge.powers(total)
+        self._recent = kept * self._recent + self._split.powers(total)
         return _use_of(*self._recent)
 
     def _update(self, index: int) -> None:
         R = self._covariance.mean(index)
-        least = max(self._settings.min_shrinkage, 1.0 - self.elevation_split)
+        least = max(self._settings.min_shrinkage, 1.0 - self.ego_share)
         self._roots[index] = shrunk_inverse_root(R, max(least, white_share(R, self.learned_frames)))
         for beams, bins in zip(self._beams, self._slices, strict=True):
             if bins.start <= index < bins.stop:
@@ -276,13 +266,13 @@ class EgoNoise:
 
 
 def _use_of(below: float, street: float) -> float:
-    """From powers to 0 for a street, 1 for a vehicle's own noise."""
+    """Map the powers below and above the horizon to 0 for a street, 1 for ego-noise."""
     share = share_of(below, street)
     return min(max((share - _STREET_SHARE) / (_EGO_SHARE - _STREET_SHARE), 0.0), 1.0)
 
 
 def spanned(slices: Iterable[slice]) -> slice:
-    """Return the bins from the first to the last of several sets.
+    """Return the smallest range of bins that contains several.
 
     Examples
     --------

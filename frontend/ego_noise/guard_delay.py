@@ -1,4 +1,4 @@
-"""Learning late: what waits until it is known that nobody doubted it."""
+"""Delay line: each hop leaves after `hops` hops with the minimum weight seen meanwhile."""
 
 from collections import deque
 from typing import Generic, TypeVar
@@ -7,7 +7,7 @@ Item = TypeVar("Item")
 
 
 class GuardDelay(Generic[Item]):
-    """A queue of hops; each comes out some hops later with the least weight since.
+    r"""Queue of hops with the weight :math:`w'_n = \min(w_n, \dots, w_{n + hops})` over the guard interval.
 
     Examples
     --------
@@ -16,17 +16,14 @@ class GuardDelay(Generic[Item]):
     [None, ('a', 0.4), ('b', 0.4)]
     """
 
-    # So a source is not learned in the moments before anybody believes in it.
+    # Without it a source is learned as noise in the moments before it is detected.
 
     def __init__(self, hops: int) -> None:
         self._waiting: deque[Item] = deque()
         self._weights: deque[float] = deque(maxlen=hops + 1)
 
     def push(self, item: Item, weight: float) -> tuple[Item, float] | None:
-        r"""Take a hop with its weight; return the one that has waited long enough.
-
-        .. math:: w'_n = \min(w_n, w_{n+1}, \dots, w_{n + hops})
-        """
+        """Take a hop with its weight; return the one that leaves the delay, None while it fills."""
         self._waiting.append(item)
         self._weights.append(weight)
         if len(self._waiting) < (self._weights.maxlen or 0):

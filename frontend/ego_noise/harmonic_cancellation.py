@@ -1,22 +1,19 @@
-r"""Cancelling the own engine: its harmonics are fitted to the spectra of all microphones and subtracted.
+r"""Cancel the engine: its harmonics are fitted to the spectra of all microphones and subtracted.
 
-A line h f of amplitude c reaches frame t, bin k and microphone m as
+A harmonic h f of amplitude c contributes to frame t, bin k and microphone m
 
 .. math:: X_{t,k,m} = c_{h,m}\, g_{t,k,h}, \qquad
           g_{t,k,h} = (-1)^k\, D\!\big(h f_t N / f_s - k\big)\, e^{j h \varphi_t},
 
 with the phase phi_t and frequency f_t of the fundamental in the middle of the frame and the Hann window's
-kernel D(u) = N [sinc(u) / 2 + sinc(u - 1) / 4 + sinc(u + 1) / 4]. The amplitudes are those of recursive least
-squares with an exponential memory, bins weighted by their inverse power. How far a hop's own amplitudes have
-turned against the remembered ones, an angle h delta that grows with the order, corrects phase, frequency and
-rate of the fundamental: a phase-locked loop over the whole comb, which keeps lock where a speed that is told
-is a little wrong.
+kernel D(u) = N [sinc(u) / 2 + sinc(u - 1) / 4 + sinc(u + 1) / 4] (F. J. Harris, Proc. IEEE 66, 1978). The
+amplitudes come from recursive least squares with an exponential memory, bins weighted by their inverse power
+(B. Widrow et al., "Adaptive noise cancelling", Proc. IEEE 63, 1975; several orders at once as in H. Vold and
+J. Leuridan, SAE 931288, 1993). The phase h delta by which a hop's amplitudes differ from the remembered ones
+corrects phase, frequency and rate of the fundamental: a phase-locked loop over all harmonics, which stays
+locked where the given speed is a little wrong.
 
-A line is subtracted as far as it stands out of the noise: without an engine, next to nothing is taken away.
-
-Sources: B. Widrow et al., "Adaptive noise cancelling: principles and applications", Proc. IEEE 63, 1975;
-H. Vold and J. Leuridan, "High resolution order tracking at extreme slew rates", SAE 931288, 1993 (several
-orders at once); the window's kernel: F. J. Harris, Proc. IEEE 66, 1978.
+A line is subtracted by its excess over the noise: without an engine almost nothing is removed.
 """
 
 import cmath
@@ -28,22 +25,23 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 
-# Lines so far outside the bins, in bins, no longer reach them through the window.
+# Distance, bins, at which a line outside the band no longer leaks into it through the window.
 _REACH_BINS = 1.5
-# Gains of the loop, for a hop's phase error: frequency and its rate (phase takes all of it). The first
-# error is all frequency; the rate is left alone until the frequency has settled.
+# Gains of the loop for the phase error of a hop: frequency and its rate (the phase is corrected in full). The
+# first error is all frequency; the rate is held until the frequency has settled.
 _FREQUENCY_GAIN, _RATE_GAIN, _SETTLING_HOPS = 0.5, 0.1, 6
-# Orders between lines that are compared, coarse to fine: no order's angle may wrap before it is known.
+# Differences of order that are compared, coarse to fine, so that no angle wraps before it is resolved.
 _ORDER_STEPS = (1, 2, 4, 8)
 # Evidence of a line against noise at which nothing of it is subtracted; noise alone has 1 on average.
 _NO_LINE = 2.0
+# Ridge relative to the diagonal: close harmonics of a slow engine are nearly collinear in a hop.
 _RIDGE = 1e-3
 _TINY = 1e-30
 
 
 @dataclass(frozen=True, slots=True)
 class EngineState:
-    """Where the fundamental is at the middle of the last frame.
+    """Phase, frequency and rate of the fundamental at the middle of the last frame.
 
     Examples
     --------
@@ -55,38 +53,24 @@ class EngineState:
     phase_rad: float  # Phase, its derivative over 2 pi, and the derivative of that
     frequency_hz: float
     rate_hz_per_s: float = 0.0
-    hops: int = 0  # Number of hops since it was told
+    hops: int = 0  # Hops since the fundamental was given
 
     def phases(self, time_s: FloatArray) -> FloatArray:
-        r"""Continue the phase to later times, radians.
-
-        .. math:: \varphi(t) = \varphi + 2\pi \big(f t + \tfrac12 \dot f t^2\big)
-
-        Shapes: time_s (n,).
-        """
+        r"""Return :math:`\varphi(t) = \varphi + 2\pi (f t + \tfrac12 \dot f t^2)`, radians."""
         cycles = self.frequency_hz * time_s + 0.5 * self.rate_hz_per_s * time_s**2
         return np.asarray(self.phase_rad + 2.0 * np.pi * cycles)
 
     def frequencies(self, time_s: FloatArray) -> FloatArray:
-        r"""Continue the frequency to later times, Hz.
-
-        .. math:: f(t) = f + \dot f t
-
-        Shapes: time_s (n,).
-        """
+        r"""Return :math:`f(t) = f + \dot f t`, Hz."""
         return np.asarray(self.frequency_hz + self.rate_hz_per_s * time_s)
 
     def after(self, time_s: float, phase_error_rad: float) -> "EngineState":
-        r"""Move on by a hop of this length, in whose middle the phase was found ahead by so much.
+        r"""Advance by a hop of this length, with the phase error measured in its middle.
 
         .. math:: \varphi' = \varphi(T) + \epsilon, \qquad f' = f(T) + g\, \frac{\epsilon}{2\pi T}, \qquad
                   \dot f' = \dot f + 0.1\, \frac{\epsilon}{2\pi T^2}
 
-        with g falling from 1 to 1/2; the rate waits until the frequency has settled.
-
-        References
-        ----------
-        F. M. Gardner, *Phaselock Techniques*, 1966 (loops of this kind); the gains are ours.
+        with g falling from 1 to 1/2.
         """
         frequency_error = phase_error_rad / (2.0 * np.pi * time_s)
         gain = max(_FREQUENCY_GAIN, 1.0 / max(self.hops, 1))
@@ -100,17 +84,14 @@ class EngineState:
         )
 
     def within(self, low_hz: float, high_hz: float) -> "EngineState":
-        r"""Keep the frequency between two limits; one that has to be moved keeps no rate.
-
-        .. math:: f' = \min(\max(f, f_{low}), f_{high})
-        """
+        """Limit the frequency to a range; the rate is reset where that changes it."""
         if low_hz <= self.frequency_hz <= high_hz:
             return self
         return replace(self, frequency_hz=min(max(self.frequency_hz, low_hz), high_hz), rate_hz_per_s=0.0)
 
 
 class HarmonicCanceller:
-    """Subtracts the harmonics of an engine from the spectra of a stream.
+    """Subtract the harmonics of an engine from the spectra of a stream.
 
     Examples
     --------
@@ -144,31 +125,29 @@ class HarmonicCanceller:
 
     @property
     def fundamental_hz(self) -> float | None:
-        """Frequency of the fundamental as tracked, or None while nothing is followed."""
+        """Tracked frequency of the fundamental, None while there is none."""
         return None if self._engine is None else self._engine.frequency_hz
 
     def follow(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
-        """Say the fundamental: from the engine's speed, or from `harmonics.track_fundamental`."""
+        """Set the fundamental, from the engine's speed or from `track_fundamental`; None stops."""
         if fundamental_hz is None:
             self._engine = self._fit = None
             return
-        told = in_range("fundamental_hz", fundamental_hz, 10.0, 1000.0)
+        given = in_range("fundamental_hz", fundamental_hz, 10.0, 1000.0)
         share = in_range("tolerance", tolerance, 0.0, 0.5)
         if self._engine is None:
-            self._engine = EngineState(0.0, told)
-        self._limits_hz = told * (1.0 - share), told * (1.0 + share)
+            self._engine = EngineState(0.0, given)
+        self._limits_hz = given * (1.0 - share), given * (1.0 + share)
         self._engine = self._engine.within(*self._limits_hz)
 
     def cancel(self, spectra: Complex64Array) -> Complex64Array:
-        r"""Return the frames of a hop, (frames, bins, M), without the lines of the engine that is followed.
+        r"""Return the frames of a hop, (frames, bins, M), without the lines of the engine.
 
         .. math:: X'_{t,k,m} = X_{t,k,m} - \sum_h \kappa_h \hat c_{h,m}\, g_{t,k,h}, \qquad
                   \hat c = (G^H W G)^{-1} G^H W X, \qquad \kappa_h = \max(1 - 2 / e_h,\, 0)
 
-        with the sums over the memory and a ridge of a thousandth, W the inverse power of the bins, and e_h
-        the power of a line over that which noise alone would give it.
-
-        Shapes: spectra (frames, bins, M).
+        with sums over the memory, W the inverse power of the bins, and e_h the power of a line over that of
+        noise.
         """
         if self._engine is None or not len(spectra):
             return spectra
@@ -181,8 +160,8 @@ class HarmonicCanceller:
             return spectra
         time: FloatArray = self._frame_s * np.arange(1.0, len(spectra) + 1)
         shapes = _LineShapes.of(self._engine, time, orders, self._bins, self._bin_hz)
-        heard = np.ascontiguousarray(spectra)
-        now = _Fit.of(shapes, heard)
+        frames = np.ascontiguousarray(spectra)
+        now = _Fit.of(shapes, frames)
         error = 0.0
         if self._fit is not None:
             error = now.phase_ahead(self._fit, self._evident)
@@ -191,8 +170,8 @@ class HarmonicCanceller:
         self._engine = self._engine.after(float(time[-1]), error).within(*self._limits_hz)
         turn = np.exp(1j * orders * error).astype(np.complex64)
         lines = shapes.over_bins(shapes.turn) @ (turn[:, None] * self._evident)
-        rest = lines.reshape(heard.shape)
-        return np.asarray(np.subtract(heard, rest, out=rest))
+        rest = lines.reshape(frames.shape)
+        return np.asarray(np.subtract(frames, rest, out=rest))
 
     def _orders(self, frequency_hz: float) -> IntArray:
         """Return the orders that reach the bins."""
@@ -203,7 +182,7 @@ class HarmonicCanceller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LineShapes:
-    """The g of the module's equation for unit N, as the product of what bins and frames see."""
+    """The factor g of the equation above for unit N, as a product over bins and frames."""
 
     orders: IntArray  # Successive
     kernel: Float32Array  # Over a hop that of its middle: the frequency moves by a small part of a bin
@@ -246,7 +225,7 @@ class _Fit:
     orders: IntArray
     gram: ComplexArray
     moment: ComplexArray
-    energy: float  # Weighted sum of |X|^2 per microphone and number of values behind it
+    energy: float  # Weighted sum of |X|^2 per microphone, and the number of values in it
     count: float
 
     @classmethod

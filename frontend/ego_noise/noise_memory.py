@@ -1,4 +1,4 @@
-"""What is remembered of noise: its covariance, and its level once it is whitened."""
+"""Recursive means of the noise: its covariance, and its level after whitening."""
 
 import math
 
@@ -8,7 +8,7 @@ from worldstate.ground.typing import Complex64Array
 
 from .guard_delay import GuardDelay
 
-# Memory of the level of whitened noise, hops.
+# Memory of the level of whitened noise, hops: one second, for the level follows the speed of the vehicle.
 _LEVEL_HOPS = 10.0
 
 
@@ -29,11 +29,9 @@ class NoiseCovariance:
         self._forgetting = forgetting_frames
 
     def learn(self, total: Complex64Array, n_frames: int, weight: float) -> None:
-        r"""Take a hop's sum (bins, M, M) over so many frames, with a weight in (0, 1]; `total` is consumed.
+        r"""Add a hop's sum (bins, M, M) over `n_frames` with a weight in (0, 1]; `total` is overwritten.
 
         .. math:: S \leftarrow e^{-w T / F} S + w \sum_t x_t x_t^H, \qquad n \leftarrow e^{-w T / F} n + w T
-
-        Shapes: total (bins, M, M).
         """
         kept = math.exp(-weight * n_frames / self._forgetting)
         total *= np.float32(weight)
@@ -42,24 +40,17 @@ class NoiseCovariance:
         self.n_frames = kept * self.n_frames + weight * n_frames
 
     def mean(self, bin_index: int) -> Complex64Array:
-        r"""Covariance of one bin; the mean of its diagonal is one.
-
-        .. math:: \hat R = S / n
-
-        References
-        ----------
-        As for `NoiseCovariance.learn`, after D. E. Tyler 1987.
-        """
+        """Return the covariance S / n of one bin; the mean of its diagonal is one."""
         return np.asarray(self._sum[bin_index] / np.float32(max(self.n_frames, 1e-30)))
 
     @property
     def total(self) -> Complex64Array:
-        """Sum that the mean is made of, (bins, M, M)."""
+        """The weighted sum S, (bins, M, M)."""
         return self._sum
 
 
 class NoiseLevel:
-    """Level of whitened noise over that of white noise, learned like the covariance.
+    """Level of whitened noise relative to white noise, learned like the covariance.
 
     Examples
     --------
@@ -73,11 +64,11 @@ class NoiseLevel:
         self._sum = self._weights = 0.0
 
     def push(self, level: float, weight: float) -> float:
-        r"""Take a hop's level with the weight of the gate; return the level learned, 1 before there is any.
+        r"""Take a hop's level with its weight; return the level learned so far, 1 before any.
 
         .. math:: c = \frac{\sum_i w_i l_i e^{-W_i / 10}}{\sum_i w_i e^{-W_i / 10}}
+        with the weights w of the levels l and W the weight learned since.
         """
-        # over the levels l with the weights w, W being the weight learned since.
         ripe = self._guard.push(level, weight)
         if ripe is not None and ripe[1] > 0.0:
             learned, weight = ripe

@@ -1,20 +1,14 @@
-r"""Prewhitening: a change of coordinates after which known noise is the same in every direction.
+r"""Prewhitening: coordinates in which the noise is spatially white.
 
 .. math:: y = R^{-1/2} x, \qquad b(\theta) = \sqrt{M}\, \frac{R^{-1/2} a(\theta)}{\|R^{-1/2} a(\theta)\|}
 
-with the noise covariance R per bin and its Hermitian root, of all roots the one that leaves the microphones
-most alike: where R is a multiple of the identity, y is x and b is a, and every spatial spectrum is what it
-was. What whitening removes from the sound it removes from the steering vector too, hence its new length.
+with the noise covariance R per bin and its Hermitian root, the root that changes the microphones least: where
+R is a multiple of the identity, y is x and b is a. Whitening attenuates the steering vector as it does the
+sound, hence its new length.
 
-MUSIC in these coordinates is the generalised eigenvalue form: the eigenvectors v of
-:math:`R^{-1/2} R_x R^{-1/2}` are :math:`R^{1/2} u` with :math:`R_x u = \lambda R u`.
-
-References
-----------
-R. Roy and T. Kailath, "ESPRIT", IEEE Trans. ASSP 37, 1989 (generalised eigenvalues). K. Nakamura et al.,
-"Intelligent sound source localization for dynamic environments", IROS 2009 (generalised MUSIC for ego-noise).
-Y. Chen, A. Wiesel, Y. Eldar and A. Hero, "Shrinkage algorithms for MMSE covariance estimation", IEEE Trans.
-Signal Processing 58, 2010.
+MUSIC in these coordinates is the generalised eigenvalue form (R. Roy and T. Kailath, IEEE Trans. ASSP 37,
+1989; for ego-noise K. Nakamura et al., IROS 2009): the eigenvectors v of :math:`R^{-1/2} R_x R^{-1/2}` are
+:math:`R^{1/2} u` with :math:`R_x u = \lambda R u`.
 """
 
 from dataclasses import dataclass
@@ -28,7 +22,8 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray
 
-# A microphone whose noise is this far below the mean (power) is dead: it keeps no say in anything.
+# Noise power of a microphone, relative to the mean, below which it is dead and left out: its inverse would
+# dominate.
 _DEAD = 1e-9
 
 
@@ -38,7 +33,7 @@ class Prewhitener:
 
     Examples
     --------
-    Noise that reaches both microphones in phase no longer hides a source between them:
+    Noise in phase at both microphones becomes white:
 
     >>> noise = np.array([[[1.0, 0.9], [0.9, 1.0]]])
     >>> whitener = Prewhitener.of(noise, shrinkage=0.0)
@@ -51,45 +46,24 @@ class Prewhitener:
 
     @classmethod
     def of(cls, noise_covariance: ArrayLike, shrinkage: float = 0.03) -> "Prewhitener":
-        r"""Make it from a covariance (bins, M, M); see `inverse_root` for the arguments and errors.
-
-        .. math:: \mathrm{roots} = \big[(1 - s) R / p + s I\big]^{-1/2}, \qquad p = \operatorname{tr} R / M
-
-        Shapes: noise_covariance (bins, M, M).
-
-        References
-        ----------
-        As for `inverse_root`: O. Ledoit and M. Wolf 2004, A. Kessy et al. 2018.
-        """
+        """Build it from a covariance (bins, M, M): see `inverse_root`."""
         return cls(inverse_root(noise_covariance, shrinkage))
 
     def spectra(self, spectra: ArrayLike) -> ComplexArray:
-        """Whiten frames, (frames, bins, M) -> the same shape.
-
-        .. math:: y = R^{-1/2} x
-
-        Shapes: spectra (frames, bins, M).
-        """
+        r"""Whiten frames (frames, bins, M): :math:`y = R^{-1/2} x`."""
         X = finite_complex("spectra", spectra, (None, *self.roots.shape[:2]))
         # y_i = sum_j root_ij x_j, with x as rows: the transpose.
         return np.asarray((X.transpose(1, 0, 2) @ self.roots.transpose(0, 2, 1)).transpose(1, 0, 2))
 
     def covariance(self, covariance: ArrayLike) -> ComplexArray:
-        """Whiten covariances, R -> root R root, (bins, M, M).
-
-        .. math:: R_y = R^{-1/2} R_x R^{-1/2}
-
-        Shapes: covariance (bins, M, M).
-        """
+        r"""Whiten covariances (bins, M, M): :math:`R_y = R^{-1/2} R_x R^{-1/2}`."""
         R = finite_complex("covariance", covariance, self.roots.shape)
         return np.asarray(self.roots @ R @ self.roots)
 
     def steering(self, steering: ArrayLike) -> ComplexArray:
-        r"""Whiten steering vectors and give them their length back, (bins, M, directions).
+        r"""Whiten steering vectors (bins, M, directions) and restore their length.
 
         .. math:: b = \|a\|\, \frac{R^{-1/2} a}{\|R^{-1/2} a\|}
-
-        Shapes: steering (bins, M, directions).
         """
         A = finite_complex("steering", steering, (*self.roots.shape[:2], None))
         whitened = self.roots @ A
@@ -105,21 +79,15 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
 
     Shapes: noise_covariance (bins, M, M).
 
-    References
-    ----------
-    O. Ledoit and M. Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", J.
-    Multivariate Anal. 88, 2004 (shrinkage); A. Kessy, A. Lewin and K. Strimmer, "Optimal whitening and
-    decorrelation", Amer. Statist. 72, 2018 (which root).
-
     Examples
     --------
     >>> inverse_root([np.diag([3.0, 1.0])], shrinkage=0.0).real.round(3) + 0.0
     array([[[0.816, 0.   ],
             [0.   , 1.414]]])
     """
-    # so that no direction is amplified by more than 1 / sqrt(s), and s = 1 leaves everything as it is. The
-    # level of R plays no part. Microphones without any noise are dead and give zeros; a bin in which all are
-    # silent is left alone.
+    # Shrinkage after O. Ledoit and M. Wolf (2004): no direction is amplified by more than 1 / sqrt(s), and s
+    # = 1 changes nothing. The Hermitian root after A. Kessy et al. (2018). Dead microphones give zeros; a bin
+    # in which all are silent is unchanged.
     R = finite_complex("noise_covariance", noise_covariance, (None, None, None))
     if R.shape[1] != R.shape[2]:
         raise InvalidArgumentError(f"noise_covariance: expected shape (bins, M, M), got {R.shape}")
@@ -129,7 +97,7 @@ def inverse_root(noise_covariance: ArrayLike, shrinkage: float = 0.03) -> Comple
 
 
 def white_share(R: ComplexArray, n_frames: float) -> float:
-    r"""Say how far a sample covariance should be shrunk towards white noise (oracle-approximating shrinkage).
+    r"""Return the oracle-approximating shrinkage of a sample covariance towards white noise.
 
     .. math:: s = \min\Big(1, \frac{(1 - 2/M) \operatorname{tr} R^2 + \operatorname{tr}^2 R}
               {(n + 1 - 2/M) (\operatorname{tr} R^2 - \operatorname{tr}^2 R / M)}\Big)
@@ -141,8 +109,8 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
     >>> white_share(np.eye(4), 100), round(white_share(np.ones((4, 4)), 100), 3)
     (1.0, 0.02)
     """
-    # One where the eigenvalues spread no more than n frames of white noise would make them, so that nothing
-    # is whitened that was white; next to nothing where a few directions dominate.
+    # Y. Chen et al., IEEE Trans. Signal Processing 58, 2010. One if the eigenvalues spread no more than those
+    # of n frames of white noise, so that white noise is not whitened; near zero if a few directions dominate.
     size = len(R)
     squares = float(np.square(R.real).sum() + np.square(R.imag).sum())
     trace = float(np.einsum("mm->", R).real) ** 2
@@ -152,16 +120,12 @@ def white_share(R: ComplexArray, n_frames: float) -> float:
 
 
 def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
-    r"""Invert one matrix (M, M) as `inverse_root` does, unchecked.
+    r"""Return the shrunk inverse root of one matrix, without checks.
 
     .. math:: \big[(1 - s) R / p + s I\big]^{-1/2} =
               V \operatorname{diag}\big[(1 - s) \lambda / p + s\big]^{-1/2} V^H
 
     Shapes: R (M, M).
-
-    References
-    ----------
-    As for `inverse_root`: O. Ledoit and M. Wolf 2004, A. Kessy et al. 2018.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Beams for spectra that are whitened by a root of their own in every bin."""
+"""Beams for spectra that are whitened per bin."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ _TINY = np.float32(1e-30)
 
 
 class WhitenedBeams:
-    r"""Beams for whitened spectra, brought up to date bin by bin.
+    r"""Beams for whitened spectra, updated bin by bin.
 
     With :math:`W = B C` of `Steering`, the weights for :math:`y = R^{-1/2} x` are
-    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the living
-    microphones: those with any noise).
+    :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the
+    microphones that are not dead).
 
     Examples
     --------
@@ -31,12 +31,10 @@ class WhitenedBeams:
         self.steering = Steering(basis, plain.weights.copy(), plain.conjugate.copy())
 
     def update(self, bin_index: int, root: Complex64Array) -> None:
-        r"""Use another inverse root (M, M) in one bin.
+        r"""Set the inverse root (M, M) of one bin.
 
         .. math:: w(\theta) = \sqrt M\, \frac{\overline{R^{-1/2}}\, \overline{a(\theta)}}
                   {\|R^{-1/2}\, a(\theta)\|}
-
-        Shapes: root (M, M).
         """
         plain, ours = self.plain, self.steering
         weights = plain.weights[bin_index]

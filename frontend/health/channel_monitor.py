@@ -25,9 +25,9 @@ _CRACKLE = 4.0
 # A mean above a tenth of the peak-to-peak sound (0.7 of its standard deviation), judged after two seconds.
 _OFFSET = 0.1
 _SETTLED_HOPS = 20
-# Gains within one array differ by 1 to 3 dB; 10 dB is a wrong setting or a covered capsule.
+# Gains within one array differ by a few dB; 10 dB is a wrong setting or a covered capsule.
 _LEVEL_DB = 10.0
-# Share of samples at full scale from which clipping is audible in the spectra; a lone peak is less.
+# One sample in ten thousand; a lone peak is less.
 _CLIPPED_SHARE = 1e-4
 # Enough for a report; the count goes on beyond them.
 _KEPT_DROPOUTS = 16

@@ -26,7 +26,7 @@ _JUMP_CEILING = 5.0
 _JUMP_LIMIT = 12.0
 # The same relative to the other jumps of the hop: white sound from broadside jumps in all channels, too.
 _JUMP_CONTRAST = 3.0
-# With fewer channels the mean over them scatters beyond these limits.
+# The mean over fewer channels scatters too much for these limits.
 _MIN_SPLICE_CHANNELS = 6
 # Repeat: samples whose hash has five zero bits, one in 32, are compared with those of the last one or two
 # seconds; four that agree in their lag are no chance.

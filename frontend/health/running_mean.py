@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.typing import BoolArray
 
-# Time constant, hops: three seconds follow the traffic and average over single events.
+# Time constant, hops: three seconds.
 _HOPS = 30
 
 

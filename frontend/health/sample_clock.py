@@ -19,7 +19,7 @@ from worldstate.ground.values import NotUsable, seconds
 _MIN_READINGS = 10
 # An error of four standard deviations is significant: one false report in 16,000.
 _SIGNIFICANT = 4.0
-# Crystals have an error of about 10 ppm; less has no effect on bearing or level.
+# Crystals themselves are off by about as much; less changes neither bearing nor level.
 _TOLERATED = 1e-5
 
 

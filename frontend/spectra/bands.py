@@ -5,7 +5,7 @@ import numpy as np
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 
-# Mean square that stands for silence, far below 24-bit quantisation; keeps the logarithm finite.
+# Mean square below which a band is silent, far below 24-bit quantisation; keeps the logarithm finite.
 SILENCE = 1e-20
 
 
@@ -39,11 +39,6 @@ def mean_square_per_bin(powers: Float32Array, nfft: int) -> FloatArray:
               \qquad \sum_n w^2 = 3 N / 8
 
     Shapes: powers (frames, bins, M).
-
-    References
-    ----------
-    P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans. AU 15,
-    1967.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A lower sample rate for one channel of a stream: filtered, thinned, exact in blocks of any length."""
+"""Decimation of one channel of a stream, exact in blocks of any length."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,14 +7,14 @@ from scipy import signal
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
-# What folds into the band is this far down, and so is the ripple within it.
+# Attenuation of what aliases into the band, and of the ripple within it: the resolution of 16-bit converters.
 _ATTENUATION_DB = 80.0
-# Samples kept per period of the highest frequency: the filter may take its time to close.
+# Samples kept per period of the highest frequency: with 2 the filter would need an endless transition.
 _OVERSAMPLING = 3.0
 
 
 class Decimator:
-    r"""Keeps everything up to a frequency at the lowest handy rate.
+    r"""Decimate to about three samples per period of the highest frequency.
 
     .. math:: y[m] = \sum_{n=0}^{L-1} h[n]\, x[m D + n], \qquad D = \lfloor f_s / 3 f_{high} \rfloor
 
@@ -22,18 +22,14 @@ class Decimator:
     Only outputs whose L samples are all there are given; what is left over waits. In polyphase form: the
     samples as rows of D, one matrix product with the taps as columns of D, sums along its diagonals.
 
-    References
-    ----------
-    J. F. Kaiser, "Nonrecursive digital filter design using the I0-sinh window function", 1974.
-
     Examples
     --------
     >>> decimator = Decimator(sample_rate_hz=48_000, high_hz=400.0)
     >>> decimator.factor, decimator.rate_hz
     (40, 1200.0)
     >>> blocks = np.split(np.ones(4800), [7, 1000])
-    >>> heard = np.concatenate([decimator.push(block) for block in blocks])
-    >>> len(heard) == (4800 - decimator.n_taps) // 40 + 1, bool(np.allclose(heard, 1.0))
+    >>> output = np.concatenate([decimator.push(block) for block in blocks])
+    >>> len(output) == (4800 - decimator.n_taps) // 40 + 1, bool(np.allclose(output, 1.0))
     (True, True)
     """
 
@@ -49,11 +45,9 @@ class Decimator:
         self._waiting: FloatArray = np.empty(0)
 
     def push(self, samples: NDArray[np.floating]) -> FloatArray:
-        r"""Take the next samples (n,), give the outputs that they complete.
+        r"""Take the next samples (n,) and return the outputs that they complete.
 
         .. math:: y[m] = \sum_n h[n]\, x[m D + n]
-
-        Shapes: samples (n,).
         """
         waiting = np.concatenate([self._waiting, samples])
         n_out = max((len(waiting) - self.n_taps) // self.factor + 1, 0)

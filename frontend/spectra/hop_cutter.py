@@ -1,4 +1,4 @@
-"""Cutting a stream of samples into hops that do not drift."""
+"""Cut a stream of samples into hops that do not drift."""
 
 import math
 from collections.abc import Iterator
@@ -22,21 +22,15 @@ def hop_end(index: int, sample_rate_hz: float, hop_rate_hz: float) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hop:
-    """The samples of one hop.
-
-    Examples
-    --------
-    >>> Hop(index=1, end=4800, samples=np.zeros((4800, 2), np.float32)).end
-    4800
-    """
+    """The samples of one hop."""
 
     index: int  # From 1
     end: int  # Number of samples from the start of the stream to the end of this hop
-    samples: Float32Array  # shape (n, M): Valid until the next hop is asked for
+    samples: Float32Array  # shape (n, M): Valid until the next hop is read
 
 
 class HopCutter:
-    """Collect blocks of any length and give whole hops, in time proportional to the samples.
+    """Collect blocks of any length and return whole hops, in time proportional to the samples.
 
     Examples
     --------
@@ -54,10 +48,7 @@ class HopCutter:
         self._buffer = np.empty((math.ceil(sample_rate_hz / hop_rate_hz) + 1, n_channels), np.float32)
 
     def cut(self, block: Float32Array) -> Iterator[Hop]:
-        """Take a block (n, M), give the hops that it completes; read the iterator to its end.
-
-        Shapes: block (n, M).
-        """
+        """Take a block (n, M) and yield the hops that it completes; the iterator must be read to its end."""
         while len(block):
             taken = min(len(block), self._length - self._filled)
             whole = taken == self._length

@@ -1,11 +1,10 @@
-"""The phase transform: keep phases, forget magnitudes."""
+"""The phase transform: spectra of unit magnitude (C. Knapp and G. C. Carter, IEEE Trans. ASSP 24, 1976)."""
 
 import numpy as np
 
 from worldstate.ground.typing import Complex64Array, Float32Array
 
-# Smallest power of a bin that still counts as sound; far below 24-bit quantisation, far above float32
-# underflow.
+# Smallest power of a bin that is not silence: far below 24-bit quantisation, far above float32 underflow.
 _POWER_FLOOR = np.float32(1e-30)
 
 
@@ -24,11 +23,6 @@ def power(spectra: Complex64Array) -> Float32Array:
 
 def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Complex64Array:
     r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
-
-    References
-    ----------
-    C. Knapp and G. C. Carter, "The generalized correlation method for estimation of time delay", IEEE Trans.
-    ASSP 24, 1976.
 
     Examples
     --------

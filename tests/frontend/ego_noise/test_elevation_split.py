@@ -103,9 +103,9 @@ def test_the_share_grows_with_what_comes_from_below(mixed: float, azimuth: float
 def test_a_level_line_cannot_tell_and_trusts_its_caller() -> None:
     line = MicrophoneArray(np.linspace(-0.4, 0.4, 9)[:, None] * [0.0, 1.0, 0.0])
     judge = ElevationSplit.of(line, BINS_HZ)
-    assert JUDGES[56].can_tell
-    assert JUDGES[14].can_tell
-    assert not judge.can_tell
+    assert JUDGES[56].is_separable
+    assert JUDGES[14].is_separable
+    assert not judge.is_separable
     assert judge.share(np.ones((len(BINS_HZ), 9, 9), np.complex64)) == 1.0
 
 
