@@ -48,7 +48,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recording: Path) -> None:
     bearings = {}
     for ego in (False, True):
-        steps = list(listen_steps(open_source(recording, settings=ListenSettings(ego_noise=ego))))
+        steps = list(
+            listen_steps(open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=ego)))
+        )
         late = [step.frame for step in steps if step.frame.stamp_ns > (APPEARS_S + 0.4) * 1e9]
         bearings[ego] = np.degrees([frame.bearing_rad for frame in late])
     assert len(bearings[True]) > 8
@@ -57,10 +59,10 @@ def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recordin
 
 
 def test_it_is_off_unless_asked_and_where_nobody_believes(recording: Path) -> None:
-    plain = [frame.srp for frame, _ in measure_steps(open_source(recording))]
+    plain = [frame.srp for frame, _ in measure_steps(open_source(recording, array=ARRAY))]
     doubted: list[list[np.ndarray]] = []
     for belief in (None, lambda: 0.3):
-        source = open_source(recording, settings=ListenSettings(ego_noise=True))
+        source = open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=True))
         doubted.append([frame.srp for frame, _ in measure_steps(source, belief)])
     for srp, unasked, unlearned in zip(plain, *doubted, strict=True):
         np.testing.assert_array_equal(srp, unasked)
@@ -68,7 +70,7 @@ def test_it_is_off_unless_asked_and_where_nobody_believes(recording: Path) -> No
     believed = [
         frame.srp
         for frame, _ in measure_steps(
-            open_source(recording, settings=ListenSettings(ego_noise=True)), lambda: 1.0
+            open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=True)), lambda: 1.0
         )
     ]
     assert np.abs(believed[-1] - plain[-1]).max() > 0.02
@@ -77,7 +79,7 @@ def test_it_is_off_unless_asked_and_where_nobody_believes(recording: Path) -> No
 def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
     """The posterior is the same, hop by hop: only spatial spectrum, bearing and prominence change."""
     plain, learned = (
-        list(listen_steps(open_source(recording, settings=ListenSettings(ego_noise=ego))))
+        list(listen_steps(open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=ego))))
         for ego in (False, True)
     )
     for a, b in zip(plain, learned, strict=True):
