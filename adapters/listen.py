@@ -150,6 +150,19 @@ class Source:
         d of the camera, or a function from the stamp to it.
     site : SiteEstimate or None
         What is known of the site beforehand, from a checkpoint.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     source = open_source(path)
+    >>> source.detections is None, source.t0_s is None
+    (True, True)
     """
 
     audio_path: Path
@@ -188,7 +201,30 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One hop: what was heard, what was measured, what is believed."""
+    """One hop: what was heard, what was measured, what is believed.
+
+    Parameters
+    ----------
+    frame : AcousticFrame
+        What the front-end read from the sound.
+    measurement : Measurement
+        What the adapter made of it.
+    state : WorldState
+        The snapshot after it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     steps = list(listen_steps(open_source(path)))
+    >>> steps[0].frame.stamp_ns == steps[0].measurement.stamp_ns == steps[0].state.stamp_ns
+    True
+    """
 
     frame: AcousticFrame
     measurement: Measurement
@@ -236,12 +272,32 @@ def open_source(
     settings : ListenSettings, optional
         How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
 
+    Returns
+    -------
+    Source
+        For `listen_steps`.
+
     Raises
     ------
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
         If the model holds no threshold for the budget, or both detections and a detector are given.
+    OutOfDomainError
+        If the array is not that of the data set.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     source = open_source(path, settings=ListenSettings(alpha=0.05))
+    >>> len(source.array.positions_m), source.policy.alpha
+    (56, 0.05)
     """
     path, settings = Path(path), settings or ListenSettings()
     recording = Recording.open(path) if path.is_dir() else None
@@ -328,8 +384,17 @@ def listen(
 
     Examples
     --------
-    >>> for state in listen("some.wav", array="mics.xml", detections="d.json"):  # doctest: +SKIP
-    ...     print(state.stamp_ns, state.risk)
+    A second and a fifth of noise:
+
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     [(state.stamp_ns / 1e9, len(state.entities)) for state in listen(path)]
+    [(1.0, 0), (1.1, 0), (1.2, 0)]
     """
     source = open_source(
         path,
@@ -349,10 +414,32 @@ def listen(
 def listen_steps(source: Source) -> Iterator[Step]:
     """Yield every hop of `source` with what was heard and measured.
 
+    Parameters
+    ----------
+    source : Source
+        From `open_source`.
+
+    Yields
+    ------
+    Step
+        One a hop, the first after the first second of sound.
+
     Raises
     ------
     InputFileError
         If the sound file is damaged or does not fit the array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     [step.frame.feature.shape for step in listen_steps(open_source(path))]
+    [(60,), (60,), (60,)]
     """
     world = WorldFilter(context=source.context, policy=source.policy)
     measured = measure_steps(source, lambda: world.explanation.none)
@@ -374,10 +461,27 @@ def measure_steps(
         Asked after every hop for the belief that nothing is there, which gates the learning of ego-noise;
         without it none is learned.
 
+    Yields
+    ------
+    frame, measurement : AcousticFrame, Measurement
+        One pair a hop.
+
     Raises
     ------
     InputFileError
         If the sound file is damaged or does not fit the array.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "noise.wav"
+    ...     soundfile.write(path, noise, 48_000)
+    ...     [measurement.co_evidence.reason for _, measurement in measure_steps(open_source(path))]
+    ['no detections file', 'no detections file', 'no detections file']
     """
     strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
     with open_audio(source.audio_path, expect_channels=n_microphones, strict=strict) as audio:

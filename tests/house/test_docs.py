@@ -27,8 +27,6 @@ def test_every_exported_name_has_an_example_that_runs(name):
     value = getattr(importlib.import_module(HOMES[name]), name)
     if reference.kind(value) == "data":
         pytest.skip("the reference evaluates it")
-    if getattr(value, "__module__", "") == "worldstate.adapters.listen":
-        pytest.xfail("being rewritten")
     assert any(not example.options.get(doctest.SKIP) for example in examples(value))
 
 
