@@ -1,1 +1,1 @@
-"""Beliefs: what is carried from one measurement to the next."""
+"""Beliefs of explanations and entities, and their predict and update steps."""

@@ -1,4 +1,4 @@
-"""Which sighting belongs to which entity."""
+"""Association of sightings with entities, in view and at the edge of an occluder."""
 
 import math
 
@@ -11,16 +11,19 @@ from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 from .track import Track
 
-_NEVER = 1e6
-_CHANGED_MIND = 20.0
+# Cost of a pair outside the gate; larger than any sum of costs within it.
+_FORBIDDEN = 1e6
+# Cost of pairing a parked with a moving object: above gate_sigma**2 = 16, so that any free partner is
+# preferred, and finite, so that a parked car that drives off keeps its id.
+_PARKED_MISMATCH = 20.0
 
 
 def match_visible(
     tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], settings: FilterSettings
 ) -> dict[int, int]:
     """Return {track index: sighting index} by global nearest neighbour in azimuth, within the gate."""
-    # The cost is the squared Mahalanobis distance, plus a penalty where one is parked and the other moves,
-    # lest a vehicle that drives past a parked one changes places with it. Only tracks that vision has take
+    # The cost is the squared Mahalanobis distance, plus a penalty where one is parked and the other moves:
+    # without it a vehicle that drives past a parked one swapped ids with it. Only entities already seen take
     # part.
     candidates = [i for i, track in enumerate(tracks) if track.seen]
     if not candidates or not sightings:
@@ -33,23 +36,23 @@ def match_visible(
     return {
         candidates[row]: int(column)
         for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
-        if cost[row, column] < _NEVER
+        if cost[row, column] < _FORBIDDEN
     }
 
 
 def match_hidden(
-    tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], scene: SiteGeometry
+    tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], site: SiteGeometry
 ) -> dict[int, int]:
-    """Return {track index: sighting index}: hidden entities that came into view."""
-    # A vehicle comes into view near the edge of what hid it. Of a new moving sighting there are two accounts:
-    # it is a hidden entity, whose side may have been heard wrongly, or it is a vehicle that nobody heard. The
-    # likelier one holds, best pair first.
+    """Return {track index: sighting index} of the hidden entities that came into view."""
+    # A vehicle comes into view near the edge of its occluder. A new moving sighting is either a hidden
+    # entity, whose side may be wrong, or a vehicle that was not heard; the likelier hypothesis is taken, best
+    # pair first.
     pairs = sorted(
         (-score, i, j)
         for i, track in enumerate(tracks)
         for j, sighting in sightings
         if not track.seen and sighting.moving
-        if (score := _emergence(track, sighting, scene)) > 0.0
+        if (score := _emergence(track, sighting, site)) > 0.0
     )
     found: dict[int, int] = {}
     for _, i, j in pairs:
@@ -63,14 +66,14 @@ def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> flo
     variance = track.motion.azimuth_std_rad**2 + sighting.std_rad**2
     outside = abs(residual) > settings.gate_rad or residual**2 > settings.gate_sigma**2 * variance
     if outside:
-        return _NEVER
-    return residual**2 / variance + (0.0 if sighting.moving == track.moving else _CHANGED_MIND)
+        return _FORBIDDEN
+    return residual**2 / variance + (0.0 if sighting.moving == track.moving else _PARKED_MISMATCH)
 
 
-def _emergence(track: Track, sighting: Sighting, scene: SiteGeometry) -> float:
-    """Return the log odds of "this entity" against "nobody heard it"; -inf out of reach of any edge."""
-    settings = scene.settings
-    distances = [side.distance_rad(sighting.azimuth_rad) for side in scene.sides]
+def _emergence(track: Track, sighting: Sighting, site: SiteGeometry) -> float:
+    """Return the log odds of this hidden entity against an unheard vehicle; -inf beyond every gate."""
+    settings = site.settings
+    distances = [side.distance_rad(sighting.azimuth_rad) for side in site.sides]
     if min(distances) > settings.handover_gate_rad:
         return -math.inf
     near = [math.exp(-2.0 * (distance / settings.handover_gate_rad) ** 2) for distance in distances]

@@ -1,4 +1,4 @@
-"""Birth and death of hidden entities."""
+"""Birth and death of hidden entities, one at most on each side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,12 +10,13 @@ from .explanation import ExplanationBelief
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id
 
+# The signature tells no classes apart; a detector replaces this at the hand-over.
 HIDDEN_LABEL = "vehicle"
 
 
 @dataclass(frozen=True, slots=True)
 class BirthDeath:
-    """Outcome: tracks, explanations, entities that each side has brought forth, sides that began one."""
+    """Result: tracks, explanations, births so far on each side, sides of this step's births."""
 
     tracks: tuple[Track, ...]
     explanation: ExplanationBelief
@@ -30,28 +31,30 @@ def birth_death(
     alarmed: Sequence[bool],
     rearmed: Sequence[bool],
     measurement: Measurement,
-    scene: SiteGeometry,
+    site: SiteGeometry,
 ) -> BirthDeath:
-    """Return the world with hidden entities born, refreshed and dropped, one at most per side.
+    """Return the tracks with hidden entities born, updated and removed.
 
     Shapes: alarmed (K,), rearmed (K,).
     """
-    settings, kept, counts = scene.settings, list(tracks), list(births)
+    settings, kept, counts = site.settings, list(tracks), list(births)
     begun = []
-    for k in range(len(scene.sides)):
+    for k in range(len(site.sides)):
         current = next((track for track in kept if not track.seen and track.side == k), None)
         if current is None:
             heard = explanation.hidden[k] >= settings.birth_probability or alarmed[k]
             if heard and rearmed[k]:
-                explanation = explanation.disown(k)
+                # What came into view from here before was another vehicle: the new one starts without its
+                # mass.
+                explanation = explanation.forget_origin(k)
                 begun.append(k)
-                returning = _returning(kept, k, measurement.stamp_ns, scene)
+                returning = _returning(kept, k, measurement.stamp_ns, site)
                 if returning is None:
-                    kept.append(_born(k, counts[k], explanation.hidden[k], measurement, scene))
+                    kept.append(_born(k, counts[k], explanation.hidden[k], measurement, site))
                     counts[k] += 1
                 else:
                     kept.remove(returning)
-                    kept.append(_hidden_again(returning, k, explanation.hidden[k], measurement, scene))
+                    kept.append(_hidden_again(returning, k, explanation.hidden[k], measurement, site))
         else:
             kept.remove(current)
             # The sum of two exponentials exceeds one by rounding where nothing else is possible.
@@ -61,9 +64,9 @@ def birth_death(
     return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))
 
 
-def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: SiteGeometry) -> Track | None:
-    """Return the entity that left view near this side a moment ago, if there is one."""
-    side, settings = scene.sides[k], scene.settings
+def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
+    """Return the moving entity last seen near this side's edge within the reocclusion time, if any."""
+    side, settings = site.sides[k], site.settings
     earliest_ns = stamp_ns - settings.reocclusion_s * NANOSECONDS_PER_SECOND
     latest_ns = stamp_ns - settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
     candidates = [
@@ -77,7 +80,7 @@ def _returning(tracks: list[Track], k: int, stamp_ns: int, scene: SiteGeometry) 
 
 
 def _hidden_again(
-    track: Track, k: int, existence: float, measurement: Measurement, scene: SiteGeometry
+    track: Track, k: int, existence: float, measurement: Measurement, site: SiteGeometry
 ) -> Track:
     return replace(
         track,
@@ -85,18 +88,18 @@ def _hidden_again(
         seen=False,
         was_hidden=True,
         existence=existence,
-        motion=scene.prior(k),
+        motion=site.prior(k),
         updated_ns=measurement.stamp_ns,
     )
 
 
-def _born(k: int, number: int, existence: float, measurement: Measurement, scene: SiteGeometry) -> Track:
+def _born(k: int, number: int, existence: float, measurement: Measurement, site: SiteGeometry) -> Track:
     return Track(
-        id=entity_id(scene.settings.stream, scene.sides[k].label, number),
+        id=entity_id(site.settings.stream, site.sides[k].label, number),
         side=k,
         seen=False,
         existence=existence,
-        motion=scene.prior(k),
+        motion=site.prior(k),
         labels=((HIDDEN_LABEL, 1.0),),
         moving=True,
         sources=(measurement.source,),

@@ -1,38 +1,43 @@
-"""Bernoulli existence of an entity that vision has: what looks, found or empty, and time do to it."""
+"""Bernoulli existence updates for detection, missed detection and elapsed time."""
 
 import math
 
 
 def after_empty_look(existence: float, miss_rate: float) -> float:
-    r"""Return the existence after a look that did not find the entity.
+    r"""Return the existence after a missed detection.
 
-    .. math:: r \leftarrow \frac{r (1 - p_D)}{1 - r\, p_D}, \qquad 1 - p_D = \beta.
+    .. math:: r \leftarrow \frac{r \beta}{r \beta + 1 - r} = \frac{r (1 - p_D)}{1 - r\, p_D},
+        \qquad p_D = 1 - \beta
 
     Examples
     --------
     >>> round(after_empty_look(0.788, 0.1), 3)
     0.271
     """
+    # At r = 1 and beta = 0 the ratio is 0/0; what certainly exists stays.
     missed = existence * miss_rate
     return missed / (missed + 1.0 - existence) if existence < 1.0 else 1.0
 
 
 def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> float:
-    r"""Return the existence after a look that found something in its place.
+    r"""Return the existence after a detection.
 
-    .. math:: r \leftarrow \frac{r\, p_D}{r\, p_D + (1 - r)\, c}
+    .. math:: r \leftarrow \frac{r\, (1 - \beta (1 - c))}{r\, (1 - \beta (1 - c)) + (1 - r)\, c}
 
     Examples
     --------
     >>> round(after_sighting(0.5, 0.04, 0.01), 3)
     0.99
     """
+    # A look finds something where the entity is detected or, if it is missed, where there is clutter.
     found = existence * (1.0 - miss_rate * (1.0 - clutter_rate))
     return found / (found + (1.0 - existence) * clutter_rate)
 
 
 def after_time(existence: float, step_s: float, mean_life_s: float) -> float:
-    """Return the existence after a time in which nobody looked.
+    r"""Return the existence after a time without looks.
+
+    .. math:: r \leftarrow r\, e^{-dt / \tau}
 
     Examples
     --------

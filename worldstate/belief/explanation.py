@@ -1,4 +1,4 @@
-"""The belief over explanations, carried through time in log space."""
+"""The belief over explanations, a hidden Markov model filtered in log space."""
 
 from dataclasses import dataclass, replace
 
@@ -11,15 +11,18 @@ from worldstate.ground.typing import FloatArray
 
 from .markov_chain import RatesHz, equilibrium, transition
 
-# Keeps every log finite: about 1e-261, far below anything that a likelihood could bring back in time.
+# About 1e-261: keeps every log finite, and is far below what the likelihoods of a few windows could raise
+# again.
 LOG_FLOOR = -600.0
 
-_FOLDED_IN = Unqueried("already weighed into the prior")
+# The co-evidence enters through the prior here, with the evidence of the other sources, and must not count
+# again.
+_IN_PRIOR = Unqueried("already weighed into the prior")
 
 
 @dataclass(frozen=True, slots=True)
 class ExplanationBelief:
-    r"""P(hidden_k), P(in view, come from k), P(in view, from elsewhere), P(none), given all so far.
+    r"""Filtered P(hidden_k), P(in view, come from k), P(in view, from elsewhere) and P(none).
 
     predict is the Chapman-Kolmogorov step :math:`p \leftarrow p\, e^{Q\,dt}`, update is eq. (6).
 
@@ -31,24 +34,24 @@ class ExplanationBelief:
     """
 
     directions: tuple[str, ...]  # The K approach sides
-    log_probabilities: tuple[float, ...]  # In the order of `chain`, length 2K + 2, nats
+    log_probabilities: tuple[float, ...]  # In the order of `markov_chain`, length 2K + 2, nats
 
     @classmethod
     def settled(cls, directions: tuple[str, ...], rates_hz: RatesHz) -> "ExplanationBelief":
-        """Return the equilibrium of the rates, with nothing yet known to have come from a side."""
-        return cls(directions, _logs(equilibrium(rates_hz, len(directions))))._disowned()
+        """Return the equilibrium of the rates, all visible mass from elsewhere."""
+        return cls(directions, _logs(equilibrium(rates_hz, len(directions))))._without_origins()
 
     @classmethod
     def from_priors(
         cls, directions: tuple[str, ...], hidden: float, visible: float, none: float
     ) -> "ExplanationBelief":
-        """Return the three given priors, the hidden one spread evenly over the directions."""
+        """Return the belief of three priors, the hidden one divided evenly among the directions."""
         k = len(directions)
         return cls(directions, _logs(np.array([*[hidden / k] * k, *[0.0] * k, visible, none])))
 
     @property
     def probabilities(self) -> FloatArray:
-        """Shape (2K + 2,), in the order of `chain`."""
+        """Shape (2K + 2,), in the order of `markov_chain`."""
         return np.exp(self.log_probabilities)
 
     @property
@@ -64,7 +67,7 @@ class ExplanationBelief:
 
     @property
     def hidden_total(self) -> float:
-        """P(hidden): the first of the paper's three explanations."""
+        """P(hidden) over all directions, as in eq. (6)."""
         return float(self.probabilities[: len(self.directions)].sum())
 
     @property
@@ -87,7 +90,7 @@ class ExplanationBelief:
         evidence: SignatureEvidence,
         log_co_evidence: FloatArray,
     ) -> "ExplanationBelief":
-        """Return the belief after one look.
+        """Return the belief after one window with its co-evidence.
 
         Shapes: log_co_evidence (K + 2,).
         """
@@ -95,14 +98,15 @@ class ExplanationBelief:
         parts = np.array(self.log_probabilities[k:-1])
         visible = np.logaddexp.reduce(parts)
         prior = np.array([*self.log_probabilities[:k], visible, self.log_probabilities[-1]])
-        seen: Posterior = abduce(prior + log_co_evidence, evidence, _FOLDED_IN)
+        seen: Posterior = abduce(prior + log_co_evidence, evidence, _IN_PRIOR)
         posterior = np.array(seen.log_probabilities)
         spread = np.concatenate([posterior[:k], parts + (posterior[-2] - visible), posterior[-1:]])
         return replace(self, log_probabilities=tuple(np.clip(spread, LOG_FLOOR, 0.0).tolist()))
 
     def emerge(self, direction: int, residual: float) -> "ExplanationBelief":
-        """Return the belief once vision has the vehicle of a direction: its mass is in view now."""
-        # `residual` is the share that stays hidden: the sighting may have been of another vehicle.
+        """Return the belief after a hand-over: the hidden mass of a direction moves into view."""
+        # `residual` is the share that stays hidden, since the sighting may be of another vehicle. The rest
+        # counts as from elsewhere: the entity is seen now, and its existence no longer read from here.
         p, k = self.probabilities, len(self.directions)
         moved = p[direction] * (1.0 - residual)
         p[direction] -= moved
@@ -110,17 +114,17 @@ class ExplanationBelief:
         p[k + direction] = 0.0
         return replace(self, log_probabilities=_logs(p))
 
-    def disown(self, direction: int) -> "ExplanationBelief":
-        """Return the belief with whatever came into view from a direction counted as from elsewhere."""
+    def forget_origin(self, direction: int) -> "ExplanationBelief":
+        """Return the belief with the visible mass that came from a direction counted as from elsewhere."""
         p, k = self.probabilities, len(self.directions)
         p[2 * k] += p[k + direction]
         p[k + direction] = 0.0
         return replace(self, log_probabilities=_logs(p))
 
-    def _disowned(self) -> "ExplanationBelief":
+    def _without_origins(self) -> "ExplanationBelief":
         belief = self
         for direction in range(len(self.directions)):
-            belief = belief.disown(direction)
+            belief = belief.forget_origin(direction)
         return belief
 
 

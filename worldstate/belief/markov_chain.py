@@ -3,7 +3,7 @@ r"""The Markov chain of explanations in continuous time.
 Its states are, in order: hidden in direction 1 .. K, in view having come from direction 1 .. K, in view from
 elsewhere, none. All visible states leave at the same rates, so the chain lumps exactly onto (hidden_1 ..
 hidden_K, visible, none) and, with equal rates for all directions, onto the three explanations. What the finer
-chain adds is the answer to "was that the one we heard before?".
+chain adds is whether a source in view is the one that was heard while hidden.
 """
 
 from functools import lru_cache
@@ -16,7 +16,7 @@ from worldstate.ground.values import NANOSECONDS_PER_SECOND
 RatesHz = tuple[float, float, float, float, float, float]
 """arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""
 
-# After that long the chain has forgotten everything; larger exponents would only cost digits.
+# At any rate above .01/s the chain is in equilibrium by then; a larger exponent of expm only costs digits.
 LONGEST_STEP_S = 1000.0
 
 
@@ -68,7 +68,7 @@ def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
-    """Return where the chain settles from "none", shape (2K + 2,).
+    """Return the distribution that the chain reaches from "none" after a long time, shape (2K + 2,).
 
     Examples
     --------

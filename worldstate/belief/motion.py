@@ -13,9 +13,11 @@ from worldstate.ground.values import wrap_angle
 
 from .polar import AZIMUTH, LOG_RANGE, RADIAL_RATE, jacobian, process_noise, propagate
 
-# No range is ever measured from a standing ego; the belief about it only scales accelerations.
+# Range only scales the angular noise of an acceleration, and bearings from a standing ego do not measure it:
+# outside these limits the noise would vanish or throw the bearing.
 _NEAREST_M, _FARTHEST_M = 3.0, 200.0
-# Nobody drives through the array: within a step a vehicle comes no closer than half its range.
+# Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
+# array.
 _CLOSEST_SHARE = 0.5
 
 
@@ -29,7 +31,7 @@ def _covariance(row: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionBelief:
-    """Gaussian over (theta, theta_dot, rho, log r); see `polar`.
+    """Gaussian over (theta, theta_dot, rho, log r), the modified polar coordinates of `polar`.
 
     Examples
     --------
@@ -97,10 +99,11 @@ def relax(
 
     .. math:: m \leftarrow m_0 + \Phi (m - m_0), \quad P \leftarrow \Phi P \Phi + (I - \Phi^2) P_0
 
-    with :math:`\Phi` diagonal: `bearing_kept` for (theta, theta_dot), `radial_kept` for (rho, log r). P_0 has
-    to be diagonal. Constant velocity alone would drive a vehicle out of its occlusion unheard, or, at a
-    constant bearing whose range nobody measures, straight through the array.
+    with :math:`\Phi` diagonal, `bearing_kept` for (theta, theta_dot) and `radial_kept` for (rho, log r), and
+    P_0 diagonal.
     """
+    # Constant velocity alone would move a hidden vehicle out of its occlusion without evidence or, at a
+    # constant bearing without a measured range, through the array.
     phi = np.array([bearing_kept, bearing_kept, radial_kept, radial_kept])
     offset = belief.mean - towards.mean
     offset[AZIMUTH] = wrap_angle(float(offset[AZIMUTH]))

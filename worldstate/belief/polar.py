@@ -26,7 +26,7 @@ from worldstate.ground.typing import FloatArray
 
 AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
 
-# The vehicle passes through the array itself at q = 0; nothing that drives comes that close.
+# q = 0 is a vehicle at the array itself, where the coordinates are singular; 1e-3 is 3 % of the first range.
 _LEAST_Q = 1e-3
 
 

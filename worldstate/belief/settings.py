@@ -1,4 +1,4 @@
-"""The numbers of the filter, each with what it stands for."""
+"""Settings of the filter."""
 
 from dataclasses import dataclass, fields
 
@@ -8,13 +8,13 @@ from worldstate.ground.errors import InvalidArgumentError
 
 @dataclass(frozen=True, slots=True)
 class FilterSettings:
-    """How much to believe of what, and when to say that something is there.
+    """Noise levels, association gates, and thresholds of birth and death.
 
     Parameters
     ----------
     window_s : float
         Length of the window that a signature is computed on. Windows that overlap repeat most of their
-        samples: explanations build on the belief of one window ago (`trail`), and a bearing or approach rate
+        samples: explanations build on the belief of one window ago, and a bearing or approach rate
         weighs kappa = (time since the last one) / window, at most 1.
     look_interval_s : float
         Looks of the co-evidence channel closer in time than this repeat each other's misses (same object,
@@ -80,32 +80,37 @@ class FilterSettings:
     1.0
     """
 
-    window_s: float = 1.0
-    look_interval_s: float = 0.3
+    window_s: float = 1.0  # Of the published feature
+    look_interval_s: float = 0.3  # Three images at 10 Hz: misses of consecutive images repeat each other
+    # Far apart: with one threshold for both, a belief that wavers about it would change ids at every hop.
     birth_probability: float = 0.5
     death_probability: float = 0.1
-    rearm_s: float = 1.0
-    relaxation_s: float = 1.0
-    acceleration_psd: float = 2.0
+    rearm_s: float = 1.0  # One window
+    relaxation_s: float = 1.0  # One window: what the sound of the last one did not confirm fades
+    acceleration_psd: float = 2.0  # 1.4 m/s of speed in a second: braking and turning in town
+    # 5 m/s at 25 m, give or take as much again; the range within a factor of 1.8.
     hidden_std: tuple[float, float, float] = (0.15, 0.25, 0.6)
     hidden_inverse_tta_hz: float = 0.2
     hidden_range_m: float = 25.0
-    hidden_path_probability: float = 0.25
+    hidden_path_probability: float = 0.25  # 21 % of the peaks in real hidden windows, rounded up
     hidden_bearing_std_rad: float = 0.25
     hidden_bias_std_rad: float = 0.17
     line_of_sight_path_probability: float = 0.8
+    # The second bounds the first: four deviations of an entity unseen for a second are most of the view.
     gate_sigma: float = 4.0
     gate_rad: float = 0.35
-    handover_gate_rad: float = 0.8
+    handover_gate_rad: float = 0.8  # Less than the 64 deg between the edges of a default junction
     side_confusion: float = 0.2
     unheard_probability: float = 0.05
-    handover_residual: float = 0.02
+    handover_residual: float = (
+        0.02  # Above zero, or a second vehicle behind the same corner could not be heard
+    )
     sighting_existence: float = 0.5
     clutter_rate: float = 0.01
     visible_life_s: float = 10.0
     delete_existence: float = 0.05
-    lost_std_rad: float = 0.8
-    reocclusion_after_s: float = 0.15
+    lost_std_rad: float = 0.8  # Beyond, the azimuth says no more than which half of the view
+    reocclusion_after_s: float = 0.15  # More than one image at 10 Hz: a single miss is no occlusion
     reocclusion_s: float = 3.0
     stream: str = "worldstate"
 

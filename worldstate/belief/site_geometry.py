@@ -1,4 +1,4 @@
-"""The place as the beliefs need it: where hidden vehicles are, and where they come into view."""
+"""Geometry of the site: where hidden vehicles are, where they come into view, and what the camera sees."""
 
 import math
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ class SideGeometry:
     std_rad: float
 
     def distance_rad(self, azimuth_rad: float) -> float:
-        """Angle between an azimuth and the occluder's edge, >= 0."""
+        """Return the angle between an azimuth and the occluder's edge, >= 0."""
         return abs(wrap_angle(azimuth_rad - self.edge_azimuth_rad))
 
     def prior(self, settings: FilterSettings) -> MotionBelief:
-        """Return what is known of a vehicle hidden here before anything is measured of its motion."""
+        """Return the prior motion of a vehicle hidden here."""
         log_range = math.log(settings.hidden_range_m)
         return MotionBelief.around(
             (self.azimuth_rad, 0.0, -settings.hidden_inverse_tta_hz, log_range),
@@ -39,14 +39,14 @@ class SideGeometry:
 
 @dataclass(frozen=True, slots=True)
 class SiteGeometry:
-    """What stays the same from step to step."""
+    """All sides, the field of view and the settings, constant from step to step."""
 
     sides: tuple[SideGeometry, ...]  # Approach sides, in the order of the signature's directions
     view_half_angle_rad: float  # Half the field of view of the co-evidence channel, centred on the x axis
     settings: FilterSettings  # Noise levels, gates, births and deaths
 
     def prior(self, side: int) -> MotionBelief:
-        """Return what is known of a vehicle hidden on a side."""
+        """Return the prior motion of a vehicle hidden on a side."""
         return self.sides[side].prior(self.settings)
 
     def nearest_side(self, azimuth_rad: float) -> int:
@@ -54,5 +54,5 @@ class SiteGeometry:
         return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
 
     def in_view(self, azimuth_rad: float) -> bool:
-        """Whether the co-evidence channel can see there."""
+        """Tell whether an azimuth is in the field of view of the co-evidence channel."""
         return abs(azimuth_rad) <= self.view_half_angle_rad

@@ -1,4 +1,4 @@
-"""What a look of the co-evidence channel does: sightings, empty looks, hand-over from hidden to visible."""
+"""Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
 from dataclasses import dataclass, replace
 
@@ -17,15 +17,17 @@ from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, merged, relabelled
 
+# Of (theta_dot rad/s, rho 1/s) at the first sighting: a car at 50 km/h passing at 15 m has .9 rad/s, two
+# deviations. A parked one has none, but zero would make the covariance singular.
 _NEW_RATE_STD = (0.5, 0.5)
 _PARKED_RATE_STD = (1e-3, 1e-3)
-# A channel that was said to miss everything and yet found something was not that blind.
+# A detection by a channel said to miss everything would carry no information; its miss rate is capped here.
 _MOST_MISSES = 0.99
 
 
 @dataclass(frozen=True, slots=True)
 class VisionUpdate:
-    """Outcome of a look: the tracks, the explanations, and on which sides a hand-over took place."""
+    """Result of a look: tracks, explanations, sides of hand-overs, number of entities born in view so far."""
 
     tracks: tuple[Track, ...]
     explanation: ExplanationBelief
@@ -45,37 +47,38 @@ def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
     return np.array([*[hidden] * directions, visible, none])
 
 
-def look(
+def vision_update(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
     measurement: Measurement,
     weight: float,
     born: int,
-    scene: SiteGeometry,
+    site: SiteGeometry,
 ) -> VisionUpdate:
-    """Return the world after one look; `born` counts the entities that vision brought in so far."""
+    """Return tracks and explanations after one look; `born` counts the entities born in view so far."""
+    # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings = tuple(sorted(measurement.sightings, key=lambda s: (s.azimuth_rad, s.label, s.score)))
-    known = match_visible(tracks, sightings, scene.settings)
+    known = match_visible(tracks, sightings, site.settings)
     new = tuple((j, s) for j, s in enumerate(sightings) if j not in known.values())
-    emerging = match_hidden(tracks, new, scene)
+    emerging = match_hidden(tracks, new, site)
     after = []
     for i, track in enumerate(tracks):
         if i in known:
-            after.append(_sighted(track, sightings[known[i]], measurement, scene.settings))
+            after.append(_sighted(track, sightings[known[i]], measurement, site.settings))
         elif i in emerging:
-            after.append(_handed_over(track, sightings[emerging[i]], measurement, scene))
+            after.append(_handed_over(track, sightings[emerging[i]], measurement, site))
         else:
-            after.append(_not_sighted(track, measurement.co_evidence, weight, scene))
+            after.append(_not_sighted(track, measurement.co_evidence, weight, site))
     handed_over = tuple(tracks[i].side for i in emerging)
     for side in handed_over:
-        explanation = explanation.emerge(side, scene.settings.handover_residual)
+        explanation = explanation.emerge(side, site.settings.handover_residual)
     fresh = [s for j, s in new if j not in emerging.values()]
-    after += [_born(s, measurement, born + n, scene) for n, s in enumerate(fresh)]
+    after += [_born(s, measurement, born + n, site) for n, s in enumerate(fresh)]
     return VisionUpdate(tuple(after), explanation, handed_over, born + len(fresh))
 
 
 def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
-    """Return the tracks without the visible ones that no longer exist or are lost."""
+    """Return the tracks without seen entities of too little existence or too uncertain azimuth."""
     return tuple(
         track
         for track in tracks
@@ -88,14 +91,15 @@ def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Trac
 
 
 def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
-    """Return miss and clutter rate of a look; a channel that was not asked has neither."""
+    """Return the miss and clutter rate of a look."""
     if isinstance(answer, Unqueried):
+        # Sightings outside the sector asked about: found without a stated miss rate.
         return 0.0, settings.clutter_rate
     return min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or settings.clutter_rate
 
 
 def _found(track: Track, measurement: Measurement, settings: FilterSettings) -> Track:
-    """Return a track that a sighting was given to: its existence and its time stamps."""
+    """Return an associated track with existence, sources and time stamps updated."""
     miss, clutter = _rates(measurement.co_evidence, settings)
     return replace(
         track,
@@ -118,36 +122,37 @@ def _sighted(track: Track, sighting: Sighting, measurement: Measurement, setting
     return _found(changed, measurement, settings)
 
 
-def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, scene: SiteGeometry) -> Track:
-    """Return the hidden entity as vision now has it: same id, azimuth and side from the sighting."""
+def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
+    """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
     seen = replace(
         track,
         seen=True,
-        side=scene.nearest_side(sighting.azimuth_rad),
-        existence=max(track.existence, scene.settings.sighting_existence),
+        side=site.nearest_side(sighting.azimuth_rad),
+        existence=max(track.existence, site.settings.sighting_existence),
         motion=_motion_at(sighting, track.motion),
         labels=((sighting.label, sighting.score),),
     )
-    return _found(seen, measurement, scene.settings)
+    return _found(seen, measurement, site.settings)
 
 
-def _not_sighted(track: Track, answer: CoEvidence, weight: float, scene: SiteGeometry) -> Track:
+def _not_sighted(track: Track, answer: CoEvidence, weight: float, site: SiteGeometry) -> Track:
     if not track.seen:
         searched = isinstance(answer, Absent)
         miss = answer.miss_rate if isinstance(answer, Absent) else None
         return replace(track, answer="absent" if searched else "unqueried", miss_rate=miss)
-    if isinstance(answer, Unqueried) or not scene.in_view(track.motion.azimuth_rad):
+    # Absent speaks of one sector; what stands outside the field of view was not looked for.
+    if isinstance(answer, Unqueried) or not site.in_view(track.motion.azimuth_rad):
         return replace(track, answer="unqueried", miss_rate=None)
     existence = after_empty_look(track.existence, answer.miss_rate**weight)
     return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
 
 
-def _born(sighting: Sighting, measurement: Measurement, number: int, scene: SiteGeometry) -> Track:
+def _born(sighting: Sighting, measurement: Measurement, number: int, site: SiteGeometry) -> Track:
     unseen = Track(
-        id=entity_id(scene.settings.stream, "visible", number),
-        side=scene.nearest_side(sighting.azimuth_rad),
+        id=entity_id(site.settings.stream, "visible", number),
+        side=site.nearest_side(sighting.azimuth_rad),
         seen=True,
-        existence=scene.settings.sighting_existence,
+        existence=site.settings.sighting_existence,
         motion=_motion_at(sighting, None),
         labels=((sighting.label, sighting.score),),
         moving=sighting.moving,
@@ -155,11 +160,11 @@ def _born(sighting: Sighting, measurement: Measurement, number: int, scene: Site
         created_ns=measurement.stamp_ns,
         updated_ns=measurement.stamp_ns,
     )
-    return _found(unseen, measurement, scene.settings)
+    return _found(unseen, measurement, site.settings)
 
 
 def _motion_at(sighting: Sighting, before: MotionBelief | None) -> MotionBelief:
-    """Return a motion that starts at a sighting, with approach rate and range of a belief before it."""
+    """Return the motion belief at a sighting, with approach rate and range of an earlier belief."""
     rate_std, radial_std = _NEW_RATE_STD if sighting.moving else _PARKED_RATE_STD
     mean, std = [sighting.azimuth_rad, 0.0, 0.0, 3.2], [sighting.std_rad, rate_std, radial_std, 0.6]
     if before is not None and sighting.moving:

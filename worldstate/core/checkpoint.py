@@ -88,11 +88,11 @@ class FilterRecord:
 
 def memory_record(memory: Memory) -> _Memory:
     """Return what a checkpoint keeps of a memory."""
-    trail, instant = memory.trail, memory.instant
+    lag, instant = memory.lag, memory.instant
     return _Memory(
         stamp_ns=memory.stamp_ns,
         log_explanations=memory.explanation.log_probabilities,
-        trail=_BeliefLag(tuple((ns, b.log_probabilities) for ns, b in trail.beliefs), trail.heard),
+        trail=_BeliefLag(tuple((ns, b.log_probabilities) for ns, b in lag.beliefs), lag.heard),
         rule_run=memory.rule.run,
         births=memory.births,
         handover_ns=memory.handover_ns,
@@ -113,7 +113,7 @@ def memory_of(record: FilterRecord) -> Memory:
     return Memory(
         stamp_ns=kept.stamp_ns,
         explanation=ExplanationBelief(directions, kept.log_explanations),
-        trail=BeliefLag(beliefs, kept.trail.heard),
+        lag=BeliefLag(beliefs, kept.trail.heard),
         rule=SustainedRule(record.policy.sustain_hops, kept.rule_run),
         births=kept.births,
         handover_ns=kept.handover_ns,

@@ -32,7 +32,7 @@ from .step import (
     weights_of,
 )
 
-# A step and the stamp that it aims at may differ by the rounding of sample counts.
+# A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
 
 
@@ -55,6 +55,7 @@ def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
     0.9
     """
     prior = (1.0 / (directions + 2),) * (directions + 2)
+    # Three windows in a row above .9; slope -1 and offset 0 make the risk the statistic itself.
     return CueingPolicy(0.9, 3, 0.0, prior, PlattMap(-1.0, 0.0))
 
 
@@ -161,7 +162,7 @@ class WorldFilter:
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":
-        """Return the filter `dt_s` seconds later, nothing having been measured.
+        """Return the filter `dt_s` seconds later, without a measurement.
 
         Raises
         ------
@@ -183,12 +184,12 @@ class WorldFilter:
             raise InvalidArgumentError(
                 f"stamp_ns: expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
             )
-        if stamp_ns <= self.stamp_ns:
+        if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
         return replace(self, memory=advance(self._memory, stamp_ns, self._model))
 
     def update(self, measurement: Measurement) -> "WorldFilter":
-        """Return the filter after a measurement, predicted to its time first where that was not done.
+        """Return the filter after a measurement, predicted to its time stamp first.
 
         Raises
         ------
@@ -199,10 +200,12 @@ class WorldFilter:
         stamp_ns = _integer_ns("stamp_ns", measurement.stamp_ns)
         if stamp_ns is not measurement.stamp_ns:  # numpy's integers cannot be written as JSON
             measurement = replace(measurement, stamp_ns=stamp_ns)
+        # Before anything is computed: a measurement that is refused leaves the filter as it was.
         _check(measurement, self.context, dict(self._memory.last_ns))
         world = self.predict_to(measurement.stamp_ns)
         memory, model = world._memory, world._model
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
+        # Evidence first: association and births need the explanations of this very window.
         memory = update_evidence(memory, measurement, weights, model)
         memory = update_sightings(memory, measurement, weights, model)
         memory = update_advisories(memory, measurement, model)
@@ -247,14 +250,15 @@ class WorldFilter:
 
 
 def _integer_ns(name: str, value: object) -> int:
-    """Return a time stamp as a Python integer; NaN and infinity would pass every comparison unnoticed."""
+    """Return a time stamp as a Python integer."""
+    # NaN and infinity would pass the comparisons of `predict_to` and stay in the belief.
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise InvalidArgumentError(f"{name}: expected integer nanoseconds, got {value!r}")
     return int(value)
 
 
 def _check(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> None:
-    """Refuse what would poison the belief: the engine takes NaN without a word."""
+    """Refuse measurements that do not fit the context or hold numbers out of range."""
     if measurement.signature.directions != context.directions:
         raise InvalidArgumentError(
             f"signature: expected the directions {context.directions}, got {measurement.signature.directions}"

@@ -1,4 +1,4 @@
-"""What the filter carries from one call to the next."""
+"""The state that the filter carries from one call to the next."""
 
 from dataclasses import dataclass, field
 
@@ -13,17 +13,17 @@ from worldstate.state import Context, Priors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Memory:
-    """All of it; the rest of a filter is configuration."""
+    """State of a filter; everything else in it is configuration."""
 
     stamp_ns: int  # Time of the belief
     explanation: ExplanationBelief  # Which explanation holds
-    trail: BeliefLag  # Its past of one window
+    lag: BeliefLag  # Its past of one window
     rule: SustainedRule  # Run of the statistic above its threshold
-    births: tuple[int, ...]  # Hidden entities that each side has brought forth
+    births: tuple[int, ...]  # Hidden entities born so far on each side
     handover_ns: tuple[int | None, ...]  # Last hand-over on each side
     tracks: tuple[Track, ...] = ()  # Entities
     seq: int = 0  # Measurements so far
-    sighted: int = 0  # Entities that vision brought in by itself
+    sighted: int = 0  # Entities born in view so far
     last_ns: tuple[tuple[str, int], ...] = ()  # Last time stamp of each source
     predicted: Priors | None = None  # Explanation priors of the last update; None before the first
     # Posterior of the last window alone, at the policy's reference prior; None before the first.
@@ -38,7 +38,7 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
     return Memory(
         stamp_ns=start_ns,
         explanation=explanation,
-        trail=BeliefLag(((start_ns, explanation),)),
+        lag=BeliefLag(((start_ns, explanation),)),
         rule=policy.rule(),
         births=(0,) * len(directions),
         handover_ns=(None,) * len(directions),
@@ -46,7 +46,8 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
 
 
 def priors_of(explanation: ExplanationBelief) -> Priors:
-    """Return the three explanations of the paper."""
+    """Return the probabilities of the three explanations of eq. (6)."""
+    # A sum of exponentials may exceed one by rounding, which readers of a snapshot refuse.
     values = (explanation.hidden_total, explanation.visible, explanation.none)
     return Priors(*(min(value, 1.0) for value in values))
 

@@ -1,4 +1,4 @@
-"""From beliefs to the snapshot: what of them is said aloud, and how."""
+"""Build the public WorldState from the internal beliefs."""
 
 import math
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from worldstate.state.relation import EGO
 from .memory import Memory, priors_of
 from .step import FilterModel
 
-# A range whose logarithm is less certain than this was never measured, only assumed.
+# Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
 _KNOWN_LOG_RANGE_STD = 0.25
 
 
 def entity_of(
     track: Track, explanation: ExplanationBelief, context: Context, settings: FilterSettings
 ) -> Entity:
-    """Return the public face of a track."""
+    """Return the published entity of a track."""
     share, existence = hidden_share(track, explanation), existence_of(track, explanation)
     hidden, motion = share >= 0.5, track.motion
     range_m = _range(motion, hidden)
@@ -51,29 +51,31 @@ def entity_of(
 
 
 def existence_of(track: Track, explanation: ExplanationBelief) -> float:
-    """Return the existence of a track: its own once vision has it, before that what its side's sound says."""
+    """Return the existence of a track, from the explanation belief of its side until it is seen."""
     if track.seen:
         return track.existence
     return min(explanation.hidden[track.side] + explanation.emerged[track.side], 1.0)
 
 
 def time_to_arrival(track: Track) -> float | None:
-    """Return TTA in seconds, where an approach was heard and is positive by more than one deviation."""
+    """Return TTA in seconds where a measured approach rate exceeds its standard deviation, else None."""
     rate = track.motion.inverse_tta_hz
     return 1.0 / rate if track.approach_heard and rate > track.motion.inverse_tta_std_hz else None
 
 
 def published_std(motion: MotionBelief, hidden: bool, settings: FilterSettings) -> float:
-    """Return the azimuth's standard deviation; while hidden, what is heard comes round the corner."""
+    """Return the published standard deviation of the azimuth, with the bias of the path while hidden."""
     if not hidden:
         return motion.azimuth_std_rad
+    # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
+    # that.
     return math.hypot(motion.azimuth_std_rad, settings.hidden_bias_std_rad)
 
 
 def relations_of(
     track: Track, explanation: ExplanationBelief, context: Context, stamp_ns: int
 ) -> list[Relation]:
-    """Return the edges of one entity: to what hides it or hid it, and to the ego vehicle it approaches."""
+    """Return the relations of one entity to its occluder and to the ego vehicle."""
     occluder, edges = context.occluders[track.side].id, []
     if not track.seen:
         share = hidden_share(track, explanation)
@@ -88,31 +90,32 @@ def relations_of(
 
 
 def cues_of(
-    memory: Memory, ground: FilterModel, hazard_risk: float, alarmed: Sequence[bool]
+    memory: Memory, model: FilterModel, hazard_risk: float, alarmed: Sequence[bool]
 ) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
     if memory.instant is None:
         return ()
-    return tuple(_cue(k, memory, ground, hazard_risk, named) for k, named in enumerate(alarmed))
+    return tuple(_cue(k, memory, model, hazard_risk, named) for k, named in enumerate(alarmed))
 
 
-def _cue(k: int, memory: Memory, ground: FilterModel, hazard_risk: float, named: bool) -> RiskCue:
-    explanation, side, instant = memory.explanation, ground.scene.sides[k], memory.instant
+def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: bool) -> RiskCue:
+    explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
     assert instant is not None
     track = next((t for t in memory.tracks if not t.seen and t.side == k), None)
-    motion = ground.scene.prior(k) if track is None else track.motion
+    motion = model.site.prior(k) if track is None else track.motion
+    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     return RiskCue(
         direction=side.label,
         azimuth_rad=motion.azimuth_rad,
-        azimuth_std_rad=published_std(motion, True, ground.scene.settings),
+        azimuth_std_rad=published_std(motion, True, model.site.settings),
         risk=hazard_risk * share,
         confidence=share,
         statistic=min(instant.hidden_total, 1.0),
         log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
         hypotheses=priors_of(explanation),
         advisory=named,
-        alpha=ground.policy.alpha or None,
+        alpha=model.policy.alpha or None,
         entity_id=None if track is None else track.id,
         horizon_s=None if track is None else time_to_arrival(track),
     )

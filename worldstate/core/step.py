@@ -16,36 +16,36 @@ from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import predict_track
-from worldstate.belief.vision_update import log_co_evidence, look, surviving
+from worldstate.belief.vision_update import log_co_evidence, surviving, vision_update
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Context
 
 from .memory import Memory, priors_of
 
-# Sides whose probabilities differ by rounding only are equally likely.
+# Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class FilterModel:
-    """What does not change while the filter runs."""
+    """Context, policy and site geometry, constant while the filter runs."""
 
     context: Context
     policy: CueingPolicy
-    scene: SiteGeometry
+    site: SiteGeometry
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """How much of a measurement is news to the entities: of the sound, and of the look, in [0, 1]."""
+    """Overlap discounts for the acoustic and the visual likelihood, in [0, 1]."""
 
     sound: float
     look: float
 
 
 def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry:
-    """Return a context as the beliefs need it."""
+    """Return the site geometry of a context."""
     sides = (
         SideGeometry(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
         for o in context.occluders
@@ -54,42 +54,46 @@ def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry
 
 
 def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
-    """Return kappa of the sound and of the look, from the time since the source's last measurement."""
+    r"""Return the overlap discounts from the time since the source's last measurement.
+
+    .. math:: \kappa = \min(dt / T, 1), \quad T = window for the sound, look interval for the look
+    """
     before_ns = dict(memory.last_ns).get(measurement.source, start_ns)
     elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
     return Weights(min(elapsed_s / settings.window_s, 1.0), min(elapsed_s / settings.look_interval_s, 1.0))
 
 
 def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
-    """Return the memory at a later time, nothing having been measured."""
+    """Return the memory predicted to a later time."""
     step_ns, explanation = stamp_ns - memory.stamp_ns, memory.explanation
     tracks = tuple(
-        predict_track(track, hidden_share(track, explanation), seconds(step_ns), model.scene)
+        predict_track(track, hidden_share(track, explanation), seconds(step_ns), model.site)
         for track in memory.tracks
     )
     return replace(
         memory,
         stamp_ns=stamp_ns,
         explanation=explanation.predict(model.context.rates.values_hz, step_ns),
-        tracks=surviving(tracks, model.scene.settings),
+        tracks=surviving(tracks, model.site.settings),
     )
 
 
 def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel) -> Memory:
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
-    settings, source, stamp_ns = model.scene.settings, measurement.source, measurement.stamp_ns
+    settings, source, stamp_ns = model.site.settings, measurement.source, measurement.stamp_ns
     window_ns = nanoseconds(settings.window_s)
-    base = memory.trail.base(source, stamp_ns, window_ns)
+    base = memory.lag.base(source, stamp_ns, window_ns)
     prior = base.belief.predict(model.context.rates.values_hz, stamp_ns - base.stamp_ns)
-    answer = log_co_evidence(measurement.co_evidence, len(model.scene.sides))
+    answer = log_co_evidence(measurement.co_evidence, len(model.site.sides))
     signature = _with_hand_overs(measurement.signature, memory.handover_ns, stamp_ns - window_ns)
     explanation = prior.update(signature, answer + base.log_likelihoods)
-    said = np.maximum(signature.log_likelihoods + answer, LOG_FLOOR)
-    heard = SourceEvidence(source, stamp_ns, tuple(said.tolist()))
+    # -inf would stay for the length of the lag and cannot be written as JSON.
+    own = np.maximum(signature.log_likelihoods + answer, LOG_FLOOR)
+    evidence = SourceEvidence(source, stamp_ns, tuple(own.tolist()))
     return replace(
         memory,
         explanation=explanation,
-        trail=memory.trail.add(heard, explanation, window_ns),
+        lag=memory.lag.add(evidence, explanation, window_ns),
         tracks=acoustic_update(memory.tracks, measurement, explanation, weights.sound, settings),
         predicted=priors_of(prior),
     )
@@ -98,8 +102,9 @@ def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, 
 def _with_hand_overs(
     signature: SignatureEvidence, handover_ns: tuple[int | None, ...], begin_ns: int
 ) -> SignatureEvidence:
-    """Return the signature, a source in view explaining what it sounded like while it still hid."""
-    # The window that begins at `begin_ns` holds sound from before a hand-over within it.
+    """Return the evidence, its visible likelihood at least the hidden one for a window after a hand-over."""
+    # A window that begins before a hand-over holds sound of the vehicle while it was hidden; without this,
+    # that sound would give birth to a second hidden entity.
     pairs = zip(signature.hidden, handover_ns, strict=True)
     before = [hidden for hidden, stamp_ns in pairs if stamp_ns is not None and stamp_ns > begin_ns]
     return replace(signature, visible=max([signature.visible, *before]))
@@ -108,34 +113,36 @@ def _with_hand_overs(
 def update_sightings(
     memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel
 ) -> Memory:
-    """Return the memory after the sightings, the empty looks and the hand-overs they bring."""
-    seen = look(
+    """Return the memory after detections, missed detections and hand-overs."""
+    seen = vision_update(
         memory.tracks,
         memory.explanation,
         measurement,
         weights.look,
         memory.sighted,
-        model.scene,
+        model.site,
     )
     handover_ns = tuple(
         measurement.stamp_ns if k in seen.handed_over else before_ns
         for k, before_ns in enumerate(memory.handover_ns)
     )
-    residual, trail = model.scene.settings.handover_residual, memory.trail
+    # The lagged beliefs are what the next windows build on: they have to know of the hand-over, too.
+    residual, lag = model.site.settings.handover_residual, memory.lag
     for side in seen.handed_over:
-        trail = trail.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
+        lag = lag.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
     return replace(
         memory,
-        tracks=surviving(seen.tracks, model.scene.settings),
+        tracks=surviving(seen.tracks, model.site.settings),
         explanation=seen.explanation,
-        trail=trail,
+        lag=lag,
         handover_ns=handover_ns,
         sighted=seen.born,
     )
 
 
 def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
-    """Return the memory after the sustained rule has taken in this window's statistic."""
+    """Return the memory after the sustained rule has seen this window's statistic."""
+    # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
     log_prior = np.log(model.policy.reference_prior)
     instant = abduce(log_prior, measurement.signature, measurement.co_evidence)
     held = instant.hidden_total >= model.policy.gamma_at(memory.threshold.shift_nats)
@@ -144,7 +151,7 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
 
 
 def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThreshold:
-    """Return the threshold's state after this window, once the belief has taken it in."""
+    """Return the adaptive threshold after this window."""
     if policy.adaptive is None:
         return memory.threshold
     before_ns = max((ns for _, ns in memory.last_ns), default=stamp_ns)
@@ -158,15 +165,15 @@ def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThr
 
 
 def alarmed(memory: Memory) -> tuple[bool, ...]:
-    """Return for each side whether the advisory names it: the likeliest one, or both in a tie."""
+    """Return for each side whether an advisory names it: the likeliest side, or all in a tie."""
     hidden = memory.explanation.hidden
     least = max(hidden) * (1.0 - _TIE)
     return tuple(memory.rule.alarm and p >= least for p in hidden)
 
 
 def update_entities(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
-    """Return the memory after births and deaths of hidden entities, the measurement counted."""
-    rearm_ns = model.scene.settings.rearm_s * NANOSECONDS_PER_SECOND
+    """Return the memory after births and deaths of hidden entities."""
+    rearm_ns = model.site.settings.rearm_s * NANOSECONDS_PER_SECOND
     hidden = birth_death(
         memory.tracks,
         memory.explanation,
@@ -174,17 +181,17 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
         alarmed(memory),
         [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
         measurement,
-        model.scene,
+        model.site,
     )
-    trail = memory.trail
+    lag = memory.lag
     for side in hidden.begun:
-        trail = trail.map(partial(ExplanationBelief.disown, direction=side))
+        lag = lag.map(partial(ExplanationBelief.forget_origin, direction=side))
     last_ns = dict(memory.last_ns) | {measurement.source: measurement.stamp_ns}
     return replace(
         memory,
         tracks=hidden.tracks,
         explanation=hidden.explanation,
-        trail=trail,
+        lag=lag,
         births=hidden.births,
         seq=memory.seq + 1,
         last_ns=tuple(sorted(last_ns.items())),

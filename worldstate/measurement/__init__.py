@@ -1,4 +1,4 @@
-"""What an adapter hands to the filter, and the roles that a modality can play."""
+"""Measurements that adapters pass to the filter, and the protocols of a modality."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What an adapter hands to the filter: one look of one modality at the world."""
+"""Measurements: evidence of one modality at one instant."""
 
 from dataclasses import dataclass
 
@@ -58,7 +58,7 @@ class Approach:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One object that the co-evidence channel reports in plain view.
+    """One object that the co-evidence channel detects.
 
     Parameters
     ----------

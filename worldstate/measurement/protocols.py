@@ -36,7 +36,7 @@ class MeasurementAdapter(Protocol[RawT]):
 
     Examples
     --------
-    An adapter that hears nothing, for blocks of bytes:
+    An adapter without measurements, for blocks of bytes:
 
     >>> class Deaf:
     ...     source = "deaf"
@@ -50,12 +50,12 @@ class MeasurementAdapter(Protocol[RawT]):
     source: str
 
     def measure(self, block: RawT, /) -> list[Measurement]:
-        """Take the next piece of raw input; return what became measurable with it, oldest first."""
+        """Take the next piece of raw input; return the measurements completed by it, oldest first."""
         ...
 
 
 class CoEvidenceChannel(Protocol):
-    """A channel that can be asked whether the co-evidence that a signature predicts is there.
+    """A channel that searches a sector for the co-evidence that a signature predicts.
 
     `adapters.camera.vision_query.VisionQuery` is one, over recorded detections; a live detector is another.
 
@@ -81,5 +81,5 @@ class CoEvidenceChannel(Protocol):
         ...
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
-        """All that the channel reports at this instant, in any sector."""
+        """Return all objects that the channel detects at this instant, in any sector."""
         ...

@@ -34,7 +34,7 @@ class Sector:
         return abs(wrap_angle(azimuth_rad - self.centre_rad)) <= self.half_width_rad + width_rad / 2
 
     def overlap(self, other: "Sector") -> "Sector | None":
-        """Return what two sectors, of less than a full turn together, have in common; None where nothing."""
+        """Return the intersection with another sector, None where empty; less than a full turn together."""
         offset = wrap_angle(self.centre_rad - other.centre_rad)
         low = max(offset - self.half_width_rad, -other.half_width_rad)
         high = min(offset + self.half_width_rad, other.half_width_rad)
@@ -53,6 +53,7 @@ class Sector:
         return cls(wrap_angle(right_rad + half), half)
 
 
+# Ahead only: the front-end's default grid ends at 90 deg, and so do the views of the cameras asked.
 WHOLE_SIDES: dict[Side | None, Sector] = {
     "left": Sector(math.pi / 4, math.pi / 4),
     "right": Sector(-math.pi / 4, math.pi / 4),

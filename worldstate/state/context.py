@@ -1,4 +1,4 @@
-"""Context: what is known of the place before anything is heard."""
+"""Context: rates, occluders, priors and the field of view, given before any measurement."""
 
 import math
 from dataclasses import dataclass, fields
@@ -11,7 +11,7 @@ from worldstate.ground.serialisation import Layout, Probability
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Rates at which explanations give way to each other, 1/s.
+    """Transition rates of the Markov chain of explanations, 1/s.
 
     The defaults are those of a side street with a few vehicles a minute: a hidden vehicle is heard for some
     three seconds before it comes into view, and stays in view for about as long.
@@ -98,7 +98,7 @@ class Priors:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """A static thing that hides one approach: the landmark that hidden entities are related to.
+    """A static object that hides one approach side.
 
     Parameters
     ----------
@@ -149,6 +149,8 @@ def blind_corner(direction: str, side: int) -> Occluder:
     >>> round(blind_corner("right", -1).edge_azimuth_rad, 2)
     -0.56
     """
+    # The nominal corner of OVAD's junctions; three quarters of the peaks in its real hidden windows stand at
+    # 42 to 63 deg.
     edge, hidden, std = math.radians(32.0), math.radians(55.0), math.radians(20.0)
     return Occluder(f"corner_{direction}", direction, side * edge, side * hidden, std)
 

@@ -1,4 +1,4 @@
-"""Entities: road users that the world-state holds, seen or not."""
+"""Entities: road users of the world-state, seen or hidden."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias
@@ -33,7 +33,7 @@ class Classification:
 
 @dataclass(frozen=True, slots=True)
 class Visibility:
-    """What the co-evidence channel last said of an entity.
+    """Last answer of the co-evidence channel about an entity.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The scene graph of a snapshot, for those who query relations."""
+"""The scene graph of a snapshot as a networkx graph."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING

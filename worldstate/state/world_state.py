@@ -1,4 +1,4 @@
-"""The snapshot S_t: what an embedder reads."""
+"""The snapshot S_t."""
 
 import json
 from dataclasses import dataclass, field
@@ -68,7 +68,7 @@ class WorldState:
 
     @property
     def risk(self) -> float:
-        """Largest risk of all directions, 0 before anything was measured."""
+        """Largest risk of all directions, 0 before the first measurement."""
         return max((cue.risk for cue in self.cues), default=0.0)
 
     def graph(self) -> "nx.MultiDiGraph[str]":
