@@ -64,8 +64,10 @@ class FrontEnd:
     InvalidArgumentError
         If a band exceeds half the sample rate, or a hop is shorter than an STFT frame.
 
-    References ---------- "Evidence of Absence", section IV; J. DiBiase, H. Silverman and M. Brandstein,
-    "Robust localization in reverberant rooms", in *Microphone Arrays*, 2001 (SRP-PHAT).
+    References
+    ----------
+    "Evidence of Absence", section IV; J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in
+    reverberant rooms", in *Microphone Arrays*, 2001 (SRP-PHAT).
 
     Examples
     --------

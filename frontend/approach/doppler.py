@@ -148,13 +148,16 @@ def radial_speed(
     InvalidArgumentError
         If the track is not finite or its arrays differ in length.
 
-    Notes ----- An engine whose speed falls along an S-curve during the pass-by is read as a faster vehicle:
-    line and level cannot distinguish the two (5 of 100 simulated decelerations by 10 % within a passage, none
-    of 100 at the kerb).
+    Notes
+    -----
+    An engine whose speed falls along an S-curve during the pass-by is read as a faster vehicle: line and
+    level cannot distinguish the two (5 of 100 simulated decelerations by 10 % within a passage, none of 100
+    at the kerb).
 
-    References ---------- "Evidence of Absence", section IV; P. M. Morse and K. U. Ingard, *Theoretical
-    Acoustics*, 1968, section 11.2 (the S-curve); G. Schwarz, "Estimating the dimension of a model", Ann.
-    Statist. 6, 1978 (BIC).
+    References
+    ----------
+    "Evidence of Absence", section IV; P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section
+    11.2 (the S-curve); G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6, 1978 (BIC).
 
     Examples
     --------

@@ -81,9 +81,11 @@ def track_fundamental(
     InvalidArgumentError
         On a wrong shape, too few samples, non-finite values or too low a sample rate.
 
-    References ---------- A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum,
-    the harmonic sum spectrum and a maximum likelihood estimate", 1969; A. J. Viterbi, IEEE Trans. IT 13, 1967
-    (the track); D. C. Rife and R. R. Boorstyn, IEEE Trans. IT 20, 1974 (the variance of a partial).
+    References
+    ----------
+    A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum, the harmonic sum
+    spectrum and a maximum likelihood estimate", 1969; A. J. Viterbi, IEEE Trans. IT 13, 1967 (the track); D.
+    C. Rife and R. R. Boorstyn, IEEE Trans. IT 20, 1974 (the variance of a partial).
 
     Examples
     --------

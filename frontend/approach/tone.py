@@ -102,8 +102,10 @@ def estimate_tone(
     -----
     Bound: `worldstate.frontend.bounds.cramer_rao.tone_crb_hz2`.
 
-    References ---------- D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time
-    observations", IEEE Trans. IT 20, 1974.
+    References
+    ----------
+    D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations", IEEE
+    Trans. IT 20, 1974.
 
     Examples
     --------

@@ -44,12 +44,16 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
     InvalidArgumentError
         On wrong shapes or values out of range.
 
-    Notes ----- A bound for small errors: below a threshold SNR the peak jumps to another lobe and the
-    variance is far larger.
+    Notes
+    -----
+    A bound for small errors: below a threshold SNR the peak jumps to another lobe and the variance is far
+    larger.
 
-    References ---------- "Evidence of Absence", eq. (3), after C. Knapp and G. C. Carter, "The generalized
-    correlation method for estimation of time delay", IEEE Trans. ASSP 24, 1976, and G. C. Carter, "Coherence
-    and time delay estimation", Proc. IEEE 75, 1987.
+    References
+    ----------
+    "Evidence of Absence", eq. (3), after C. Knapp and G. C. Carter, "The generalized correlation method for
+    estimation of time delay", IEEE Trans. ASSP 24, 1976, and G. C. Carter, "Coherence and time delay
+    estimation", Proc. IEEE 75, 1987.
 
     Examples
     --------
@@ -298,8 +302,10 @@ def radial_speed_crb_m2_s2(
     -----
     In a street the stability of the tone itself, not this bound, limits the accuracy.
 
-    References ---------- "Evidence of Absence", section IV; P. M. Morse and K. U. Ingard, *Theoretical
-    Acoustics*, 1968, section 11.2.
+    References
+    ----------
+    "Evidence of Absence", section IV; P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section
+    11.2.
 
     Examples
     --------

@@ -129,8 +129,10 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     InvalidArgumentError
         On another shape, a window shorter than a frame, NaN or infinity.
 
-    References ---------- Y. Schulz, A. Mattar, T. Hehn and J. Kooij, "Hearing what you cannot see: acoustic
-    vehicle detection around corners", IEEE Robotics and Automation Letters 6, 2021.
+    References
+    ----------
+    Y. Schulz, A. Mattar, T. Hehn and J. Kooij, "Hearing what you cannot see: acoustic vehicle detection
+    around corners", IEEE Robotics and Automation Letters 6, 2021.
 
     Examples
     --------

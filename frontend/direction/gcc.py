@@ -140,8 +140,10 @@ def gcc_delays(
         On wrong shapes or values, an unknown weighting, ``ml`` with a single frame, or a search range in
         which equally spaced bins repeat themselves (max_delay_s >= 1 / (2 bin spacing)).
 
-    References ---------- C. Knapp and G. C. Carter, "The generalized correlation method for estimation of
-    time delay", IEEE Trans. ASSP 24, 1976, table I (the weightings).
+    References
+    ----------
+    C. Knapp and G. C. Carter, "The generalized correlation method for estimation of time delay", IEEE Trans.
+    ASSP 24, 1976, table I (the weightings).
 
     Examples
     --------

@@ -64,9 +64,11 @@ def count_sources(
     InvalidArgumentError
         On wrong shapes, negative eigenvalues, an unknown criterion, or MDL or AIC with T <= M.
 
-    References ---------- M. Wax and T. Kailath, "Detection of signals by information theoretic criteria",
-    IEEE Trans. ASSP 33, 1985 (AIC, MDL); R. R. Nadakuditi and A. Edelman, "Sample eigenvalue based detection
-    of high-dimensional signals in white noise using relatively few samples", IEEE Trans. SP 56, 2008 (few).
+    References
+    ----------
+    M. Wax and T. Kailath, "Detection of signals by information theoretic criteria", IEEE Trans. ASSP 33, 1985
+    (AIC, MDL); R. R. Nadakuditi and A. Edelman, "Sample eigenvalue based detection of high-dimensional
+    signals in white noise using relatively few samples", IEEE Trans. SP 56, 2008 (few).
 
     Examples
     --------

@@ -30,10 +30,12 @@ def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (directions,)
-        Sum of |beam|^2, at most frames x bins x M^2.
+        Sum of the squared moduli of the beams, at most frames x bins x M^2.
 
-    References ---------- J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in reverberant
-    rooms", in *Microphone Arrays*, 2001.
+    References
+    ----------
+    J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in reverberant rooms", in *Microphone
+    Arrays*, 2001.
 
     Examples
     --------
@@ -83,8 +85,10 @@ def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     InvalidArgumentError
         If the spectra have other axes or another number of bins.
 
-    References ---------- J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in reverberant
-    rooms", in *Microphone Arrays*, 2001.
+    References
+    ----------
+    J. DiBiase, H. Silverman and M. Brandstein, "Robust localization in reverberant rooms", in *Microphone
+    Arrays*, 2001.
 
     Examples
     --------

@@ -79,9 +79,11 @@ class SampleClock:
     nominal_hz : float
         Rate in the header of the stream, Hz.
 
-    References ---------- B. P. Welford, "Note on a method for calculating corrected sums of squares and
-    products", Technometrics 4, 1962 (the running sums); N. Draper and H. Smith, *Applied Regression
-    Analysis*, 1966, chapter 1 (the line).
+    References
+    ----------
+    B. P. Welford, "Note on a method for calculating corrected sums of squares and products", Technometrics 4,
+    1962 (the running sums); N. Draper and H. Smith, *Applied Regression Analysis*, 1966, chapter 1 (the
+    line).
 
     Examples
     --------

@@ -28,6 +28,7 @@ def test_every_exported_name_has_an_example_that_runs(name):
     if reference.kind(value) == "data":
         pytest.skip("the reference evaluates it")
     assert any(not example.options.get(doctest.SKIP) for example in examples(value))
+    assert not re.search(r"\w -{4,}", value.__doc__), "a heading that a re-wrapped paragraph swallowed"
 
 
 def test_all_names_together_can_be_learned():
