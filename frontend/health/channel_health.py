@@ -115,7 +115,7 @@ class ArrayHealth:
         Parameters
         ----------
         n_channels : int
-            M.
+            Number of microphones M.
         reason : str
             Why there is no estimate of the sample rate and of the coherence.
 

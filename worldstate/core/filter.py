@@ -42,7 +42,7 @@ def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
     Parameters
     ----------
     directions : int
-        K.
+        Number of directions K.
 
     Returns
     -------

@@ -16,7 +16,7 @@ class ArrayBounds:
     Parameters
     ----------
     microphones : int
-        M.
+        Number of microphones M.
     horizontal_moment_m2 : float
         S_xx of eq. (4).
     aperture_m : tuple of float
@@ -60,7 +60,7 @@ class ArrayBounds:
         snr_db : float
             Per microphone and snapshot, dB.
         snapshots : int
-            N.
+            Number of snapshots N.
 
         Returns
         -------
