@@ -1,11 +1,12 @@
 """Acoustic measurement adapter: blocks of samples in, measurements out."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -15,6 +16,7 @@ from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel, Side
 
+from .acoustic_domain import feature_order
 from .acoustic_grounding import Grounding, observe
 
 
@@ -89,6 +91,10 @@ class AcousticAdapter:
         Weighs the model's scores with bearing, approach and engine line, eq. (5); the scores as they are
         without.
 
+    uncalibrated : bool
+        Go on with another array, rate or band than the model was made for. Give the filter a policy of
+        alpha 0 then, which states no budget.
+
     Attributes
     ----------
     source : str
@@ -102,6 +108,8 @@ class AcousticAdapter:
     ------
     InvalidArgumentError
         If the array, the rate or a setting does not fit; see `FrontEnd`.
+    OutOfDomainError
+        If the model has a `domain` and was made for another array, rate or feature.
 
     Examples
     --------
@@ -126,7 +134,13 @@ class AcousticAdapter:
         settings: AcousticSettings | None = None,
         front_end_settings: FrontEndSettings | None = None,
         grounding: Grounding | None = None,
+        uncalibrated: bool = False,
     ) -> None:
+        front_end_settings = front_end_settings or FrontEndSettings()
+        domain: ModelDomain | None = getattr(model, "domain", None)
+        if domain is not None and not uncalibrated:
+            order = feature_order(domain, array, sample_rate_hz, front_end_settings)
+            front_end_settings = replace(front_end_settings, feature_order=order)
         self.source = "acoustic"
         self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
         self.last_frame: AcousticFrame | None = None

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
@@ -36,6 +36,7 @@ from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
 
 from .acoustic import AcousticAdapter, Signature
+from .acoustic_domain import array_of, states_budget
 from .acoustic_grounding import Grounding
 
 BLOCKS_PER_SECOND = 20
@@ -67,6 +68,9 @@ class ListenSettings:
         spatial spectrum, bearing and prominence. The signature hears what it was trained with.
     boxes : DetectionFilter
         Which of the camera's boxes count: classes, score, height.
+    uncalibrated : bool
+        Go on where the model was made for another array, rate or band; then no cue states an alpha and the
+        snapshots say that they are not calibrated.
 
     Raises
     ------
@@ -88,6 +92,7 @@ class ListenSettings:
     grounding: Grounding | None = None
     ego_noise: bool | EgoNoiseSettings = False
     boxes: DetectionFilter = field(default_factory=DetectionFilter)
+    uncalibrated: bool = False
 
     def __post_init__(self) -> None:
         if in_range("azimuth_span_deg", self.azimuth_span_deg, 2.0, 360.0) % 1.0:
@@ -252,7 +257,7 @@ def open_source(
         Multichannel sound file, or a recording folder in the OVAD layout.
     array : path or MicrophoneArray, optional
         Acoular XML, CSV or JSON as `read_array` reads them; that of the data set where not given, OVAD's
-        where it names none.
+        where it names none; the model's own for a sound file of as many channels.
     detections : path or DetectionLog, optional
         Camera detections per frame, in any form that `read_any_detections` knows; those of the recording
         folder where not given.
@@ -284,7 +289,7 @@ def open_source(
     InvalidArgumentError
         If the model holds no threshold for the budget, or both detections and a detector are given.
     OutOfDomainError
-        If the array is not that of the data set.
+        If the array is not that of the data set, or not the model's.
 
     Examples
     --------
@@ -306,13 +311,20 @@ def open_source(
     lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
     rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
     alpha, policies = settings.alpha, chosen.policies
+    policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
+    assumed = None if chosen.domain is None else array_of(chosen.domain)
+    heard_by = choose_array(path, microphones, assumed=assumed, trust_given=settings.uncalibrated)
+    context = context or Context()
+    moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
+    if settings.uncalibrated or not states_budget(chosen.domain, heard_by, moves):
+        policy = replace(policy, alpha=0.0)
     return Source(
         audio_path=recording.audio_path if recording else path,
-        array=choose_array(path, microphones, name=array),
+        array=heard_by,
         detections=_detections(detections, detector, recording, lens),
         model=chosen.signature,
-        policy=policies.policies[0] if alpha is None else policies.for_alpha(alpha),
-        context=context or Context(),
+        policy=policy,
+        context=context,
         settings=settings,
         t0_s=recording.t0_s if recording and recording.label != "none" else None,
         camera=lens,
@@ -492,6 +504,7 @@ def measure_steps(
             vision=source.camera_channel(),
             grounding=source.settings.grounding,
             front_end_settings=source.settings.front_end(source.array, audio.sample_rate_hz),
+            uncalibrated=source.settings.uncalibrated,
         )
         for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
             for frame in adapter.front_end.process(block):

@@ -65,7 +65,7 @@ class HopSpectra:
         self._beams = Steering.towards(array, frequencies, *settings.directions_rad(), speed)
         self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft, speed)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
-        self._nfft = nfft
+        self._nfft, self._order = nfft, settings.feature_order
         self._n_frames = 0
         self.music = self._music(array.n_microphones, settings)
         self._unmonitored = ArrayHealth.unknown(array.n_microphones, "channels are not monitored")
@@ -131,9 +131,9 @@ class HopSpectra:
         """Return steered power and pair sums of one hop, scaled to all microphones."""
         srp = prewhitened[0] if prewhitened else (whitened[:, self._srp], self._beams)
         if len(prewhitened) > 1:
-            pairs = pair_sum(*prewhitened[1])
+            pairs = pair_sum(*prewhitened[1], self._order)
         else:
-            pairs = pair_sum_of(mask.cross(matrices), self._feature_beams)
+            pairs = pair_sum_of(mask.cross(matrices), self._feature_beams, self._order)
         power = steered_power(*srp) * mask.power_scale
         if self.ego_noise is not None:
             power = self.ego_noise.levelled(power, len(srp[0]))

@@ -64,6 +64,8 @@ class FrontEndSettings:
         Settings of ego-noise suppression, used with `FrontEnd.learn_ego_noise`; None switches it off.
     watch_channels : bool
         Detect faulty microphones and leave them out.
+    feature_order : tuple of int, optional
+        Channels in the order in which the feature forms its pairs, where it is not that of the array.
 
     Raises
     ------
@@ -100,6 +102,7 @@ class FrontEndSettings:
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
     ego_noise: EgoNoiseSettings | None = None
     watch_channels: bool = True
+    feature_order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         _even("nfft", self.nfft, 4, 65536)

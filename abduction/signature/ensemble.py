@@ -9,7 +9,7 @@ over experts and over the window and its mirror image, sides exchanged:
 so that mirroring the world exchanges left and right to the bit.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Annotated, ClassVar
 
@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Layout, Via
+from worldstate.ground.serialisation import ADDED, Layout, Via
 from worldstate.ground.typing import FloatArray
 
 from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
 from .mirror import SEGMENTS, mirror_features
+from .model_domain import ModelDomain
 from .pairwise_coupling import SMALLEST_PROBABILITY
 from .published_signature import (
     CLASSES,
@@ -55,6 +56,8 @@ class EnsembleModel:
     empty : ndarray, shape (features,)
         Mean log-levels of the training windows without any source: what a stream that is mostly empty is
         compared with, see `SiteEstimate`.
+    domain : ModelDomain, optional
+        What it was made for; `AcousticAdapter` refuses another array, rate or feature.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class EnsembleModel:
     class_prior: FloatArray
     home: Annotated[SiteReference, Via(FloatArray, attrgetter("row"), SiteReference.from_row)]
     empty: FloatArray
+    domain: ModelDomain | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:

@@ -5,7 +5,7 @@ and the pairs are coupled into posteriors of front, left, none and right. Dividi
 the training set leaves likelihoods, which is what eq. (6) takes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -15,9 +15,10 @@ from worldstate.abduction.cueing.platt import sigmoid
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Layout
+from worldstate.ground.serialisation import ADDED, Layout
 from worldstate.ground.typing import FloatArray
 
+from .model_domain import ModelDomain
 from .pairwise_coupling import class_pairs, couple
 
 CLASSES = ("front", "left", "none", "right")
@@ -47,6 +48,8 @@ class SignatureModel:
         A and B of the sigmoids.
     class_prior : ndarray, shape (4,)
         Class frequencies of the training set, mirrored rows included.
+    domain : ModelDomain, optional
+        What it was made for; `AcousticAdapter` refuses another array, rate or feature.
 
     Raises
     ------
@@ -74,6 +77,7 @@ class SignatureModel:
     slopes: FloatArray
     offsets: FloatArray
     class_prior: FloatArray
+    domain: ModelDomain | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         features, pairs = (np.size(self.mean),), (PAIRS,)

@@ -7,6 +7,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import check_shape, finite_array, in_range
 
 from .ensemble import EnsembleModel
+from .model_domain import ModelDomain
 from .site_estimate import SiteEstimate, SiteEstimateSettings
 
 HOP_S = 0.1
@@ -65,6 +66,11 @@ class SiteSignature:
     def reference_prior(self) -> tuple[float, ...]:
         """That of the model."""
         return self._model.reference_prior
+
+    @property
+    def domain(self) -> ModelDomain | None:
+        """What the model was made for."""
+        return self._model.domain
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         """Return the log-likelihoods of the next window, then learn from it.

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.array_match import array_difference, microphone_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.ground.errors import OutOfDomainError
+from worldstate.ground.errors import InputFileError, OutOfDomainError
 
 from .ovad_layout import ARRAY_NAME, AUDIO_NAME, LOG_NAME
 
@@ -20,7 +21,6 @@ def choose_array(
     path: Path,
     given: MicrophoneArray | None = None,
     *,
-    name: object = "the array given",
     assumed: MicrophoneArray | None = None,
     trust_given: bool = False,
 ) -> MicrophoneArray:
@@ -36,10 +36,8 @@ def choose_array(
         Data set, recording folder or sound file.
     given : MicrophoneArray, optional
         By the user.
-    name : object
-        How messages call it.
     assumed : MicrophoneArray, optional
-        For a sound file that nothing is known of; OVAD's where not given.
+        For a sound file that nothing is known of, if it has as many channels; OVAD's where not given.
     trust_given : bool
         Take the array given whatever the data set says.
 
@@ -48,21 +46,21 @@ def choose_array(
     OutOfDomainError
         If the array given is not that of the data set.
     InputFileError
-        If the data set's array is damaged.
+        If the data set's array is damaged, or a sound file has other channels than the array assumed.
     """
     named = named_array(path)
     if given is not None and (named is None or trust_given):
         return given
     if named is None:
-        return ovad_array() if path.is_dir() or assumed is None else assumed
+        return ovad_array() if path.is_dir() else _assumed(path, assumed or ovad_array())
     own = read_array(named)
     if given is not None:
         order = microphone_order(own.positions_m, given)
         if order is None:
             difference = array_difference(own.positions_m, given)
-            raise OutOfDomainError(f"{name}: not the array of {named}: {difference}. Leave --array out")
+            raise OutOfDomainError(f"{given.name}: not the array of {named}: {difference}. Leave --array out")
         if (np.diff(order) != 1).any():
-            _LOG.warning("%s: in another order than %s, whose order counts", name, named)
+            _LOG.warning("%s: in another order than %s, whose order counts", given.name, named)
     return own
 
 
@@ -73,3 +71,15 @@ def named_array(path: Path) -> Path | None:
     if path.is_dir() or path.name == AUDIO_NAME:
         roots += [root for root in folder.absolute().parents[2:3] if (root / LOG_NAME).is_file()]
     return next((root / ARRAY_NAME for root in roots if (root / ARRAY_NAME).is_file()), None)
+
+
+def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
+    """Return the array that a sound file is taken to be of, if it has as many channels."""
+    with open_audio(path, strict=False) as audio:
+        if audio.channels != array.n_microphones:
+            problem = (
+                f"expected --array for its {audio.channels} channels; {array.name} has {array.n_microphones}"
+            )
+            raise InputFileError(path, problem)
+    _LOG.warning("%s: no array is named; taken as %s, %d microphones", path, array.name, array.n_microphones)
+    return array

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.adapters.acoustic_domain import domain_of
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.csv_rows import read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -94,15 +95,25 @@ def read_windows(
             yield _last_second(source, window), source.sample_rate_hz
 
 
-def feature_table(windows: list[LabelledWindow], features: list[FloatArray]) -> FeatureTable:
-    """Return windows and features, in the same order, as a table.
+def feature_table(
+    windows: list[LabelledWindow], features: list[FloatArray], array: MicrophoneArray
+) -> FeatureTable:
+    """Return windows and features, in the same order, as a table that names the array which heard them.
 
     Shapes: features (60,).
     """
     columns = zip(*((w.label, w.window_id, w.environment, w.recording) for w in windows), strict=True)
     labels, ids, environments, recordings = (np.array(column) for column in columns)
     t0_frames = tuple(w.t0_frame for w in windows)
-    return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames)
+    rates = {source_rate_hz(path) for path in {w.path for w in windows}}
+    domain = domain_of(array, sorted(rates), environments.tolist())
+    return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames, domain)
+
+
+def source_rate_hz(path: Path) -> int:
+    """Return the sample rate of a sound file."""
+    with open_audio(path, strict=False) as source:
+        return source.sample_rate_hz
 
 
 def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:

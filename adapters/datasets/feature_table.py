@@ -6,6 +6,7 @@ degrees and grow to the right, as in the released data and in `frontend.directio
 """
 
 import csv
+import json
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +14,13 @@ from typing import Literal
 
 import numpy as np
 
+from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.published_signature import CLASSES
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.atomic import atomic_path, write_text
 from worldstate.adapters.files.csv_rows import read_rows
+from worldstate.adapters.files.json_file import read_json, refused_as_file
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 
 N_FEATURES = 60
@@ -42,6 +46,8 @@ class FeatureTable:
         front window: splits go by recording.
     t0_frames : tuple of int or None
         Line-of-sight entry, frame number at 10 a second; None where unknown.
+    domain : ModelDomain, optional
+        Array, rates and ego's motion of the windows; None where the file does not say.
 
     Examples
     --------
@@ -58,6 +64,7 @@ class FeatureTable:
     environments: TextArray
     recordings: TextArray
     t0_frames: tuple[int | None, ...]
+    domain: ModelDomain | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -87,6 +94,7 @@ class FeatureTable:
             self.environments[kept],
             self.recordings[kept],
             tuple(self.t0_frames[i] for i in kept),
+            self.domain,
         )
 
     def group(self, group: Group) -> "FeatureTable":
@@ -133,7 +141,7 @@ class FeatureTable:
 
 
 def read_features(path: str | Path) -> FeatureTable:
-    """Read a table of windows.
+    """Read a table of windows, and `FILE.csv.json` beside it, which says what they were made with.
 
     Parameters
     ----------
@@ -168,11 +176,19 @@ def read_features(path: str | Path) -> FeatureTable:
         raise InputFileError(path, "expected at least one window below the header")
     features, labels, t0_frames = zip(*windows, strict=True)
     classes, ids, environments, recordings = (np.array(column) for column in zip(*labels, strict=True))
-    return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames)
+    domain = _companion(path)
+    made_with = None
+    if domain.is_file():
+        what = "what the windows were made with"
+        with refused_as_file(domain):
+            made_with = decode(ModelDomain, read_json(domain, what), "domain")
+    return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames, made_with)
 
 
 def write_features(path: str | Path, table: FeatureTable) -> None:
     """Write a table of windows that `read_features` reads back to the bit, whole or not at all.
+
+    What they were made with goes to `FILE.csv.json`, so that other tools read the columns as they are.
 
     Parameters
     ----------
@@ -203,6 +219,14 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
         names = (table.labels, table.ids, table.environments, table.t0_frames, table.recordings)
         for feature, *labels in zip(table.features.tolist(), *names, strict=True):
             writer.writerow([*feature, *labels])
+    # One of an earlier table would speak of other windows.
+    _companion(path).unlink(missing_ok=True)
+    if table.domain is not None:
+        write_text(_companion(path), json.dumps(encode(table.domain), allow_nan=False) + "\n")
+
+
+def _companion(path: str | Path) -> Path:
+    return Path(f"{path}.json")
 
 
 def read_ids(path: str | Path) -> frozenset[str]:

@@ -138,7 +138,7 @@ def _array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> Microph
         positions = positions[:, [2, 0, 1]] * [1.0, -1.0, 1.0] + 0.0
     _check_size(path, positions)
     try:
-        return MicrophoneArray(positions)
+        return MicrophoneArray(positions, str(path))
     except InvalidArgumentError as error:
         raise InputFileError(path, str(error)) from error
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.ground.serialisation import Layout, Via, decode, encode
 
@@ -75,11 +76,16 @@ class Model:
     [0.01, 0.02, 0.05]
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Model", "1.1.0", order="provenance signature policies")
+    LAYOUT: ClassVar = Layout("worldstate.Model", "1.2.0", order="provenance signature policies")
 
     signature: AnySignature
     policies: Annotated[CueingPolicies, Via(tuple[CueingPolicy, ...], attrgetter("policies"), CueingPolicies)]
     provenance: Provenance
+
+    @property
+    def domain(self) -> ModelDomain | None:
+        """What the model was made for; None in files of a version before 1.2."""
+        return self.signature.domain
 
 
 def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPolicies]:

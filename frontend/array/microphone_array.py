@@ -38,6 +38,8 @@ class MicrophoneArray:
     positions_m : array_like, shape (M, 3)
         Coordinates in `base_link` axes (x forward, y left, z up), metres; 2 <= M <= 1024, all different. The
         order is that of the audio channels.
+    name : str
+        How messages call it.
 
     Raises
     ------
@@ -54,6 +56,7 @@ class MicrophoneArray:
     """
 
     positions_m: FloatArray
+    name: str = "the array given"
 
     def __post_init__(self) -> None:
         positions = finite_array("positions_m", self.positions_m, (None, 3)).copy()
@@ -224,7 +227,8 @@ def roof_array_56() -> MicrophoneArray:
     z = row + _JITTER * (np.mod(index * 0.5698402909980532, 1.0) - 0.5)
     y, z = _to_unit(y), _to_unit(z)
     y = np.sign(y) * np.abs(y) ** _COLUMN_POWER
-    return MicrophoneArray(np.stack([np.zeros_like(y), 0.5 * _WIDTH_M * y, 0.5 * _HEIGHT_M * z], axis=1))
+    positions = np.stack([np.zeros_like(y), 0.5 * _WIDTH_M * y, 0.5 * _HEIGHT_M * z], axis=1)
+    return MicrophoneArray(positions, "roof_array_56")
 
 
 def _to_unit(values: FloatArray) -> FloatArray:

@@ -44,4 +44,4 @@ def ovad_array() -> MicrophoneArray:
     (56, [0.0, 0.784, 0.651], 3.027)
     """
     y, z = np.array(_LEFT_UP_M).T
-    return MicrophoneArray(np.stack([np.zeros_like(y), y, z], axis=1))
+    return MicrophoneArray(np.stack([np.zeros_like(y), y, z], axis=1), "OVAD (Schulz et al. 2021)")

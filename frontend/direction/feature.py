@@ -35,6 +35,8 @@ FEATURE_AZIMUTHS_RAD.flags.writeable = False
 # modulus of the complex sum depends, by about one per cent, on the order of the microphones, which is that of
 # the array file.
 FEATURE_BAND_HZ = (50.0, 1500.0)
+FEATURE_VERSION = "SRP-PHAT pairs 1"
+"""What a model says that it was trained with: another number wherever the feature of a window changes."""
 FEATURE_NFFT = 512
 FEATURE_SEGMENTS = 2
 
@@ -59,7 +61,9 @@ def feature_steering(
     return Steering.towards(array, frequencies, FEATURE_AZIMUTHS_RAD, speed_of_sound_m_s=speed_of_sound_m_s)
 
 
-def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
+def pair_sum(
+    whitened: Complex64Array, steering: Steering, order: tuple[int, ...] | None = None
+) -> Complex128Array:
     r"""Return the complex sum over frames, bins and microphone pairs i < j.
 
     .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
@@ -67,13 +71,17 @@ def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
 
     Shapes: whitened (frames, bins, M).
     """
-    return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
+    return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering, order)
 
 
-def pair_sum_of(matrices: Complex64Array, steering: Steering) -> Complex128Array:
+def pair_sum_of(
+    matrices: Complex64Array, steering: Steering, order: tuple[int, ...] | None = None
+) -> Complex128Array:
     r"""Return the complex sum over microphone pairs i < j from cross-spectra (bins, M, M).
 
     .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
+
+    The channels are counted in `order`, or in that of the array.
 
     Examples
     --------
@@ -82,7 +90,7 @@ def pair_sum_of(matrices: Complex64Array, steering: Steering) -> Complex128Array
     >>> pair_sum_of(np.ones((1, 2, 2), np.complex64), steering).round(3)
     array([1.+0.j])
     """
-    pairs = matrices * _pairs_mask(matrices.shape[2])
+    pairs = matrices * _pairs_mask(order or tuple(range(matrices.shape[2])))
     return steering.quadratic_form(steering.compress(pairs))
 
 
@@ -157,7 +165,9 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
 
 
 @lru_cache(maxsize=8)
-def _pairs_mask(n_microphones: int) -> Float32Array:
-    mask = np.triu(np.ones((n_microphones, n_microphones), np.float32), 1)
+def _pairs_mask(order: tuple[int, ...]) -> Float32Array:
+    """Return one where the row comes before the column in an order of the channels, else zero."""
+    place = np.argsort(order)
+    mask = (place[:, None] < place[None]).astype(np.float32)
     mask.flags.writeable = False
     return mask

@@ -20,6 +20,7 @@ COMMANDS = (
     "users.bounds",
     "users.simulate",
     "users.train",
+    "users.model",
     "users.calibrate",
     "users.measure_absence",
     "studies.evaluate_degradation",

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Layout, decode, decode_json, encode
+from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
 
 from .context import Context
 from .cue import RiskCue
@@ -39,6 +39,9 @@ class WorldState:
         Axes of all quantities: x forward, y left, z up.
     clock : {"media", "unix", "monotonic"}
         What `stamp_ns` counts from.
+    calibrated : bool
+        Whether the cues hold to a false-alarm budget, of a model that is used for what it was made for. Where
+        not, no cue states an alpha.
 
     Examples
     --------
@@ -47,7 +50,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.0.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.1.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -57,6 +60,7 @@ class WorldState:
     cues: tuple[RiskCue, ...] = ()
     frame_id: str = "base_link"
     clock: str = "media"
+    calibrated: bool = field(default=False, metadata=ADDED)
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.

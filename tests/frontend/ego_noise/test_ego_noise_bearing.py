@@ -45,12 +45,16 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def opened(recording: Path, ego_noise: bool) -> Source:
+    """The model that ships knows neither this array nor this rate."""
+    settings = ListenSettings(ego_noise=ego_noise, uncalibrated=True)
+    return open_source(recording, array=ARRAY, settings=settings)
+
+
 def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recording: Path) -> None:
     bearings = {}
     for ego in (False, True):
-        steps = list(
-            listen_steps(open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=ego)))
-        )
+        steps = list(listen_steps(opened(recording, ego)))
         late = [step.frame for step in steps if step.frame.stamp_ns > (APPEARS_S + 0.4) * 1e9]
         bearings[ego] = np.degrees([frame.bearing_rad for frame in late])
     assert len(bearings[True]) > 8
@@ -59,29 +63,21 @@ def test_a_source_under_ego_noise_is_pointed_at_once_the_noise_is_known(recordin
 
 
 def test_it_is_off_unless_asked_and_where_nobody_believes(recording: Path) -> None:
-    plain = [frame.srp for frame, _ in measure_steps(open_source(recording, array=ARRAY))]
+    plain = [frame.srp for frame, _ in measure_steps(opened(recording, False))]
     doubted: list[list[np.ndarray]] = []
     for belief in (None, lambda: 0.3):
-        source = open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=True))
+        source = opened(recording, True)
         doubted.append([frame.srp for frame, _ in measure_steps(source, belief)])
     for srp, unasked, unlearned in zip(plain, *doubted, strict=True):
         np.testing.assert_array_equal(srp, unasked)
         np.testing.assert_array_equal(srp, unlearned)
-    believed = [
-        frame.srp
-        for frame, _ in measure_steps(
-            open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=True)), lambda: 1.0
-        )
-    ]
+    believed = [frame.srp for frame, _ in measure_steps(opened(recording, True), lambda: 1.0)]
     assert np.abs(believed[-1] - plain[-1]).max() > 0.02
 
 
 def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
     """The posterior is the same, hop by hop: only spatial spectrum, bearing and prominence change."""
-    plain, learned = (
-        list(listen_steps(open_source(recording, array=ARRAY, settings=ListenSettings(ego_noise=ego))))
-        for ego in (False, True)
-    )
+    plain, learned = (list(listen_steps(opened(recording, ego))) for ego in (False, True))
     for a, b in zip(plain, learned, strict=True):
         assert a.measurement.signature == b.measurement.signature
 
@@ -101,7 +97,7 @@ def test_the_command_line_passes_it_on(recording: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("worldstate.cli.common.listening.listen_with_progress", listened)
     for options in ([], ["--ego-noise"]):
-        main(["run", str(recording), *options])
+        main(["run", str(recording), "--uncalibrated", *options])
     assert [source.settings.ego_noise for source in heard] == [False, True]
 
 

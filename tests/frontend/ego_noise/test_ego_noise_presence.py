@@ -128,7 +128,7 @@ def last_second(sound: Sound, array: MicrophoneArray, scene: Scene, gate: str) -
     model, policies = load_model(None)
     assert isinstance(model, EnsembleModel)
     signature = SiteSignature(model, SiteEstimateSettings())
-    adapter = AcousticAdapter(array, scene.rate_hz, signature, front_end_settings=settings)
+    adapter = AcousticAdapter(array, scene.rate_hz, signature, front_end_settings=settings, uncalibrated=True)
     world = WorldFilter(context=Context(), policy=policies.for_alpha(0.02))
     adapter.set_no_source_probability(float(gate == "open"))
     rows = []

@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs(arguments, figures=("figure",))
     path: Path = arguments.input
     sound = Recording.open(path).audio_path if path.is_dir() else path
-    array = choose_array(path, given_array(arguments), name=arguments.array)
+    array = choose_array(path, given_array(arguments))
     with open_audio(sound, expect_channels=array.n_microphones, strict=False) as audio:
         health = examine(audio, array, arguments.duration, arguments.duration_error)
         if arguments.json:

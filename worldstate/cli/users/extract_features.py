@@ -56,10 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.datasets.feature_table import write_features
 
     check_outputs(arguments, "out")
-    array = choose_array(arguments.dataset, given_array(arguments), name=arguments.array)
+    array = choose_array(arguments.dataset, given_array(arguments))
     windows, left_out = _windows(arguments)
     features = list(track(extract_features(windows, array), "extracting", len(windows)))
-    table = feature_table(windows, features)
+    table = feature_table(windows, features, array)
     write_features(arguments.out, table)
     summary = {
         "out": str(arguments.out),

@@ -63,6 +63,10 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
         "--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)"
     )
     parser.add_argument(
+        "--uncalibrated", action="store_true",
+        help="go on where the model was made for another array or rate; no cue states an alpha then",
+    )  # fmt: skip
+    parser.add_argument(
         "--grounded", action="store_true",
         help="weigh the signature with bearing and approach, eq. (5) (default: off)",
     )  # fmt: skip
@@ -124,6 +128,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         grounding=Grounding() if arguments.grounded else None,
         ego_noise=arguments.ego_noise,
         boxes=boxes_of(arguments),
+        uncalibrated=arguments.uncalibrated,
     )
     return open_source(
         arguments.input,

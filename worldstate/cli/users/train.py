@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.feature_options import add_table_options
@@ -9,9 +10,14 @@ from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
+if TYPE_CHECKING:
+    from worldstate.adapters.datasets.feature_table import FeatureTable
+
 DESCRIPTION = """\
 Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
-scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data.
+scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data, and
+what the windows were made with: array, sample rate, band, ego's motion. A table that does not say, as the
+released one, counts as OVAD's unless --array and --sample-rate say otherwise.
 
   --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
   --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
@@ -38,6 +44,10 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         metavar="IDS",
         help="CSV files with a column ID: leave out the recordings of these windows",
     )
+    parser.add_argument(
+        "--array", type=Path, metavar="FILE", help="microphones that the windows were heard by"
+    )
+    parser.add_argument("--sample-rate", type=float, metavar="HZ", help="of that sound (default: 47998)")
     parser.add_argument("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
     parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
     parser.add_argument("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
@@ -50,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.operations.training.training import TrainingSettings, train_model
 
     check_outputs(arguments, "out")
-    table = read_features(arguments.table).group(arguments.group)
+    table = _with_domain(arguments, read_features(arguments.table)).group(arguments.group)
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
     settings = TrainingSettings(
         seed=arguments.seed, sustain_hops=arguments.sustain_hops, method=arguments.method
@@ -74,3 +84,24 @@ def run(arguments: argparse.Namespace) -> int:
     }
     print_summary(summary, as_json=arguments.json)
     return 0
+
+
+def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "FeatureTable":
+    """Return the table with what its windows were made with: as it says, as the options say, or as OVAD's."""
+    import sys
+    from dataclasses import replace
+
+    from worldstate.adapters.acoustic_domain import OVAD_RATE_HZ, check_array, domain_of, ovad_domain
+    from worldstate.adapters.files.array_file import read_array
+
+    environments = table.environments.tolist()
+    if arguments.array is None:
+        if table.domain is None:
+            print(f"worldstate: {arguments.table} names no array: taken as OVAD's", file=sys.stderr)
+        return replace(table, domain=table.domain or ovad_domain(environments))
+    array = read_array(arguments.array)
+    if table.domain is not None:
+        check_array(table.domain, array)
+        return table
+    rate_hz = arguments.sample_rate or OVAD_RATE_HZ
+    return replace(table, domain=domain_of(array, [rate_hz], environments))

@@ -1,7 +1,7 @@
 """Training of a model: classifier on all windows, thresholds and risk maps on out-of-fold scores."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Literal
 
@@ -10,9 +10,11 @@ import numpy as np
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
 from worldstate.abduction.signature.ensemble_training import RECIPES, SiteEnsembleClassifier
+from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.adapters.acoustic_domain import ego_motion_of
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.typing import FloatArray
@@ -124,7 +126,8 @@ def train_model(
     levels = [passes]
     if compares and len(np.unique(table.environments)) > 1:
         levels.insert(0, [out_of_fold(inputs, junction_folds(table), make, rng)])
-    signature = fit_signature(inputs, settings.method, rng)
+    fitted = fit_signature(inputs, settings.method, rng)
+    signature = replace(fitted, domain=_domain(table))
     on_step()
     provenance = Provenance(
         dataset=dataset,
@@ -137,6 +140,13 @@ def train_model(
         figures=_figures(table, signature, passes),
     )
     return Model(signature, _policies(table, signature, levels, settings), provenance)
+
+
+def _domain(table: FeatureTable) -> ModelDomain | None:
+    """Return what the table says, the ego's motion of the windows that are left in it."""
+    if table.domain is None:
+        return None
+    return replace(table.domain, ego_motion=ego_motion_of(np.unique(table.environments).tolist()))
 
 
 def seen_by(table: FeatureTable, method: TrainingMethod) -> FeatureTable:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.adapters.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import Model
 from worldstate.ground.errors import InvalidArgumentError
@@ -14,6 +15,9 @@ from worldstate.operations.training.window_calibration import MISS_RATES, Window
 def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[float, Predictions]:
     """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does."""
     # A model that compares windows with their site is given the reference from the site's other recordings.
+    if model.domain is not None:
+        # A table that does not say, as the released one, is OVAD's.
+        check_tables(model.domain, table.domain or ovad_domain(table.environments.tolist()))
     check_unseen(model, table)
     compares = isinstance(model.signature, EnsembleModel)
     inputs = with_site_references(table).features if compares else table.features

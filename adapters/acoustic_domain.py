@@ -1,0 +1,135 @@
+"""Hold an array and a sample rate against what a model was made for."""
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+
+from worldstate.abduction.signature.model_domain import EgoMotion, ModelDomain
+from worldstate.adapters.files.array_match import array_difference, microphone_order
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_VERSION
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.ground.errors import OutOfDomainError
+from worldstate.ground.typing import IndexArray
+
+OVAD_RATE_HZ = 47_998.0
+# Frames have a fixed number of samples: two per cent move the top of the band by a third of a bin.
+RATE_TOLERANCE = 0.02
+WAY_OUT = "Train a model for it (extract-features, train), or go on with --uncalibrated (uncalibrated=True)"
+
+_LOG = logging.getLogger(__name__)
+
+
+def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
+    """Return the domain of windows that an array heard at these rates, the ego as the environments say.
+
+    Examples
+    --------
+    >>> domain_of(ovad_array(), [47_998.0], ["SA1", "SB3"]).ego_motion
+    'standing'
+    """
+    low, high = (1.0 - RATE_TOLERANCE) * min(rates_hz), (1.0 + RATE_TOLERANCE) * max(rates_hz)
+    motion = ego_motion_of(environments)
+    return ModelDomain(array.name, array.positions_m, (low, high), FEATURE_BAND_HZ, FEATURE_VERSION, motion)
+
+
+def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
+    """Return what the ego did at environments S.. (standing) and D.. (moving)."""
+    kinds = {environment[:1] for environment in environments}
+    return "any" if len(kinds) > 1 else "moving" if kinds == {"D"} else "standing"
+
+
+def ovad_domain(environments: Sequence[str]) -> ModelDomain:
+    """Return the domain of the windows released with OVAD."""
+    return domain_of(ovad_array(), [OVAD_RATE_HZ], environments)
+
+
+def check_array(domain: ModelDomain, array: MicrophoneArray) -> IndexArray:
+    """Return the channels of an array in the order that a model was made with.
+
+    Raises
+    ------
+    OutOfDomainError
+        If the microphones stand elsewhere; the message names the array, the difference and the way out.
+    """
+    order = microphone_order(domain.positions_m, array)
+    if order is None:
+        difference = array_difference(domain.positions_m, array)
+        made_for = f"{domain.array}, {len(domain.positions_m)} microphones"
+        raise OutOfDomainError(
+            f"{array.name}: not the array of the model ({made_for}): {difference}. {WAY_OUT}"
+        )
+    return order
+
+
+def array_of(domain: ModelDomain) -> MicrophoneArray:
+    """Return the array of a domain."""
+    return MicrophoneArray(domain.positions_m, domain.array)
+
+
+def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego: bool) -> bool:
+    """Return whether a model's thresholds hold for an array and the ego's motion; a word where not.
+
+    Raises
+    ------
+    OutOfDomainError
+        If the model was made for another array.
+    """
+    if domain is None:
+        _LOG.warning("the model names no array that it was made for: no budget is stated")
+        return False
+    check_array(domain, array)
+    if moving_ego and domain.ego_motion == "standing":
+        _LOG.warning("the model was made for a standing ego, this one moves: no budget is stated")
+        return False
+    return True
+
+
+def feature_order(
+    domain: ModelDomain, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings
+) -> tuple[int, ...] | None:
+    """Return the channels in the model's order where it is another one, or refuse what it was not made for.
+
+    Raises
+    ------
+    OutOfDomainError
+        If array, sample rate, band or feature is not what the model was made with.
+    """
+    low, high = domain.sample_rate_hz
+    if not low <= sample_rate_hz <= high:
+        expected = f"a model made for {low:.0f} to {high:.0f} Hz expects such sound"
+        raise OutOfDomainError(f"sample rate: {expected}, got {sample_rate_hz:g} Hz. {WAY_OUT}")
+    made_with = _feature(domain.feature, domain.band_hz)
+    got = _feature(FEATURE_VERSION, settings.feature_band_hz, settings.nfft)
+    if got != made_with:
+        raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {WAY_OUT}")
+    order = check_array(domain, array)
+    if (np.diff(order) == 1).all():
+        return None
+    _LOG.warning("%s: the model's microphones in another order; channels are put in the model's", array.name)
+    return tuple(order.tolist())
+
+
+def _feature(version: str, band_hz: tuple[float, float], nfft: int = FEATURE_NFFT) -> str:
+    return f"{version}, {band_hz[0]:g} to {band_hz[1]:g} Hz, frames of {nfft}"
+
+
+def check_tables(model: ModelDomain, table: ModelDomain) -> None:
+    """Refuse windows of another array or feature than the model's; their channels cannot be put in order.
+
+    Raises
+    ------
+    OutOfDomainError
+        If array, order, band or feature differ.
+    """
+    order = check_array(model, array_of(table))
+    if (np.diff(order) != 1).any():
+        raise OutOfDomainError(
+            "the table's microphones are the model's in another order: extract the features again with the "
+            "channels in the model's order"
+        )
+    expected, got = (_feature(one.feature, one.band_hz) for one in (model, table))
+    if got != expected:
+        raise OutOfDomainError(f"feature: expected {expected}, got {got}")

@@ -1,0 +1,245 @@
+"""What a model was made for: another array or rate is refused, another order is understood."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from tests.conftest import Approach
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.acoustic_domain import check_tables, domain_of, ovad_domain
+from worldstate.adapters.datasets.array_choice import choose_array
+from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.model_file import load_model, read_model
+from worldstate.adapters.listen import ListenSettings, listen, measure_steps, open_source
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.ground.errors import InputFileError, OutOfDomainError
+from worldstate.measurement.measurement import Bearing
+from worldstate.state.context import Context
+
+RATE = 47_998
+HERE = ovad_array().positions_m
+RNG = np.random.default_rng(10)
+SHUFFLED = HERE[RNG.permutation(56)]
+
+
+def turned(degrees: float, axis: int) -> np.ndarray:
+    angle, (i, j) = np.radians(degrees), [other for other in range(3) if other != axis]
+    turn = np.eye(3)
+    turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    return HERE @ turn.T
+
+
+WRONG = {
+    "x and y swapped": (HERE[:, [1, 0, 2]], "axes swapped"),
+    "y and z swapped": (HERE[:, [0, 2, 1]], "axes swapped"),
+    "in the file's axes": (np.stack([-HERE[:, 1], HERE[:, 2], HERE[:, 0]], 1), "axes swapped"),
+    "millimetres": (1e3 * HERE, "looks like millimetres"),
+    "centimetres": (1e2 * HERE, "looks like centimetres"),
+    "mirrored": (HERE * [1, -1, 1], "looks mirrored"),
+    "upside down": (HERE * [1, 1, -1], "looks mirrored"),
+    "half a turn": (HERE * [1, -1, -1], "looks turned by half a turn"),
+    "one missing": (HERE[1:], "55 microphones, expected 56"),
+    "one too many": (np.vstack([HERE, [0, 1, 0]]), "57 microphones, expected 56"),
+    "another array": (roof_array_56().positions_m, "elsewhere"),
+    "noise of 5 cm": (HERE + 0.05 * RNG.standard_normal(HERE.shape), "elsewhere"),
+    "noise of 5 mm": (HERE + 0.005 * RNG.standard_normal(HERE.shape), "elsewhere"),
+    "scaled": (0.5 * HERE, "looks scaled by 0.5"),
+    "rolled": (turned(7.0, axis=0), "looks rotated by 7 deg"),
+    "yawed": (turned(20.0, axis=2), "looks rotated by 20 deg"),
+    "shuffled and wrong": (SHUFFLED * [1, 1, 0.9], "elsewhere"),
+    "one moved": (HERE + np.eye(56)[7][:, None] * [0, 0.003, 0], "microphones up to 3 mm elsewhere"),
+}
+RIGHT = {
+    "the same": HERE,
+    "rounded to a millimetre": HERE.round(3),
+    "elsewhere on the vehicle": HERE + np.array([1.2, 0.0, 1.7]),
+    "reversed": HERE[::-1],
+    "shuffled": SHUFFLED,
+}
+
+
+@pytest.fixture
+def alone(approach: Approach, tmp_path: Path) -> Path:
+    """The sound of the session's recording as a file that no data set stands around."""
+    path = tmp_path / "some.wav"
+    path.symlink_to(approach.audio_path)
+    return path
+
+
+@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("beside", ["model", "data set"])
+def test_a_wrong_array_is_never_taken(case: str, beside: str, alone: Path, approach: Approach) -> None:
+    positions, why = WRONG[case]
+    path = alone if beside == "model" else approach.folder
+    with pytest.raises(OutOfDomainError, match=why):
+        open_source(path, array=MicrophoneArray(positions))
+    with pytest.raises(OutOfDomainError, match=why):
+        AcousticAdapter(MicrophoneArray(positions), RATE, load_model()[0])
+
+
+@pytest.mark.parametrize("case", RIGHT)
+def test_the_same_places_are_taken_in_any_order_and_anywhere(case: str, alone: Path) -> None:
+    assert open_source(alone, array=MicrophoneArray(RIGHT[case])).policy.alpha == 0.02
+    AcousticAdapter(MicrophoneArray(RIGHT[case]), RATE, load_model()[0])
+
+
+def test_the_command_refuses_in_one_line_unless_told_to_go_on(
+    alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mics = tmp_path / "mics.xml"
+    write_array_xml(mics, MicrophoneArray(HERE * [1, -1, 1]))
+    assert main(["run", str(alone), "--array", str(mics)]) == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line
+    for said in ("mics.xml", "OVAD", "56 microphones", "mm elsewhere", "looks mirrored", "--uncalibrated"):
+        assert said in line
+    assert main(["calibrate", str(alone), "--array", str(mics), "--out", str(tmp_path / "m.json")]) == 2
+    assert not (tmp_path / "m.json").exists()
+
+
+def test_uncalibrated_listening_states_no_budget(alone: Path) -> None:
+    chosen = ListenSettings(uncalibrated=True)
+    state = next(listen(alone, array=roof_array_56(), settings=chosen))
+    assert not state.calibrated and [cue.alpha for cue in state.cues] == [None, None]
+    state = next(listen(alone))
+    assert state.calibrated and [cue.alpha for cue in state.cues] == [0.02, 0.02]
+    assert not json.loads(next(listen(alone, settings=chosen)).to_json())["calibrated"]
+
+
+def test_a_moving_ego_is_flagged_where_the_model_stood(alone: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "DA1" / "left" / "1_05_0000"
+    folder.mkdir(parents=True)
+    (folder / "out_multi.wav").symlink_to(alone)
+    assert open_source(folder).policy.alpha == 0.0
+    assert open_source(alone, context=Context(ego_speed_mps=8.0)).policy.alpha == 0.0
+    assert open_source(alone, context=Context(ego_speed_mps=0.0)).policy.alpha == 0.02
+
+
+def test_another_rate_or_feature_is_refused() -> None:
+    model = load_model()[0]
+    for rate in (44_100, 16_000, 96_000):
+        with pytest.raises(OutOfDomainError, match=r"sample rate: .*47038 to 48958 Hz"):
+            AcousticAdapter(ovad_array(), rate, model)
+    AcousticAdapter(ovad_array(), 48_000, model)
+    assert model.domain is not None
+    other = replace(model, domain=replace(model.domain, feature="another 1"))
+    with pytest.raises(OutOfDomainError, match="feature: the model was made with another 1"):
+        AcousticAdapter(ovad_array(), RATE, other)
+
+
+def test_permuted_channels_give_the_model_the_same_feature() -> None:
+    sound = RNG.standard_normal((RATE, 56), dtype=np.float32)
+    order = RNG.permutation(56)
+    model = load_model()[0]
+    (there,) = AcousticAdapter(ovad_array(), RATE, model).front_end.process(sound)
+    shuffled = AcousticAdapter(MicrophoneArray(HERE[order]), RATE, model)
+    (found,) = shuffled.front_end.process(sound[:, order])
+    np.testing.assert_allclose(found.feature, there.feature, rtol=2e-4)
+    (unordered,) = AcousticAdapter(
+        MicrophoneArray(HERE[order]), RATE, model, uncalibrated=True
+    ).front_end.process(sound[:, order])
+    assert abs(unordered.feature / there.feature - 1.0).max() > 0.005  # the feature knows the order
+
+
+def plane_wave(azimuth_deg: float) -> np.ndarray:
+    """1.2 s of noise from far away at OVAD's microphones, (n, 56)."""
+    n = round(1.2 * RATE)
+    spectrum = np.fft.rfft(np.random.default_rng(3).standard_normal(n))
+    delays = ovad_array().delays_s(np.radians(azimuth_deg)).ravel()
+    turns = np.exp(-2j * np.pi * np.fft.rfftfreq(n, 1 / RATE)[:, None] * delays)
+    return 0.05 * np.fft.irfft(spectrum[:, None] * turns, n, axis=0)
+
+
+@pytest.mark.parametrize("azimuth_deg", [-50.0, -20.0, 0.0, 20.0, 50.0])
+def test_ovads_layout_is_read_with_ovads_array(azimuth_deg: float, tmp_path: Path) -> None:
+    folder = tmp_path / "SA1" / "left" / "1_00_0002"
+    folder.mkdir(parents=True)
+    soundfile.write(folder / "out_multi.wav", plane_wave(azimuth_deg), RATE, subtype="PCM_24")
+    (_, first), *_ = measure_steps(open_source(folder))
+    assert isinstance(first.bearing, Bearing)
+    assert abs(np.degrees(first.bearing.azimuth_rad) - azimuth_deg) < 1.0
+
+
+def test_a_data_set_is_read_with_its_own_array(tmp_path: Path, approach: Approach) -> None:
+    own = open_source(approach.folder).array.positions_m
+    assert np.array_equal(own, open_source(approach.folder, array=approach.array_path).array.positions_m)
+    assert np.array_equal(own, open_source(approach.audio_path).array.positions_m)
+    mics = tmp_path / "mics.xml"
+    write_array_xml(mics, roof_array_56())
+    words = ["simulate", "--out", str(tmp_path / "sim"), "--static", "1", "--duration", "1.2"]
+    assert main([*words, "--array", str(mics)]) == 0
+    folder = tmp_path / "sim" / "SA1" / "left" / "1_00_0000"
+    found = choose_array(tmp_path / "sim").positions_m
+    assert np.array_equal(found, choose_array(folder).positions_m)
+    np.testing.assert_allclose(found, roof_array_56().positions_m)
+    assert main(["run", str(folder)]) == 2  # the model that ships was not made for it
+    assert main(words) == 2  # one data set, one array
+    table = tmp_path / "features.csv"
+    assert main(["extract-features", str(tmp_path / "sim"), "--out", str(table)]) in (0, 2)
+
+
+def test_a_sound_file_alone_takes_the_models_array_if_it_fits(
+    alone: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert np.array_equal(open_source(alone).array.positions_m, HERE)
+    assert "taken as" in caplog.text
+    soundfile.write(tmp_path / "few.wav", 0.1 * RNG.standard_normal((RATE, 8)), RATE)
+    with pytest.raises(InputFileError, match=r"few.wav: .*--array.* 8 channels"):
+        open_source(tmp_path / "few.wav")
+
+
+def windows(seed: int = 0) -> FeatureTable:
+    rng = np.random.default_rng(seed)
+    labels = np.array(["front", "left", "none", "right"] * 15)
+    keys = np.array([str(i) for i in range(60)])
+    sites = np.array(["SA1", "SB2"] * 30)
+    return FeatureTable(rng.random((60, 60)) + 0.1, labels, keys, sites, keys, (None,) * 60)
+
+
+def test_a_table_and_the_model_trained_on_it_say_what_they_were_made_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = MicrophoneArray(HERE[:8], "eight")
+    table = replace(windows(), domain=domain_of(own, [44_100], ["SA1"]))
+    write_features(tmp_path / "t.csv", table)
+    read = read_features(tmp_path / "t.csv")
+    assert read.domain is not None and read.domain.array == "eight"
+    assert np.array_equal(read.domain.positions_m, own.positions_m)
+    train = ["train", str(tmp_path / "t.csv"), "--method", "baseline", "--out", str(tmp_path / "m.json")]
+    assert main(train) == 0
+    domain = read_model(tmp_path / "m.json").domain
+    assert domain is not None and (len(domain.positions_m), domain.ego_motion) == (8, "standing")
+    write_features(tmp_path / "t.csv", windows())  # the companion of another table goes
+    assert read_features(tmp_path / "t.csv").domain is None
+    capsys.readouterr()
+    assert main(train) == 0
+    assert "names no array: taken as OVAD's" in capsys.readouterr().err
+    domain = read_model(tmp_path / "m.json").domain
+    assert domain is not None and np.array_equal(domain.positions_m, HERE)
+
+
+def test_windows_of_another_array_are_not_scored() -> None:
+    model = ovad_domain(["SA1"])
+    check_tables(model, ovad_domain(["SB1"]))
+    for positions, why in ((HERE[:8], "8 microphones"), (HERE[::-1], "another order")):
+        other = domain_of(MicrophoneArray(positions), [RATE], ["SA1"])
+        with pytest.raises(OutOfDomainError, match=why):
+            check_tables(model, other)
+
+
+@pytest.mark.parametrize(
+    "show", [lambda: main(["model", "--json"]), lambda: main(["model"])], ids=["json", "text"]
+)
+def test_the_card_of_a_model(show: Callable[[], int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert show() == 0
+    card = capsys.readouterr().out
+    for said in ("OVAD", "56", "47038", "standing", "gamma", "a moving ego", "Apache-2.0"):
+        assert said in card
