@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import soundfile
+from hop_tables import blank_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
@@ -25,7 +26,8 @@ from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Measurement, Sighting
 from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
 from worldstate.operations.calibration.false_alarm_map import false_alarm_rate
-from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, load_streams, save_streams
+from worldstate.operations.recordings.hop_stream import hop_stream, load_streams
+from worldstate.operations.recordings.hop_table import save_tables
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 
 PRIOR = (0.3, 0.3, 0.2, 0.2)
@@ -40,12 +42,12 @@ nats = st.floats(-8.0, 8.0)
 def street(rng, label="none", hops=291, level=-1.5, phi=0.9):
     """A stream whose log-odds are an AR(1) about `level`; an approach rises to T0 at 20 s."""
     log_odds = lfilter([math.sqrt(1 - phi**2)], [1.0, -phi], rng.normal(size=hops)) + level
-    stream = HopStream.blank(f"{label}/{rng.integers(1 << 30)}", hops)
+    stream = blank_stream(f"{label}/{rng.integers(1 << 30)}", hops)
     if label != "none":
         log_odds = log_odds + np.clip((stream.time_s - 15.0) * 1.0, 0.0, 6.0)
     heard = np.stack([log_odds, log_odds - 2.0, log_odds - 3.0, np.zeros(hops)], axis=1)
     t0_s = math.nan if label == "none" else 20.0
-    return replace(stream, label=label, t0_s=t0_s, log_likelihoods=heard)
+    return stream.replace(label=label, t0_s=t0_s, log_likelihoods=heard)
 
 
 @given(st.lists(st.tuples(st.tuples(nats, nats, nats, nats), answers), min_size=1, max_size=8))
@@ -66,7 +68,7 @@ def test_over_a_stream_the_statistic_is_that_of_every_hop(rows):
 
 
 def test_the_approach_term_moves_the_log_odds_by_its_weight_and_only_where_usable():
-    stream = replace(street(np.random.default_rng(0), hops=4), approach=np.array([np.nan, 0.0, 1.5, -9.0]))
+    stream = street(np.random.default_rng(0), hops=4).replace(approach=np.array([np.nan, 0.0, 1.5, -9.0]))
     plain, looming = (
         stream_statistic(stream, PRIOR, StatisticSwitches(approach_weight=w)) for w in (0.0, 0.4)
     )
@@ -81,7 +83,7 @@ def test_a_stream_keeps_what_was_measured():
         Approach(0.5, 0.25), (sighted, replace(sighted, moving=False)),
     )  # fmt: skip
     stream = hop_stream([m], name="a", label="left", t0_s=2.0)
-    assert (stream.approach.item(), stream.seen.item(), stream.before_sight.item()) == (2.0, True, True)
+    assert (stream.approach.item(), stream.seen.item(), stream.before_sight().item()) == (2.0, True, True)
     with pytest.raises(InvalidArgumentError, match="hop"):
         hop_stream([], name="a")
 
@@ -143,7 +145,7 @@ def test_a_rate_to_keep_is_bounded_by_what_half_of_the_approaches_reach():
     assert policy.adaptive.rate_per_hour == 12.0
     switches = StatisticSwitches(fixed_miss_rate=0.0)
     peaks = [
-        sustained_statistic(stream_statistic(s, PRIOR, switches)[s.before_sight], 3).max()
+        sustained_statistic(stream_statistic(s, PRIOR, switches)[s.before_sight()], 3).max()
         for s in streams
         if not s.hazard_free
     ]
@@ -168,14 +170,14 @@ def test_too_few_hours_are_said_with_what_it_would_take():
 def streams_file(tmp_path):
     rng = np.random.default_rng(3)
     path = tmp_path / "streams.npz"
-    save_streams(path, [street(rng, label) for label in ("none", "none", "right") * 6])
+    save_tables(path, [street(rng, label) for label in ("none", "none", "right") * 6])
     return path
 
 
 def test_streams_survive_the_disk(streams_file):
     streams = load_streams(streams_file)
     again = streams_file.with_name("again.npz")
-    save_streams(again, streams)
+    save_tables(again, streams)
     for before, after in zip(streams, load_streams(again), strict=True):
         assert (before.name, before.label, len(before)) == (after.name, after.label, 291)
         assert np.array_equal(before.log_likelihoods, after.log_likelihoods)
@@ -195,7 +197,11 @@ def test_damaged_streams_are_a_typed_error(streams_file, tmp_path):
         load_streams(objects)
     with np.load(streams_file) as file:
         arrays = dict(file)
-    for key, value in {"hops": arrays["hops"] + 1, "log_likelihoods": np.full((5, 4), np.nan)}.items():
+    for key, value in {
+        "answer": arrays["answer"] + 7,
+        "time_s": arrays["time_s"][1:],
+        "log_likelihoods": np.full((5, 4), np.nan),
+    }.items():
         wrong = tmp_path / f"{key}.npz"
         np.savez(wrong, **(arrays | {key: value}))
         with pytest.raises(InputFileError, match=wrong.name):

@@ -1,17 +1,17 @@
 """Every ablation is a switch of one evaluation; each removes what it says and nothing else."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from hop_tables import blank_stream
 from scipy.signal import lfilter
 
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import abduce
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, HopStream
+from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT
 from worldstate.operations.recordings.stream_statistic import presence_statistic
 from worldstate.studies.paper.ablations import (
     AblationSwitches,
@@ -30,7 +30,7 @@ def recording(rng, number, label, d=0.0):
     approaches and about 0 otherwise.
     """
     hops = 141
-    stream = HopStream.blank(f"{label}/{number}", hops)
+    stream = blank_stream(f"{label}/{number}", hops)
     drift = lfilter([math.sqrt(1 - 0.8**2)], [1.0, -0.8], rng.normal(size=(3, hops)), axis=1)
     approach, t0_s = label != "none", 9.0
     heard = (stream.time_s > 6.0) & approach
@@ -39,8 +39,7 @@ def recording(rng, number, label, d=0.0):
     visible = 3.5 * sight + drift[1] - 1.5
     coin = rng.random(hops)
     seen = sight & (coin >= BETA[d])
-    return replace(
-        stream,
+    return stream.replace(
         label=label,
         t0_s=t0_s if approach else math.nan,
         log_likelihoods=np.stack([left, left - 1.0, visible, np.zeros(hops)], axis=1),
@@ -88,7 +87,7 @@ def test_the_table_switches_one_thing_at_a_time():
 
 
 def test_without_answers_the_absence_switch_does_nothing():
-    mute = [replace(s, answer=0 * s.answer, miss_rate=1 + 0 * s.miss_rate) for s in corpus(count=20)]
+    mute = [s.replace(answer=0 * s.answer, miss_rate=1 + 0 * s.miss_rate) for s in corpus(count=20)]
     table = ablation_table(mute, PRIOR, seed=0)
     assert table["signature_only"] == table["full"]
 

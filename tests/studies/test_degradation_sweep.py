@@ -1,7 +1,6 @@
 """The sweep over camera states: its figures from known decisions, its files, its report, the command."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +10,10 @@ from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.recording_folds import recording_folds
 from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERIED
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.degradation.degradation_report import sweep_report, sweep_table, write_sweep_figure
 from worldstate.studies.degradation.degradation_sweep import SweepSettings, degradation_sweep
 from worldstate.studies.degradation.degraded_detections import CLEAN, OFF, camera_states
-from worldstate.studies.degradation.staged_recording import StagedRecording
 
 PRIOR = (0.25,) * 4
 HOPS, T0_S = 60, 4.0
@@ -38,23 +37,29 @@ def staged(number, approach, rng, hearing=3.0):
     off = np.array([state == OFF for state in STATES])[:, None]
     seen = (rng.random((len(STATES), HOPS)) >= beta) & visible & ~off
     heard = np.logaddexp.reduce(likelihoods[:, :3], axis=1) - likelihoods[:, 3]
-    return StagedRecording(
-        name=f"r{number}",
-        label="left" if approach else "none",
-        t0_s=T0_S if approach else float("nan"),
-        states=STATES,
-        time_s=time_s,
-        there=visible,
-        approach=np.full(HOPS, np.nan),
-        log_likelihoods=likelihoods,
-        answer=np.where(off, UNQUERIED, np.where(seen, PRESENT, ABSENT)),
-        miss_rate=np.broadcast_to(np.clip(beta, 0.02, 0.98), seen.shape),
-        clutter_rate=np.full(seen.shape, 0.01),
-        seen=seen,
-        found=seen,
-        degradation=np.broadcast_to(beta, seen.shape),
-        presence=np.broadcast_to(1.0 / (1.0 + np.exp(-heard)), seen.shape),
-    )
+    whole = HopTable(
+        {"time_s": time_s, "there": visible, "log_likelihoods": likelihoods},
+        f"r{number}", "left" if approach else "none", T0_S if approach else float("nan"),
+    )  # fmt: skip
+    answer = np.where(off, UNQUERIED, np.where(seen, PRESENT, ABSENT))
+    by_state = zip(STATES, answer, beta[:, 0], seen, strict=True)
+    return {
+        state: whole.replace(
+            answer=answered,
+            miss_rate=np.full(HOPS, np.clip(missed, 0.02, 0.98)),
+            clutter_rate=np.full(HOPS, 0.01),
+            seen=there,
+            found=there,
+            degradation=np.full(HOPS, missed),
+            presence=1.0 / (1.0 + np.exp(-heard)),
+        )
+        for state, answered, missed, there in by_state
+    }
+
+
+def changed(one, **columns):
+    """The same recording with other columns in every state."""
+    return {state: table.replace(**columns) for state, table in one.items()}
 
 
 @pytest.fixture(scope="module")
@@ -83,16 +88,16 @@ def test_vision_alone_decays_as_one_minus_beta_and_awareness_does_not(rows):
 def test_awareness_is_counted_as_it_is_defined(corpus):
     """Against loops over the hops, with thresholds that nothing and everything passes."""
     for level, heard in ((2.0, False), (-1.0, True)):
-        bent = [replace(one, presence=np.where(one.hazard_free, 0.5, np.full_like(one.presence, level)))
-                for one in corpus]  # fmt: skip
+        bent = [
+            changed(one, presence=np.full(HOPS, 0.5 if one[OFF].hazard_free else level)) for one in corpus
+        ]
         for row in degradation_sweep(bent, SweepSettings(PRIOR), np.random.default_rng(0)):
             aware = hops = 0
-            for one in bent:
-                seen = one.seen[one.states.index(row.state)]
+            for one in (bent_one[row.state] for bent_one in bent):
                 for i, time_s in enumerate(one.time_s):
                     if not one.hazard_free and time_s > one.t0_s + 1e-6 and one.there[i]:
                         hops += 1
-                        aware += bool(seen[i] or not heard)
+                        aware += bool(one.seen[i] or not heard)
             assert row.awareness == pytest.approx(aware / hops)
 
 
@@ -101,14 +106,17 @@ def test_false_alarms_keep_the_budget_of_the_clean_camera(rows, corpus):
     report = sweep_report(rows)
     clean = next(row for row in rows if row.state == CLEAN)
     assert all(row.false_alarms_per_hour <= clean.false_alarms_per_hour + 1e-9 for row in rows)
-    hours = sum(one.hazard_free for one in corpus) * HOPS * 0.1 / 3600.0
+    hours = sum(one[CLEAN].hazard_free for one in corpus) * HOPS * 0.1 / 3600.0
     assert clean.false_awareness_per_hour * hours <= clean.false_awareness * 12 * HOPS + 1e-9
     assert clean.false_awareness <= 0.06
     assert report["largest_ratio_of_false_awareness_per_hour"] == pytest.approx(1.0)
 
 
 def test_false_detections_are_false_awareness(corpus):
-    raving = [replace(one, seen=one.seen | (np.arange(HOPS) % 2 == 0)) for one in corpus]
+    raving = [
+        {state: table.replace(seen=table.seen | (np.arange(HOPS) % 2 == 0)) for state, table in one.items()}
+        for one in corpus
+    ]
     row = degradation_sweep(raving, SweepSettings(PRIOR), np.random.default_rng(0))[0]
     assert row.false_awareness_per_hour > 10_000
     assert row.false_awareness == pytest.approx(0.5, abs=0.05)
@@ -126,7 +134,7 @@ def test_report_table_and_figure(rows, tmp_path):
 
 
 def test_a_detection_of_something_else_is_no_awareness_of_the_vehicle(corpus):
-    raving = [replace(one, seen=np.ones_like(one.seen)) for one in corpus]
+    raving = [changed(one, seen=np.ones(HOPS, bool)) for one in corpus]
     before = degradation_sweep(corpus, SweepSettings(PRIOR), np.random.default_rng(0))
     after = degradation_sweep(raving, SweepSettings(PRIOR), np.random.default_rng(0))
     assert [row.vision_only for row in after] == [row.vision_only for row in before]
@@ -137,16 +145,18 @@ def test_a_detection_of_something_else_is_no_awareness_of_the_vehicle(corpus):
 def test_what_does_not_fit_is_refused(corpus):
     with pytest.raises(InvalidArgumentError, match="states"):
         degradation_sweep([], SweepSettings(PRIOR), np.random.default_rng(0))
-    free = [one for one in corpus if one.hazard_free]
+    free = [one for one in corpus if one[CLEAN].hazard_free]
     with pytest.raises(InvalidArgumentError, match="view"):
         degradation_sweep(free, SweepSettings(PRIOR), np.random.default_rng(0))
-    one_free = [one for one in corpus if not one.hazard_free] + free[:1]
+    one_free = [one for one in corpus if not one[CLEAN].hazard_free] + free[:1]
     with pytest.raises(InvalidArgumentError, match="hazard-free"):
         degradation_sweep(one_free, SweepSettings(PRIOR), np.random.default_rng(0))
+    with pytest.raises(InvalidArgumentError, match="states"):
+        degradation_sweep(
+            [corpus[0], {CLEAN: corpus[1][CLEAN]}], SweepSettings(PRIOR), np.random.default_rng(0)
+        )
     with pytest.raises(InvalidArgumentError, match="presence"):
-        replace(corpus[0], presence=corpus[0].presence[:3])
-    with pytest.raises(InvalidArgumentError, match="fog"):
-        corpus[0].stream("fog")
+        corpus[0][CLEAN].replace(presence=np.zeros(3))
 
 
 def test_folds_are_even_in_every_label():

@@ -7,7 +7,7 @@ import pytest
 
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.cli.main import main
-from worldstate.operations.recordings.hop_stream import save_streams
+from worldstate.operations.recordings.hop_table import save_tables
 
 from .test_ablations import corpus
 
@@ -52,7 +52,7 @@ def test_the_figure_is_refused_before_the_work(table, tmp_path, capsys):
 
 
 def test_ablations_of_streams_are_those_of_the_library(tmp_path, capsys):
-    save_streams(tmp_path / "s.npz", corpus(count=24))
+    save_tables(tmp_path / "s.npz", corpus(count=24))
     rows = told(capsys, "ablations", tmp_path / "s.npz")["rows"]
     assert rows["raw_risk"]["auroc"] == rows["full"]["auroc"]
     assert rows["raw_risk"]["ece"] > rows["full"]["ece"]

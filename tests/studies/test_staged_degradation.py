@@ -22,9 +22,9 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.listen import measure_steps, open_source
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.studies.degradation.degraded_detections import CameraState, Staging, stage_looks
-from worldstate.studies.degradation.detections_file import load_looks, save_looks
-from worldstate.studies.degradation.staged_degradation import hear_staged
+from worldstate.studies.degradation.degraded_detections import CameraState, Staging, detect_in_states
+from worldstate.studies.degradation.detections_file import load_staged_detections, save_staged_detections
+from worldstate.studies.degradation.staged_degradation import filter_in_states
 
 CAMERA = PinholeCamera()
 WIDTH, HEIGHT = 484, 304
@@ -67,25 +67,24 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, 
     source, recording = open_source(approach.folder), Recording.open(approach.folder)
     staging = Staging(MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
     states = (CameraState("all", 0.0), CameraState("noise", 1.0))
-    looks = stage_looks(video, staging, states, np.random.default_rng(0))
-    staged = hear_staged(source, looks, staging, name="a", label=recording.label)
-    assert staged.states == ("clean", "noise 1", "off")
-    clean, blind, off = (staged.stream(state) for state in staged.states)
-    after = staged.after_sight
+    detections = detect_in_states(video, staging, states, np.random.default_rng(0))
+    staged = filter_in_states(source, detections, staging, name="a", label=recording.label)
+    assert list(staged) == ["clean", "noise 1", "off"]
+    clean, blind, off = staged.values()
+    after = clean.after_sight()
     assert after.any()
-    assert not after[staged.time_s < source.t0_s].any()
+    assert not after[clean.time_s < source.t0_s].any()
     assert clean.seen[after].mean() > 0.7
     assert blind.seen[after].mean() <= 0.05
-    found = dict(zip(staged.states, staged.found, strict=True))
-    assert found["clean"][after].mean() > 0.7
-    assert not (found["clean"] & ~(clean.seen & clean.there)).any()
-    assert not found["off"].any()
+    assert clean.found[after].mean() > 0.7
+    assert not (clean.found & ~(clean.seen & clean.there)).any()
+    assert not off.found.any()
     assert (off.answer == 0).all()
     asked = (clean.answer > 0) & (blind.answer > 0)
     assert asked.mean() > 0.5
     assert np.median(clean.miss_rate[asked]) < 0.4
     assert np.median(blind.miss_rate[asked]) > 0.9
-    assert np.median(staged.degradation, axis=1) == pytest.approx([0.0, 1.0, 1.0], abs=0.1)
+    assert [np.median(one.degradation) for one in staged.values()] == pytest.approx([0.0, 1.0, 1.0], abs=0.1)
     assert_the_sound_says_the_same(source, staged)
 
 
@@ -93,25 +92,25 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, video, 
 def test_what_was_seen_comes_back_for_its_origin_alone_and_damage_is_named(video, rates, tmp_path):
     staging = Staging(MotionDetector, rates, SMALL, VisionSettings(keep=any_motion()))
     states = (CameraState("all", 0.0), CameraState("noise", 1.0))
-    looks = stage_looks(video, staging, states, np.random.default_rng(0))
-    assert sum(map(len, looks.watched[0].detections.frames)) > 10
+    detections = detect_in_states(video, staging, states, np.random.default_rng(0))
+    assert sum(map(len, detections["clean"].detections.frames)) > 10
     path = tmp_path / "r.npz"
-    save_looks(path, looks, "one")
-    back = load_looks(path, "one", rates)
-    assert back.states == looks.states
-    for one, other in zip(back.watched, looks.watched, strict=True):
+    save_staged_detections(path, detections, "one")
+    back = load_staged_detections(path, "one", rates)
+    assert list(back) == list(detections)
+    for one, other in zip(back.values(), detections.values(), strict=True):
         assert np.array_equal(one.degradation.degradation, other.degradation.degradation)
         assert np.array_equal(one.detections.stamps_ns, other.detections.stamps_ns)
         for frame, same in zip(one.detections.frames, other.detections.frames, strict=True):
             assert np.array_equal(frame.boxes_px, same.boxes_px)
             assert (frame.labels, frame.scores.tolist()) == (same.labels, same.scores.tolist())
-    assert load_looks(path, "another", rates) is None
-    assert load_looks(tmp_path / "nothing.npz", "one", rates) is None
+    assert load_staged_detections(path, "another", rates) is None
+    assert load_staged_detections(tmp_path / "nothing.npz", "one", rates) is None
     whole = path.read_bytes()
     for size in range(0, len(whole) - 1, len(whole) // 15):
         path.write_bytes(whole[:size])
         with pytest.raises(InputFileError, match=r"r\.npz"):
-            load_looks(path, "one", rates)
+            load_staged_detections(path, "one", rates)
 
 
 def assert_the_sound_says_the_same(source, staged):
@@ -122,8 +121,8 @@ def assert_the_sound_says_the_same(source, staged):
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         presence.append(1.0 - world.explanation.none)
         said.append(measurement.signature.log_likelihoods)
-    assert staged.log_likelihoods == pytest.approx(np.array(said))
-    assert staged.presence[staged.index("off")] == pytest.approx(np.array(presence))
+    assert staged["off"].log_likelihoods == pytest.approx(np.array(said))
+    assert staged["off"].presence == pytest.approx(np.array(presence))
 
 
 @pytest.mark.xdist_group("approach")

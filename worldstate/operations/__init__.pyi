@@ -9,7 +9,7 @@ from .calibration.cueing_calibration import calibrate_cueing as calibrate_cueing
 from .detectors.miss_rate_measurement import AbsenceSettings as AbsenceSettings
 from .detectors.miss_rate_measurement import measure_absence as measure_absence
 from .metrics.roc import auroc as auroc
-from .recordings.hop_stream import HopStream as HopStream
+from .recordings.hop_table import HopTable as HopTable
 from .recordings.recording_report import RecordingReport as RecordingReport
 from .recordings.recording_report import run_recording as run_recording
 from .recordings.timeline import Timeline as Timeline

@@ -1,10 +1,10 @@
 """Prominence gating: coverage against accuracy, of bearings alone and of a run beside its camera."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from hop_tables import blank_recording
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,9 +12,9 @@ from worldstate.cli.main import main
 from worldstate.frontend.direction.gating import gating_curve
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, wrap_angle
-from worldstate.operations.recordings.bearing_gating import BearingChecks, check_bearings
-from worldstate.studies.streets.published_figures import twin_bearings
-from worldstate.studies.streets.recording_features import TwinRecording
+from worldstate.operations.recordings.bearing_gating import bearing_curve, bearing_figures, check_bearings
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.studies.streets.published_figures import checked_bearings
 
 PAIRS = st.lists(
     st.tuples(st.sampled_from([1.0, 1.1, 1.4, 2.0, 3.5]), st.floats(-7, 7)), min_size=1, max_size=40
@@ -89,10 +89,13 @@ def test_bearings_are_checked_against_what_moved_when_they_were_heard() -> None:
     moving = [[angle, angle + 2.0] for angle in wrap_angle(box)]
     moving[-10:] = [[]] * 10
     ages, prominence = np.full(n, 0.2), np.where(sure, 2.0, 1.2)
-    checks = check_bearings(*(x.tolist() for x in (time_s, ages, wrap_angle(heard), prominence)), moving)
-    assert np.flatnonzero(~checks.in_view).tolist() == list(range(n - 8, n))
+    run = HopTable(
+        {"time_s": time_s, "bearing_age_s": ages, "bearing_rad": wrap_angle(heard), "prominence": prominence}
+    )
+    checks = check_bearings(run, moving)
+    assert np.flatnonzero(np.isnan(checks.error_rad)).tolist() == list(range(n - 8, n))
     np.testing.assert_allclose(checks.error_rad[2:-8][sure[2:-8]], 0.1, atol=1e-9)
-    found = checks.figures()
+    found = bearing_figures(checks)
     assert found["bearings_in_view"] == n - 8
     assert found["bearing_gated_deg"] == pytest.approx(np.degrees(0.1))
     assert found["gate_prominence"] == 2.0
@@ -100,9 +103,9 @@ def test_bearings_are_checked_against_what_moved_when_they_were_heard() -> None:
 
 
 def test_nothing_in_view_is_no_accuracy() -> None:
-    checks = BearingChecks(np.array([1.5, 1.2, 1.1]), np.full(3, np.nan))
-    assert isinstance(checks.curve(), NotUsable)
-    found = checks.figures()
+    checks = HopTable({"prominence": np.array([1.5, 1.2, 1.1]), "error_rad": np.full(3, np.nan)})
+    assert isinstance(bearing_curve(checks), NotUsable)
+    found = bearing_figures(checks)
     assert (found["bearings_in_view"], found["bearing_median_deg"], found["prominence_in_view"]) == (
         0,
         None,
@@ -111,17 +114,15 @@ def test_nothing_in_view_is_no_accuracy() -> None:
     assert found["prominence_without"] == 1.2
 
 
-def test_recordings_of_the_twin_are_pooled() -> None:
+def test_simulated_recordings_are_pooled() -> None:
     """Errors of 1 and 3 degrees at prominences 2 and 1.2; the window without a box counts as neither."""
-    quiet = TwinRecording.blank("a", hops=3)
-    sure = replace(
-        quiet, prominence=np.full(3, 2.0), reference_rad=np.zeros(3), srp_rad=np.radians([1, 1, 1])
-    )
-    unsure = replace(
-        sure, prominence=np.array([1.2, 1.2, 9.0]), srp_rad=np.radians([3, -3, 50]),
+    quiet = blank_recording("a", 3)
+    sure = quiet.replace(prominence=np.full(3, 2.0), reference_rad=np.zeros(3), srp_rad=np.radians([1, 1, 1]))
+    unsure = sure.replace(
+        prominence=np.array([1.2, 1.2, 9.0]), srp_rad=np.radians([3, -3, 50]),
         reference_rad=np.array([0.0, 0.0, np.nan]),
     )  # fmt: skip
-    curve = twin_bearings([unsure, sure]).curve()
+    curve = bearing_curve(checked_bearings([unsure, sure]))
     np.testing.assert_allclose(curve.coverage, [1.0, 0.6])
     np.testing.assert_allclose(np.degrees(curve.median_error_rad), [1.0, 1.0])
     np.testing.assert_allclose(curve.threshold, [1.2, 2.0])

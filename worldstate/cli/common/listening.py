@@ -7,7 +7,7 @@ from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.listen import Source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.calibration.calibration_input import find_inputs, read_input
-from worldstate.operations.recordings.hop_stream import HopStream
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.recording_report import RecordingReport, run_recording
 
 from .progress import progress_bar, track
@@ -21,9 +21,7 @@ def listen_with_progress(source: Source, *, title: str, states_path: Path | None
         return run_recording(source, title=title, states_path=states_path, on_hop=lambda step: bar.advance())
 
 
-def read_streams(
-    inputs: Iterable[Path], array: MicrophoneArray | None, model: Path | None
-) -> list[HopStream]:
+def read_streams(inputs: Iterable[Path], array: MicrophoneArray | None, model: Path | None) -> list[HopTable]:
     """Return the hop streams of data sets, recordings, sound files and what --save-streams wrote."""
     found = [item for path in inputs for item in find_inputs(path)]
     read = track(found, "listening", len(found))

@@ -18,7 +18,7 @@ from worldstate.cli.common.progress import track
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.ovad import Recording
     from worldstate.studies.degradation.staged_dataset import StagedDataset
-    from worldstate.studies.degradation.staged_recording import StagedRecording
+    from worldstate.studies.degradation.staged_degradation import StagedHops
 
 DESCRIPTION = """\
 Stage blur, darkness and sensor noise, four levels each, on the video of every recording of a data set, and
@@ -125,26 +125,28 @@ def _settings(arguments: argparse.Namespace) -> "StagedDataset":
 
 def _stage(
     folder: Path, found: "list[Recording]", settings: "StagedDataset", jobs: int
-) -> "list[StagedRecording]":
+) -> "list[StagedHops]":
     from worldstate.studies.degradation.staged_dataset import stage_dataset
 
     folder.mkdir(parents=True, exist_ok=True)
     return list(track(stage_dataset(folder, found, settings, jobs), "staging the camera", len(found)))
 
 
-def _origin(arguments: argparse.Namespace, recordings: "list[StagedRecording]") -> dict[str, object]:
+def _origin(arguments: argparse.Namespace, recordings: "list[StagedHops]") -> dict[str, object]:
     from worldstate.operations.recordings.hop_stream import HOP_S
+    from worldstate.studies.degradation.degraded_detections import CLEAN
 
-    free = [one for one in recordings if one.hazard_free]
+    clean = [one[CLEAN] for one in recordings]
+    free = [one for one in clean if one.hazard_free]
     return {
         "out": str(arguments.out),
         "data": arguments.dataset.name,
         "detector": detector_name(arguments),
         "model": "default" if arguments.model is None else arguments.model.name,
         "approaches": len(recordings) - len(free),
-        "hops_in_view": int(sum(one.after_sight.sum() for one in recordings)),
+        "hops_in_view": int(sum(one.after_sight().sum() for one in clean)),
         "hazard_free": len(free),
-        "hazard_free_hours": sum(one.time_s.size for one in free) * HOP_S / 3600.0,
+        "hazard_free_hours": sum(map(len, free)) * HOP_S / 3600.0,
         "alpha": arguments.alpha,
         "seed": arguments.seed,
     }

@@ -12,9 +12,9 @@ from worldstate.cli.common.progress import progress_bar, track
 if TYPE_CHECKING:
     from worldstate.abduction.signature.signature_io import AnySignature
     from worldstate.adapters.simulation.scene.presets import Preset
-    from worldstate.studies.streets.decision_rules import TwinScore
+    from worldstate.operations.recordings.hop_table import HopTable
+    from worldstate.studies.streets.decision_rules import RuleScores
     from worldstate.studies.streets.realism import Realism
-    from worldstate.studies.streets.recording_features import TwinRecording
 
 # Windows from either side at every site, and the seeds, of the comparison with real ones.
 WINDOWS = 10
@@ -88,60 +88,61 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from worldstate.adapters.files.atomic import write_text
-    from worldstate.studies.streets.decision_rules import score_twins
-    from worldstate.studies.streets.figure import write_twin_figure
-    from worldstate.studies.streets.published_figures import twin_figures, twin_intervals
-    from worldstate.studies.streets.report import twin_report, twin_table
+    from worldstate.studies.streets.decision_rules import score_rules
+    from worldstate.studies.streets.figure import write_comparison_figure
+    from worldstate.studies.streets.published_figures import figure_intervals, published_figures
+    from worldstate.studies.streets.recording_features import classified
+    from worldstate.studies.streets.report import comparison_report, comparison_table
 
     output_folder(arguments.out, "twin.json", "twin.png")
     realism = _realism(arguments)
-    heard = _listen(arguments)
+    hops = _simulate(arguments)
     signature = _signature(arguments)
-    recordings = [recording.judged(signature) for recording in heard]
+    recordings = [classified(recording, signature) for recording in hops]
     # Folds and bootstrap are drawn apart from the recordings, from the same seed.
     folds, draws = np.random.default_rng(arguments.seed).spawn(2)
-    score = score_twins(recordings, folds)
+    score = score_rules(recordings, folds)
     origin = _origin(arguments, score)
-    report = origin | twin_report(twin_figures(score), twin_intervals(score, draws))
+    report = origin | comparison_report(published_figures(score), figure_intervals(score, draws))
     if realism:
         report["realism"] = {str(seed): one.to_dict() for seed, one in realism.items()}
     write_text(arguments.out / "twin.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
-    write_twin_figure(score, arguments.out / "twin.png")
+    write_comparison_figure(score, arguments.out / "twin.png")
     if arguments.json:
         print_summary(report, as_json=True)
         return 0
     print_summary(origin | {"outside": report["outside"]}, as_json=False)
-    print(twin_table(report))
+    print(comparison_table(report))
     for seed, one in realism.items():
         print(f"\nrealism, seed {seed}\n{one.table()}")
     return 0
 
 
-def _listen(arguments: argparse.Namespace) -> "list[TwinRecording]":
+def _simulate(arguments: argparse.Namespace) -> "list[HopTable]":
     from worldstate.adapters.simulation.dataset.plan import plan_static
     from worldstate.ground.checks import in_range
-    from worldstate.studies.streets.simulated_streets import TwinSettings, listen_twins
+    from worldstate.studies.streets.simulated_streets import StreetSettings, simulated_hops
 
     in_range("--static", arguments.static, 4, 10_000)
     in_range("--jobs", arguments.jobs, 1, 256)
     in_range("--duration", arguments.duration, 1.5, 60.0)
     plans = plan_static(arguments.static, arguments.seed)
-    heard = arguments.out / "heard"
-    heard.mkdir(parents=True, exist_ok=True)
+    folder = arguments.out / "hops"
+    folder.mkdir(parents=True, exist_ok=True)
     keep = arguments.out / "recordings" if arguments.keep else None
-    settings = TwinSettings(_levels(arguments), arguments.duration, keep)
-    made = listen_twins(heard, plans, settings, arguments.jobs)
+    settings = StreetSettings(_levels(arguments), arguments.duration, keep)
+    made = simulated_hops(folder, plans, settings, arguments.jobs)
     return list(track(made, "simulating and listening", len(plans)))
 
 
 def _signature(arguments: argparse.Namespace) -> "AnySignature":
     from worldstate.adapters.files.model_file import load_model
-    from worldstate.studies.streets.street_training import N_RECORDINGS, train_on_twin
+    from worldstate.studies.streets.street_training import N_RECORDINGS, train_on_simulation
 
     if arguments.model is not None:
         return load_model(None if arguments.model == DEFAULT_MODEL else arguments.model)[0]
     with progress_bar("simulating the training windows", N_RECORDINGS) as bar:
-        return train_on_twin(
+        return train_on_simulation(
             arguments.out,
             _levels(arguments),
             arguments.seed,
@@ -184,7 +185,7 @@ def _realism(arguments: argparse.Namespace) -> "dict[int, Realism]":
         return realism_over_seeds(real, simulate, REALISM_SEEDS)
 
 
-def _origin(arguments: argparse.Namespace, score: "TwinScore") -> dict[str, object]:
+def _origin(arguments: argparse.Namespace, score: "RuleScores") -> dict[str, object]:
     from worldstate.operations.recordings.hop_stream import HOP_S
 
     levels = _levels(arguments)

@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     from worldstate.adapters.files.model_file import read_model, save_model
     from worldstate.cli.common.listening import read_streams
     from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
-    from worldstate.operations.recordings.hop_stream import save_streams
+    from worldstate.operations.recordings.hop_table import save_tables
 
     check_outputs(arguments, "out", "save_streams")
     settings = CueingSettings(
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     model = read_model(arguments.model)
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     if arguments.save_streams is not None:
-        save_streams(arguments.save_streams, streams)
+        save_tables(arguments.save_streams, streams)
     done = calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
     figures = dict(model.provenance.figures or {}) | {"calibration_hours": done.hours}
     provenance = replace(model.provenance, figures=figures)

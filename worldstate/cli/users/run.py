@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.cli.common.listening import listen_with_progress
-    from worldstate.operations.recordings.bearing_gating import write_gating_figure
+    from worldstate.operations.recordings.bearing_gating import bearing_figures, write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
     check_outputs(arguments, "out", figures=("figure", "gating"))
@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     }
     if arguments.gating is not None:
         write_gating_figure(report.bearings, arguments.gating, title=str(arguments.input))
-        summary |= report.bearings.figures()
+        summary |= bearing_figures(report.bearings)
     print_summary(summary, as_json=arguments.json)
     return 0
 

@@ -7,7 +7,8 @@ from worldstate.adapters.datasets.ovad_layout import LOG_NAME
 from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.recordings.hop_stream import HopStream, hop_stream, load_streams
+from worldstate.operations.recordings.hop_stream import hop_stream, load_streams
+from worldstate.operations.recordings.hop_table import HopTable
 
 
 def find_inputs(path: Path) -> list[Path]:
@@ -21,7 +22,7 @@ def find_inputs(path: Path) -> list[Path]:
 
 def read_input(
     path: Path, *, array: MicrophoneArray | None = None, model: Path | None = None
-) -> list[HopStream]:
+) -> list[HopTable]:
     """Listen to a recording or read streams; a sound file counts as hazard-free."""
     if path.suffix == ".npz":
         return load_streams(path)

@@ -15,7 +15,8 @@ from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.recordings.hop_stream import HOP_S, HopStream
+from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate.operations.training.window_calibration import MISS_RATES
 
@@ -168,7 +169,7 @@ class CueingCalibration:
 
 
 def calibrate_cueing(
-    streams: Sequence[HopStream],
+    streams: Sequence[HopTable],
     reference_prior: tuple[float, ...],
     kept: CueingPolicies,
     settings: CueingSettings | None = None,
@@ -177,7 +178,7 @@ def calibrate_cueing(
 
     Parameters
     ----------
-    streams : sequence of HopStream
+    streams : sequence of HopTable
         Hazard-free recordings, and approaches if there are any.
     reference_prior : tuple of float
         Prior that the statistic is formed at: the signature model's own.
@@ -195,11 +196,10 @@ def calibrate_cueing(
     --------
     Ten hazard-free recordings of a minute, made up:
 
-    >>> from dataclasses import replace
     >>> from worldstate.adapters.files.model_file import load_model
     >>> rng, kept = np.random.default_rng(0), load_model()[1]
     >>> quiet = [
-    ...     replace(HopStream.blank(f"street/{i}", hops=600), log_likelihoods=rng.normal(0.0, 1.0, (600, 4)))
+    ...     HopTable({"time_s": 0.1 * np.arange(600), "log_likelihoods": rng.normal(0.0, 1.0, (600, 4))})
     ...     for i in range(10)
     ... ]
     >>> found = calibrate_cueing(quiet, (0.25,) * 4, kept, CueingSettings(alphas=(0.05,)))
@@ -210,7 +210,7 @@ def calibrate_cueing(
     free = [stream for stream in streams if stream.hazard_free and len(stream)]
     if not free:
         raise InvalidArgumentError("recordings: expected at least one without a hazard")
-    approaches = [stream for stream in streams if stream.before_sight.any()]
+    approaches = [stream for stream in streams if stream.before_sight().any()]
     budgets, policies = [], []
     for beta in sorted(MISS_RATES):
         calm = _statistics(free, reference_prior, beta)
@@ -250,14 +250,14 @@ def cut(stream: FloatArray, block_hops: int) -> list[FloatArray]:
     return np.split(stream, [i * block_hops for i in range(1, count)])
 
 
-def _statistics(streams: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
+def _statistics(streams: Sequence[HopTable], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
     switches = StatisticSwitches(fixed_miss_rate=beta)
     return [stream_statistic(stream, prior, switches) for stream in streams]
 
 
-def _hazards(approaches: Sequence[HopStream], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
+def _hazards(approaches: Sequence[HopTable], prior: tuple[float, ...], beta: float) -> list[FloatArray]:
     scored = _statistics(approaches, prior, beta)
-    return [s[stream.before_sight] for s, stream in zip(scored, approaches, strict=True)]
+    return [s[stream.before_sight()] for s, stream in zip(scored, approaches, strict=True)]
 
 
 def _budget(calm: list[FloatArray], alpha: float, beta: float, settings: CueingSettings) -> BudgetReport:

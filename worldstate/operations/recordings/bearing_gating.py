@@ -4,8 +4,7 @@ As in the paper's section on front-end accuracy: while the vehicle is in view, a
 moving box that stands nearest to it.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +12,11 @@ import numpy as np
 
 from worldstate.frontend.direction.gating import GatingCurve, gating_curve
 from worldstate.ground.checks import check_shape
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.operations.figure_style import figure_file
+
+from .hop_table import HopTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,92 +29,60 @@ PUBLISHED_COVERAGE = PUBLISHED[1][0]
 FEWEST = 10
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BearingChecks:
-    """Bearings with the prominence they were read with, and their errors where a box was there.
+def check_bearings(hops: HopTable, moving_rad: Sequence[Sequence[float]]) -> HopTable:
+    """Compare the bearings of a run with the boxes that moved when they were heard.
+
+    `error_rad` is the bearing minus the azimuth of the nearest of them, NaN where none was in view.
 
     Examples
     --------
-    >>> checks = BearingChecks(np.array([1.1, 1.2, 2.0, 3.0]), np.array([np.nan, 0.3, 0.02, 0.01]))
-    >>> checks.figures()["bearings_in_view"], checks.curve().coverage.round(2)
-    (3, array([1.  , 0.67, 0.33]))
-    """
-
-    prominence: FloatArray  # shape (n,): Peak-to-median ratios, >= 1
-    # shape (n,): Bearing minus azimuth of the nearest moving box; NaN where none was in view.
-    error_rad: FloatArray
-
-    def __post_init__(self) -> None:
-        check_shape("error_rad", np.shape(self.error_rad), np.shape(self.prominence))
-
-    @property
-    def in_view(self) -> BoolArray:
-        """Where a moving box was in view, shape (n,)."""
-        return np.isfinite(self.error_rad)
-
-    def curve(self) -> GatingCurve | NotUsable:
-        """Trade coverage for accuracy."""
-        seen = self.in_view
-        if not seen.any():
-            return NotUsable("no bearing with a moving box in view")
-        return gating_curve(self.prominence[seen], self.error_rad[seen])
-
-    def figures(self) -> dict[str, float | None]:
-        """Return counts and medians; None where there is nothing to count."""
-        curve = self.curve()
-        error = threshold = gated = None
-        if not isinstance(curve, NotUsable):
-            error = float(np.degrees(curve.median_error_rad[0]))
-            threshold, gated_rad = curve.at_coverage(PUBLISHED_COVERAGE)
-            gated = float(np.degrees(gated_rad))
-        return {
-            "bearings_in_view": int(self.in_view.sum()),
-            "bearing_median_deg": error,
-            "bearing_gated_deg": gated,
-            "gate_prominence": threshold,
-            "prominence_in_view": _median(self.prominence[self.in_view]),
-            "prominence_without": _median(self.prominence[~self.in_view]),
-        }
-
-
-def joined(parts: Iterable[BearingChecks]) -> BearingChecks:
-    """Put the bearings of several recordings together.
-
-    Examples
-    --------
-    >>> part = BearingChecks(np.array([1.5]), np.array([0.1]))
-    >>> joined([part, part]).prominence
-    array([1.5, 1.5])
-    """
-    kept = list(parts)
-    prominence, error = (np.concatenate([getattr(p, k) for p in kept]) for k in ("prominence", "error_rad"))
-    return BearingChecks(prominence, error)
-
-
-def check_bearings(
-    time_s: Sequence[float],
-    age_s: Sequence[float],
-    bearing_rad: Sequence[float],
-    prominence: Sequence[float],
-    moving_rad: Sequence[Sequence[float]],
-) -> BearingChecks:
-    """Compare the bearings of a run with what the camera saw moving when they were heard.
-
-    Examples
-    --------
-    >>> boxes, heard = [[0.3], [0.2], [0.1, -1.0]], [0.3, 0.31, 0.18]
-    >>> check_bearings([0.1, 0.2, 0.3], [0.1] * 3, heard, [1.5, 1.5, 2.0], boxes).error_rad.round(2)
+    >>> hops = {"time_s": [0.1, 0.2, 0.3], "bearing_age_s": [0.1] * 3, "bearing_rad": [0.3, 0.31, 0.18]}
+    >>> run = HopTable({name: np.array(values) for name, values in hops.items()})
+    >>> run = run.replace(prominence=np.array([1.5, 1.5, 2.0]))
+    >>> check_bearings(run, [[0.3], [0.2], [0.1, -1.0]]).error_rad.round(2)
     array([ 0.  ,  0.01, -0.02])
     """
-    time, bearing = np.array(time_s, dtype=np.float64), np.array(bearing_rad, dtype=np.float64)
-    check_shape("moving_rad", (len(moving_rad),), time.shape)
-    heard = time - np.array(age_s, dtype=np.float64)
-    at = [int(np.abs(time - moment).argmin()) for moment in heard]
-    errors = [_nearest(angle, moving_rad[hop]) for angle, hop in zip(bearing.tolist(), at, strict=True)]
-    return BearingChecks(np.array(prominence, dtype=np.float64), np.array(errors, dtype=np.float64))
+    check_shape("moving_rad", (len(moving_rad),), (len(hops),))
+    at = [int(np.abs(hops.time_s - moment).argmin()) for moment in hops.time_s - hops.bearing_age_s]
+    errors = [_nearest(angle, moving_rad[hop]) for angle, hop in zip(hops.bearing_rad, at, strict=True)]
+    return HopTable({"prominence": hops.prominence, "error_rad": np.array(errors, dtype=np.float64)})
 
 
-def write_gating_figure(checks: BearingChecks, path: Path, title: str = "") -> None:
+def bearing_curve(checks: HopTable) -> GatingCurve | NotUsable:
+    """Trade coverage for accuracy, by the bearings that a moving box could check."""
+    seen = np.isfinite(checks.error_rad)
+    if not seen.any():
+        return NotUsable("no bearing with a moving box in view")
+    return gating_curve(checks.prominence[seen], checks.error_rad[seen])
+
+
+def bearing_figures(checks: HopTable) -> dict[str, float | None]:
+    """Return counts and medians; None where there is nothing to count.
+
+    Examples
+    --------
+    >>> error = np.array([np.nan, 0.3, 0.02, 0.01])
+    >>> checks = HopTable({"prominence": np.array([1.1, 1.2, 2.0, 3.0]), "error_rad": error})
+    >>> bearing_figures(checks)["bearings_in_view"], bearing_curve(checks).coverage.round(2)
+    (3, array([1.  , 0.67, 0.33]))
+    """
+    curve, seen = bearing_curve(checks), np.isfinite(checks.error_rad)
+    error = threshold = gated = None
+    if not isinstance(curve, NotUsable):
+        error = float(np.degrees(curve.median_error_rad[0]))
+        threshold, gated_rad = curve.at_coverage(PUBLISHED_COVERAGE)
+        gated = float(np.degrees(gated_rad))
+    return {
+        "bearings_in_view": int(seen.sum()),
+        "bearing_median_deg": error,
+        "bearing_gated_deg": gated,
+        "gate_prominence": threshold,
+        "prominence_in_view": _median(checks.prominence[seen]),
+        "prominence_without": _median(checks.prominence[~seen]),
+    }
+
+
+def write_gating_figure(checks: HopTable, path: Path, title: str = "") -> None:
     """Draw the curve and what prominence says of presence, and write both by the ending of `path`."""
     with figure_file(path, 8.0, 3.6) as figure:
         left, right = figure.subplots(1, 2)
@@ -122,11 +91,11 @@ def write_gating_figure(checks: BearingChecks, path: Path, title: str = "") -> N
         figure.suptitle(title)
 
 
-def draw_gating(axes: "Axes", checks: BearingChecks) -> None:
+def draw_gating(axes: "Axes", checks: HopTable) -> None:
     """Draw the median error against the share of bearings kept, the paper's two points beside it."""
-    curve = checks.curve()
+    curve = bearing_curve(checks)
     if not isinstance(curve, NotUsable):
-        n = int(checks.in_view.sum())
+        n = int(np.isfinite(checks.error_rad).sum())
         enough = curve.coverage * n >= min(FEWEST, n)
         axes.plot(curve.coverage[enough], np.degrees(curve.median_error_rad[enough]), label=f"{n} bearings")
     axes.plot(*np.transpose(PUBLISHED), "o", color="black", fillstyle="none", label="paper")
@@ -135,8 +104,9 @@ def draw_gating(axes: "Axes", checks: BearingChecks) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_presence(axes: "Axes", checks: BearingChecks) -> None:
-    groups = (("moving box in view", checks.in_view), ("none in view", ~checks.in_view))
+def _draw_presence(axes: "Axes", checks: HopTable) -> None:
+    seen = np.isfinite(checks.error_rad)
+    groups = (("moving box in view", seen), ("none in view", ~seen))
     for name, rows in groups:
         if rows.any():
             axes.ecdf(checks.prominence[rows], label=name)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +15,18 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.values import seconds
 from worldstate.state import WorldState
 
-from .bearing_gating import BearingChecks, check_bearings
+from .bearing_gating import check_bearings
 from .channel_report import HealthLog, RecordingHealth
+from .hop_table import HopTable
 from .timeline import EntityTrack, Timeline
 from .true_track import read_true_tracks
 from .warning import WarningMeter, WarningSummary
 
 # An entity is drawn where it more likely exists than not.
 LIKELY = 0.5
+SIDES = ("left", "right")
+# The sides' columns: whether an advisory of that side is on.
+_COLUMNS = ("time_s", "statistic", "risk", *SIDES, "srp", "bearing_age_s", "bearing_rad", "prominence")
 # From the middle of a decision window to its end, with the settings that a `Source` is listened to with.
 _WINDOW_AGE_S = 0.5 * FrontEndSettings().window_hops / FrontEndSettings().hop_rate_hz
 
@@ -44,8 +49,8 @@ class RecordingReport:
         Seconds of audio per second of wall time, the whole chain.
     health : RecordingHealth
         What was wrong with the microphones.
-    bearings : BearingChecks
-        Bearings and their prominence, beside the moving boxes of the camera.
+    bearings : HopTable
+        Bearings and their prominence, beside the moving boxes of the camera: see `check_bearings`.
 
     Examples
     --------
@@ -69,7 +74,7 @@ class RecordingReport:
     peak_risk: float
     realtime_factor: float
     health: RecordingHealth
-    bearings: BearingChecks
+    bearings: HopTable
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
@@ -128,14 +133,15 @@ def run_recording(
             log.add(step)
             on_hop(step)
     elapsed_s = time.perf_counter() - started
+    hops = HopTable.of_rows(_COLUMNS, log.rows)
     return RecordingReport(
         warning=log.meter.summary(),
-        timeline=log.timeline(source, title),
-        hops=len(log.time_s),
-        peak_risk=max(log.risk, default=0.0),
-        realtime_factor=(log.time_s[-1] if log.time_s else 0.0) / elapsed_s,
+        timeline=log.timeline(hops, source, title),
+        hops=len(hops),
+        peak_risk=float(hops.risk.max(initial=0.0)),
+        realtime_factor=float(hops.time_s.max(initial=0.0)) / elapsed_s,
         health=log.health.summary(),
-        bearings=log.bearings(),
+        bearings=check_bearings(hops, log.moving_rad),
     )
 
 
@@ -154,51 +160,39 @@ class _HopLog:
 
     meter: WarningMeter
     health: HealthLog = field(default_factory=HealthLog)
-    time_s: list[float] = field(default_factory=list)
-    statistic: list[float] = field(default_factory=list)
-    risk: list[float] = field(default_factory=list)
-    advisory: dict[str, list[bool]] = field(default_factory=lambda: {"left": [], "right": []})
-    srp: list[np.ndarray] = field(default_factory=list)
+    rows: list[tuple[Any, ...]] = field(default_factory=list)
     entities: dict[str, list[tuple[float, float, float, bool]]] = field(default_factory=dict)
-    heard: list[tuple[float, float, float]] = field(default_factory=list)
     moving_rad: list[list[float]] = field(default_factory=list)
     azimuths_rad: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def add(self, step: Step) -> None:
-        state, now_s = step.state, seconds(step.state.stamp_ns)
+        state, frame, now_s = step.state, step.frame, seconds(step.state.stamp_ns)
         self.meter.update(state)
-        self.health.add(step.frame)
-        self.time_s.append(now_s)
-        self.statistic.append(max((cue.statistic for cue in state.cues), default=0.0))
-        self.risk.append(state.risk)
-        for side, raised in self.advisory.items():
-            raised.append(any(cue.advisory and cue.direction == side for cue in state.cues))
-        self.srp.append(step.frame.srp.astype(np.float32))
-        self.azimuths_rad = step.frame.azimuths_rad
+        self.health.add(frame)
+        statistic = max((cue.statistic for cue in state.cues), default=0.0)
+        raised = [cue.direction for cue in state.cues if cue.advisory]
+        bearing = frame.bearing_age_s, frame.bearing_rad, frame.prominence
+        sides = [side in raised for side in SIDES]
+        self.rows.append((now_s, statistic, state.risk, *sides, frame.srp.astype(np.float32), *bearing))
+        self.azimuths_rad = frame.azimuths_rad
         for entity in state.entities:
             if entity.moving and entity.existence_probability >= LIKELY:
                 row = now_s, entity.azimuth_rad, entity.azimuth_std_rad, entity.status == "hidden"
                 self.entities.setdefault(entity.id, []).append(row)
-        frame = step.frame
-        self.heard.append((frame.bearing_age_s, frame.bearing_rad, frame.prominence))
         self.moving_rad.append([seen.azimuth_rad for seen in step.measurement.sightings if seen.moving])
 
-    def bearings(self) -> BearingChecks:
-        age_s, bearing_rad, prominence = np.array(self.heard, dtype=np.float64).reshape(-1, 3).T.tolist()
-        return check_bearings(self.time_s, age_s, bearing_rad, prominence, self.moving_rad)
-
-    def timeline(self, source: Source, title: str) -> Timeline:
-        boxes = [(t, azimuth) for t, row in zip(self.time_s, self.moving_rad, strict=True) for azimuth in row]
+    def timeline(self, hops: HopTable, source: Source, title: str) -> Timeline:
+        boxes = [(t, azimuth) for t, row in zip(hops.time_s, self.moving_rad, strict=True) for azimuth in row]
         sightings = np.array(boxes, dtype=np.float64).reshape(-1, 2)
         return Timeline(
-            time_s=np.array(self.time_s),
-            statistic=np.array(self.statistic),
-            risk=np.array(self.risk),
+            time_s=hops.time_s,
+            statistic=hops.statistic,
+            risk=hops.risk,
             threshold=source.policy.gamma,
             alpha=source.policy.alpha,
-            advisory={side: np.array(raised, dtype=bool) for side, raised in self.advisory.items()},
+            advisory={side: hops.columns[side].astype(bool) for side in SIDES},
             azimuths_rad=self.azimuths_rad,
-            srp=np.array(self.srp),
+            srp=hops.srp,
             srp_age_s=_WINDOW_AGE_S,
             entities=tuple(map(_entity_track, self.entities.values())),
             sighting_time_s=sightings[:, 0],

@@ -8,7 +8,8 @@ import numpy as np
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import FloatArray
 
-from .hop_stream import ABSENT, PRESENT, HopStream
+from .hop_stream import ABSENT, PRESENT
+from .hop_table import HopTable
 
 # An approach score beyond this many standard deviations says no more than one at it.
 LARGEST_SCORE = 3.0
@@ -39,7 +40,7 @@ class StatisticSwitches:
 
 
 def stream_statistic(
-    stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
+    stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
 ) -> FloatArray:
     r"""Return eq. (6) at a fixed prior at every hop, shape (n,), in [0, 1].
 
@@ -54,8 +55,7 @@ def stream_statistic(
 
     Examples
     --------
-    >>> from dataclasses import replace
-    >>> stream = replace(HopStream.blank("a", 1), log_likelihoods=np.log([[0.3, 0.1, 0.5, 0.1]]))
+    >>> stream = HopTable({"log_likelihoods": np.log([[0.3, 0.1, 0.5, 0.1]])})
     >>> for beta in (1.0, 0.0):
     ...     switches = StatisticSwitches(fixed_miss_rate=beta)
     ...     stream_statistic(stream, (0.25,) * 4, switches).round(3).item()
@@ -66,18 +66,20 @@ def stream_statistic(
     joint = _log_joint(stream, reference_prior, chosen)
     hidden = np.logaddexp.reduce(joint[:, :-2], axis=1)
     log_odds = hidden - np.logaddexp(joint[:, -2], joint[:, -1])
-    log_odds += chosen.approach_weight * approach_score(stream)
+    if chosen.approach_weight:
+        log_odds += chosen.approach_weight * approach_score(stream)
     return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
 
 
 def presence_statistic(
-    stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
+    stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
 ) -> FloatArray:
     """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,).
 
     Examples
     --------
-    >>> presence_statistic(HopStream.blank("a", 1), (0.25,) * 4)
+    >>> stream = HopTable({"log_likelihoods": np.zeros((1, 4))})
+    >>> presence_statistic(stream, (0.25,) * 4, StatisticSwitches(use_absence=False))
     array([0.75])
     """
     # Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
@@ -86,15 +88,13 @@ def presence_statistic(
     return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))
 
 
-def approach_score(stream: HopStream) -> FloatArray:
+def approach_score(stream: HopTable) -> FloatArray:
     """Return the approach rate in standard deviations within three, 0 where it is not usable, shape (n,)."""
     usable = np.isfinite(stream.approach)
     return np.where(usable, np.clip(stream.approach, -LARGEST_SCORE, LARGEST_SCORE), 0.0)
 
 
-def _log_joint(
-    stream: HopStream, reference_prior: Sequence[float], switches: StatisticSwitches
-) -> FloatArray:
+def _log_joint(stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches) -> FloatArray:
     """Log of prior, signature and answer, up to a constant of each hop, shape (n, K + 2)."""
     prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
     joint = np.log(prior) + stream.log_likelihoods
@@ -103,7 +103,7 @@ def _log_joint(
     return np.asarray(joint)
 
 
-def _log_visible(stream: HopStream, switches: StatisticSwitches) -> FloatArray:
+def _log_visible(stream: HopTable, switches: StatisticSwitches) -> FloatArray:
     """Log p(V | visible) / p(V | hidden or none) at every hop."""
     if not switches.use_absence:
         return np.zeros(len(stream))

@@ -1,6 +1,7 @@
 """The sweep over camera states as JSON, as a table and as a figure."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from worldstate.adapters.files.atomic import atomic_path
@@ -30,7 +31,7 @@ def sweep_report(rows: Sequence[SweepRow]) -> dict[str, object]:
         "clean_vision_only": clean.vision_only,
         "least_vision_only": min(row.vision_only for row in staged),
         **ratios,
-        "states": [row.to_dict() for row in rows],
+        "states": [asdict(row) for row in rows],
     }
 
 

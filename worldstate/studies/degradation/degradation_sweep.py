@@ -9,14 +9,15 @@ from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.recording_folds import recording_folds
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
 
 from .degraded_detections import CLEAN, OFF
-from .staged_recording import StagedRecording
+from .staged_degradation import StagedHops
 
 DRAWS = 1000
 
@@ -82,13 +83,9 @@ class SweepRow:
     # Share of their hops in awareness: where the hours are few, steadier than the count of its rises.
     false_awareness: float
 
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON-able values."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 def degradation_sweep(
-    recordings: Sequence[StagedRecording], settings: SweepSettings, rng: np.random.Generator
+    recordings: Sequence[StagedHops], settings: SweepSettings, rng: np.random.Generator
 ) -> list[SweepRow]:
     r"""Judge every state of the camera by the same thresholds.
 
@@ -98,7 +95,7 @@ def degradation_sweep(
 
     Parameters
     ----------
-    recordings : sequence of StagedRecording
+    recordings : sequence of mapping of str to HopTable
         Approaches with a T0 and hazard-free recordings, all in the same states.
     settings : SweepSettings
         How thresholds are set.
@@ -125,98 +122,88 @@ def degradation_sweep(
     ...     view = hazard & (time_s > 4.0)
     ...     scores = np.random.default_rng(i).normal(0.0, 0.3, (60, 4)) + np.array([0.0, 0.0, 0.0, 3.0])
     ...     scores[hazard & (time_s > 2.0), 0] += 8.0
-    ...     seen, ones = np.stack([view, 0 * view]).astype(bool), np.ones((2, 60))
-    ...     return StagedRecording(
-    ...         name=str(i), label="left" if hazard else "none", t0_s=4.0 if hazard else np.nan,
-    ...         states=("clean", "off"), time_s=time_s, there=view, approach=np.full(60, np.nan),
-    ...         log_likelihoods=scores, answer=np.stack([1 + view, 0 * view]), miss_rate=0.5 * ones,
-    ...         clutter_rate=0.01 * ones, seen=seen, degradation=0 * ones, found=seen,
-    ...         presence=0.5 * ones * (1 + (hazard & (time_s > 2.0))),
-    ...     )
+    ...     columns = {"time_s": time_s, "there": view, "log_likelihoods": scores, "answer": 1 + view}
+    ...     columns |= {"seen": view, "found": view, "miss_rate": np.full(60, 0.5)}
+    ...     columns |= {"clutter_rate": np.full(60, 0.01), "degradation": np.zeros(60)}
+    ...     columns["presence"] = 0.5 * (1 + (hazard & (time_s > 2.0)))
+    ...     clean = HopTable(columns, str(i), "left" if hazard else "none", 4.0 if hazard else np.nan)
+    ...     blind = dict.fromkeys(("seen", "found", "answer"), np.zeros(60, dtype=bool))
+    ...     return {"clean": clean, "off": clean.replace(**blind)}
     >>> recordings, rng = [staged(i) for i in range(20)], np.random.default_rng(0)
     >>> rows = degradation_sweep(recordings, SweepSettings((0.25,) * 4), rng)
     >>> [(row.state, row.vision_only) for row in rows]
     [('clean', 1.0), ('off', 0.0)]
     """
-    if not recordings or any(one.states != recordings[0].states for one in recordings):
+    if not recordings or any(list(one) != list(recordings[0]) for one in recordings):
         raise InvalidArgumentError("recordings: expected at least one, all in the same states")
-    if not any(one.after_sight.any() for one in recordings):
+    clean = [one[CLEAN] for one in recordings]
+    if not any(one.after_sight().any() for one in clean):
         raise InvalidArgumentError("recordings: expected an approach that comes into view")
-    folds = recording_folds([one.label for one in recordings], settings.folds, rng)
+    folds = recording_folds([one.label for one in clean], settings.folds, rng)
     judges = {
         fold: _Judge([r for r, f in zip(recordings, folds, strict=True) if f != fold], settings)
         for fold in np.unique(folds).tolist()
     }
     pairs = [(one, judges[fold]) for one, fold in zip(recordings, folds.tolist(), strict=True)]
-    draws = _draws(recordings, rng)
-    return [_row(state, [judge(one, state) for one, judge in pairs], draws) for state in recordings[0].states]
+    draws = _draws(clean, rng)
+    return [_row(state, [judge(one[state]) for one, judge in pairs], draws) for state in recordings[0]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
     """One recording in one state with the decisions on it."""
 
-    recording: StagedRecording
-    row: int
+    recording: HopTable
     alarm: BoolArray
     heard: BoolArray
 
     @property
-    def seen(self) -> BoolArray:
-        return np.asarray(self.recording.seen[self.row])
-
-    @property
-    def found(self) -> BoolArray:
-        return np.asarray(self.recording.found[self.row])
-
-    @property
     def aware(self) -> BoolArray:
         """Of a vehicle that is there: a detection of something else is no awareness of it."""
-        return self.found | self.heard
+        return np.asarray(self.recording.found | self.heard)
 
     @property
     def raised(self) -> BoolArray:
         """Where nothing is there, any detection raises awareness."""
-        return self.seen | self.heard
+        return np.asarray(self.recording.seen | self.heard)
 
-    def in_sight(self, flags: BoolArray) -> BoolArray:
+    def in_sight(self, flags: AnyArray) -> BoolArray:
         """Return flags of the hops after T0 with the vehicle in view."""
-        return np.asarray(flags[self.recording.after_sight])
+        return np.asarray(flags[self.recording.after_sight()])
 
 
 class _Judge:
     """The two thresholds of a fold, set on the recordings of the others."""
 
-    def __init__(self, others: Sequence[StagedRecording], settings: SweepSettings) -> None:
-        free = [one for one in others if one.hazard_free]
+    def __init__(self, others: Sequence[StagedHops], settings: SweepSettings) -> None:
+        free = [one for one in others if one[CLEAN].hazard_free]
         if not free:
             raise InvalidArgumentError("recordings: expected hazard-free ones in more than one fold")
         self._settings = settings
         prior, alpha = settings.reference_prior, settings.alpha
-        calm = [stream_statistic(one.stream(CLEAN), prior) for one in free]
+        calm = [stream_statistic(one[CLEAN], prior) for one in free]
         self._gamma = neyman_pearson_threshold(calm, alpha, settings.sustain_hops)
-        self._presence = neyman_pearson_threshold([one.presence[one.index(OFF)] for one in free], alpha)
+        self._presence = neyman_pearson_threshold([one[OFF].presence for one in free], alpha)
 
-    def __call__(self, one: StagedRecording, state: str) -> _Judged:
-        row, chosen = one.index(state), self._settings
-        statistic = stream_statistic(one.stream(state), chosen.reference_prior)
-        alarm = sustained_alarm(statistic >= self._gamma, chosen.sustain_hops)
-        return _Judged(one, row, alarm, np.asarray(one.presence[row] >= self._presence))
+    def __call__(self, one: HopTable) -> _Judged:
+        statistic = stream_statistic(one, self._settings.reference_prior)
+        alarm = sustained_alarm(statistic >= self._gamma, self._settings.sustain_hops)
+        return _Judged(one, alarm, np.asarray(one.presence >= self._presence))
 
 
 def _row(state: str, judged: Sequence[_Judged], draws: Sequence[IndexArray]) -> SweepRow:
     free = [one for one in judged if one.recording.hazard_free]
     approaches = [one for one in judged if not one.recording.hazard_free]
     aware = [one.in_sight(one.aware) for one in judged]
-    seen = np.concatenate([one.in_sight(one.seen) for one in judged])
-    found_again = np.concatenate([one.in_sight(one.found) for one in judged])
+    seen = np.concatenate([one.in_sight(one.recording.seen) for one in judged])
+    found_again = np.concatenate([one.in_sight(one.recording.found) for one in judged])
     unseen = np.concatenate([one.in_sight(one.heard) for one in judged])[~found_again]
     found = [detection(_onsets_s(one), one.recording.t0_s) for one in approaches]
     leads = [one.lead_time_s for one in found if one.lead_time_s is not None]
     drawn = [np.concatenate([aware[i] for i in chosen]).mean() for chosen in draws]
     return SweepRow(
         state=state,
-        degradation=float(np.mean([one.recording.degradation[one.row].mean() for one in judged])),
+        degradation=float(np.mean([one.recording.degradation.mean() for one in judged])),
         miss_rate=_mean(np.concatenate([_asked_miss_rates(one) for one in judged])),
         vision_only=float(found_again.mean()),
         any_detection=float(seen.mean()),
@@ -232,9 +219,8 @@ def _row(state: str, judged: Sequence[_Judged], draws: Sequence[IndexArray]) -> 
 
 
 def _asked_miss_rates(one: _Judged) -> FloatArray:
-    recording = one.recording
-    asked = recording.after_sight & (recording.answer[one.row] != UNQUERIED)
-    return np.asarray(recording.miss_rate[one.row][asked])
+    asked = one.recording.answer != UNQUERIED
+    return np.asarray(one.recording.miss_rate[asked & one.recording.after_sight()])
 
 
 def _onsets_s(one: _Judged) -> list[float]:
@@ -245,7 +231,7 @@ def _mean(values: FloatArray | BoolArray) -> float | None:
     return float(np.mean(values)) if values.size else None
 
 
-def _draws(recordings: Sequence[StagedRecording], rng: np.random.Generator) -> list[IndexArray]:
+def _draws(recordings: Sequence[HopTable], rng: np.random.Generator) -> list[IndexArray]:
     """Approaches in view, drawn with replacement."""
-    shown = np.array([i for i, one in enumerate(recordings) if one.after_sight.any()], dtype=np.intp)
+    shown = np.array([i for i, one in enumerate(recordings) if one.after_sight().any()], dtype=np.intp)
     return [rng.choice(shown, size=shown.size) for _ in range(DRAWS)]

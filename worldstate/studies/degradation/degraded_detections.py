@@ -1,4 +1,4 @@
-"""What a camera saw of one recording in every staged state: the part that costs, and knows no sound."""
+"""Detections of one recording in every staged camera state: expensive, cached, independent of audio."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,6 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import Video
 from worldstate.adapters.camera.vision_query import VisionSettings
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 
 # States that every sweep has: the camera as it is, and no camera at all.
@@ -50,7 +49,7 @@ def camera_states(families: Sequence[Family] = ("blur", "darkness", "noise")) ->
 
 @dataclass(frozen=True, slots=True)
 class Staging:
-    """Who looks at the staged frames."""
+    """What detects on the staged frames."""
 
     make_detector: Callable[[], Detector]  # Makes a detector for each state
     rates: MissRates  # Measured with the same detector, on other recordings
@@ -58,23 +57,10 @@ class Staging:
     settings: VisionSettings  # How it is asked
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StagedLooks:
-    """The detections and the health of one camera, state by state."""
-
-    states: tuple[str, ...]  # Names
-    watched: tuple[Watched, ...]  # One a state, of the same frames
-
-    def __post_init__(self) -> None:
-        if not self.states or len(self.states) != len(self.watched):
-            got = f"{len(self.watched)} for {len(self.states)} states"
-            raise InvalidArgumentError(f"watched: expected one a state and at least one, got {got}")
-
-
-def stage_looks(
+def detect_in_states(
     video: Video, staging: Staging, states: Sequence[CameraState], rng: np.random.Generator
-) -> StagedLooks:
-    """Decode once, degrade and look in every state."""
+) -> dict[str, Watched]:
+    """Decode once, degrade and detect in every state."""
     # The degradation is staged on the frames and nobody is told: the detector sees degraded frames, and d is
     # estimated from them.
     watchers = [Watcher(staging.make_detector(), staging.rates) for _ in states]
@@ -82,4 +68,4 @@ def stage_looks(
         stamp_ns = nanoseconds(number / video.frame_rate_hz)
         for watcher, state in zip(watchers, states, strict=True):
             watcher.look(stamp_ns, degrade(frame, state.family, state.degradation, rng))
-    return StagedLooks(tuple(map(str, states)), tuple(watcher.watched() for watcher in watchers))
+    return {str(state): watcher.watched() for state, watcher in zip(states, watchers, strict=True)}

@@ -1,5 +1,6 @@
 """What a camera saw in every staged state, as a file."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,17 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.files.npz_file import load_npz, save_npz
 from worldstate.ground.errors import InvalidArgumentError
 
-from .degraded_detections import StagedLooks
-
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 500_000
 
 
-def save_looks(path: str | Path, looks: StagedLooks, origin: str) -> None:
-    """Write looks as npz without objects, whole or not at all."""
-    frames = [frame for one in looks.watched for frame in one.detections.frames]
-    logs = [one.degradation for one in looks.watched]
+def save_staged_detections(path: str | Path, staged: Mapping[str, Watched], origin: str) -> None:
+    """Write detections as npz without objects, whole or not at all."""
+    frames = [frame for one in staged.values() for frame in one.detections.frames]
+    logs = [one.degradation for one in staged.values()]
     values = {
-        "states": np.array(looks.states),
-        "stamps_ns": np.stack([one.detections.stamps_ns for one in looks.watched]),
+        "states": np.array(list(staged)),
+        "stamps_ns": np.stack([one.detections.stamps_ns for one in staged.values()]),
         "counts": np.array([len(frame) for frame in frames], dtype=np.int64),
         "boxes_px": np.concatenate([frame.boxes_px for frame in frames]).reshape(-1, 4),
         "scores": np.concatenate([frame.scores for frame in frames]),
@@ -35,30 +34,29 @@ def save_looks(path: str | Path, looks: StagedLooks, origin: str) -> None:
     save_npz(path, {"origin": np.array(origin), **values})
 
 
-def load_looks(path: str | Path, origin: str, rates: MissRates) -> StagedLooks | None:
-    """Return what `save_looks` wrote; None where nothing of this origin stands there."""
+def load_staged_detections(path: str | Path, origin: str, rates: MissRates) -> dict[str, Watched] | None:
+    """Return what `save_staged_detections` wrote; None where nothing of this origin stands there."""
     if not Path(path).is_file():
         return None
-    return load_npz(path, "staged looks", MAX_BYTES, lambda values: _read(values, origin, rates))
+    return load_npz(path, "staged detections", MAX_BYTES, lambda values: _read(values, origin, rates))
 
 
-def _read(values: dict[str, np.ndarray], origin: str, rates: MissRates) -> StagedLooks | None:
+def _read(values: dict[str, np.ndarray], origin: str, rates: MissRates) -> dict[str, Watched] | None:
     if str(values["origin"]) != origin:
         return None
-    states, stamps_ns = tuple(values["states"].tolist()), values["stamps_ns"]
+    states, stamps_ns = values["states"].tolist(), values["stamps_ns"]
     frames = _frames(values)
     if len(frames) != stamps_ns.size:
         raise InvalidArgumentError(f"counts: expected one a frame, got {len(frames)} for {stamps_ns.size}")
     n = stamps_ns.shape[1]
-    watched = [
-        Watched(
+    return {
+        state: Watched(
             DetectionLog(tuple(frames[i * n : (i + 1) * n]), stamps_ns[i], "watched camera"),
             DegradationLog(values["read_ns"][i], values["degradation"][i]),
             rates,
         )
-        for i in range(len(states))
-    ]
-    return StagedLooks(states, tuple(watched))
+        for i, state in enumerate(states)
+    }
 
 
 def _frames(values: dict[str, Any]) -> list[DetectionFrame]:

@@ -1,4 +1,4 @@
-"""Stage the camera of every recording of a data set, remember what it saw, and listen."""
+"""Stage the camera of every recording of a data set, keep its detections, and run the filter."""
 
 import hashlib
 import json
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.camera.camera_channel import Watched
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, Video, open_video
 from worldstate.adapters.datasets.ovad import OvadDataset, Recording
@@ -16,12 +17,11 @@ from worldstate.adapters.listen import open_source
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
 
-from .degraded_detections import CameraState, StagedLooks, Staging, stage_looks
-from .detections_file import load_looks, save_looks
-from .staged_degradation import hear_staged
-from .staged_recording import StagedRecording
+from .degraded_detections import CameraState, Staging, detect_in_states
+from .detections_file import load_staged_detections, save_staged_detections
+from .staged_degradation import StagedHops, filter_in_states
 
-# What a camera sees depends on this code: a change of it is another number.
+# What is detected depends on this code: a change of it is another number.
 VERSION = 2
 
 
@@ -29,14 +29,14 @@ VERSION = 2
 class StagedDataset:
     """What to stage, and how."""
 
-    staging: Staging  # Who looks; its camera is resized to each video
+    staging: Staging  # What detects; its camera is resized to each video
     detector: str  # Name of the detector, with its model
     states: tuple[CameraState, ...]  # Of the camera
     seed: int = 0  # Draws the staged noise
     model: Path | None = None  # Model file; the one that ships where not given
 
     def origin(self, recording: Recording) -> str:
-        """Name everything that the looks at a recording depend on, in a few characters."""
+        """Name everything that the detections of a recording depend on, in a few characters."""
         video = (recording.path / VIDEO_NAME).stat()
         made_of = {
             "version": VERSION,
@@ -61,28 +61,30 @@ def filmed_recordings(root: Path, most: int | None = None) -> list[Recording]:
 
 def stage_dataset(
     folder: Path, recordings: Sequence[Recording], settings: StagedDataset, jobs: int = 1
-) -> Iterator[StagedRecording]:
+) -> Iterator[StagedHops]:
     """Yield the recordings in their order; what the camera saw lies in `folder` and is not staged again."""
     yield from in_processes(partial(_stage, folder, settings), recordings, jobs)
 
 
-def _stage(folder: Path, settings: StagedDataset, recording: Recording) -> StagedRecording:
+def _stage(folder: Path, settings: StagedDataset, recording: Recording) -> StagedHops:
     video = open_video(recording.path / VIDEO_NAME)
     camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
     staging = replace(settings.staging, camera=camera)
-    looks = _looks(folder, settings, recording, video)
+    detections = _detections(folder, settings, recording, video)
     source = open_source(recording.path, model=settings.model)
     label = recording.label or "none"
-    return hear_staged(source, looks, staging, name=recording.recording_id, label=label)
+    return filter_in_states(source, detections, staging, name=recording.recording_id, label=label)
 
 
-def _looks(folder: Path, settings: StagedDataset, recording: Recording, video: Video) -> StagedLooks:
+def _detections(
+    folder: Path, settings: StagedDataset, recording: Recording, video: Video
+) -> dict[str, Watched]:
     path, origin = folder / f"{recording.recording_id}.npz", settings.origin(recording)
-    kept = load_looks(path, origin, settings.staging.rates)
+    kept = load_staged_detections(path, origin, settings.staging.rates)
     if kept is None:
         # A generator of its own: no recording depends on which others were staged before.
         key = int.from_bytes(hashlib.sha256(recording.recording_id.encode()).digest()[:8], "big")
         rng = np.random.default_rng((settings.seed, key))
-        kept = stage_looks(video, settings.staging, settings.states, rng)
-        save_looks(path, kept, origin)
+        kept = detect_in_states(video, settings.staging, settings.states, rng)
+        save_staged_detections(path, kept, origin)
     return kept

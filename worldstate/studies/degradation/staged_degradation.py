@@ -1,12 +1,13 @@
-"""The same sound again and again, with its camera in every staged state and without one."""
+"""Filter the same measured sound with its camera in every staged state and without one."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.camera.camera_channel import Watched
 from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.camera.detector import overlaps
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -18,35 +19,42 @@ from worldstate.ground.typing import FloatArray
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings
 from worldstate.operations.recordings.hop_stream import hop_stream
+from worldstate.operations.recordings.hop_table import HopTable
 
-from .degraded_detections import OFF, StagedLooks, Staging
-from .staged_recording import StagedRecording
+from .degraded_detections import OFF, Staging
 
 Heard = tuple[AcousticFrame, Measurement]
+# One recording in every state of its camera: a hop stream with `degradation`, d as it was estimated;
+# `presence`, P(hidden) + P(visible) of the filter; and `found`, whether a moving object that is in view was
+# detected, where `seen` takes any detection.
+StagedHops = Mapping[str, HopTable]
 
 
-def hear_staged(
-    source: Source, looks: StagedLooks, staging: Staging, *, name: str, label: str
-) -> StagedRecording:
+def filter_in_states(
+    source: Source, detections: Mapping[str, Watched], staging: Staging, *, name: str, label: str
+) -> StagedHops:
     """Return what the filter made of one recording with its camera in every state, and without it."""
-    # The sound is heard once. The last row is that of a camera that is never asked.
+    # The sound is processed once. The last state is that of a camera that is never asked.
     measured = list(measure_steps(source))
-    there = [any(sighting.moving for sighting in m.sightings) for _, m in measured]
-    sight = unoccluded_sector(source.context)
-    queries = [seen.query(staging.camera, staging.settings, sight) for seen in looks.watched]
-    rows = [list(_asked(source, measured, query)) for query in (*queries, None)]
-    streams = [hop_stream(row, name=name, label=label, t0_s=source.t0_s, there=there) for row in rows]
     stamps_ns = [frame.stamp_ns for frame, _ in measured]
-    reference = _reference(source, staging, stamps_ns)
-    found = [_found(reference, seen.detections, staging, stamps_ns) for seen in looks.watched]
-    degradation = [[seen.degradation(stamp_ns) for stamp_ns in stamps_ns] for seen in looks.watched]
-    return StagedRecording.of(
-        streams,
-        states=(*looks.states, OFF),
-        degradation=np.array([*degradation, [1.0] * len(measured)]),
-        presence=np.array([_presence(source, row) for row in rows]),
-        found=np.array([*found, [False] * len(measured)]),
-    )
+    there = [any(sighting.moving for sighting in m.sightings) for _, m in measured]
+    reference, sight = _reference(source, staging, stamps_ns), unoccluded_sector(source.context)
+
+    def in_state(query: VisionQuery | None, found: Sequence[bool], degradation: Sequence[float]) -> HopTable:
+        asked = list(_asked(source, measured, query))
+        stream = hop_stream(asked, name=name, label=label, t0_s=source.t0_s, there=there)
+        presence = np.array(_presence(source, asked))
+        return stream.replace(presence=presence, found=np.array(found), degradation=np.array(degradation))
+
+    staged = {
+        state: in_state(
+            seen.query(staging.camera, staging.settings, sight),
+            _found(reference, seen.detections, staging, stamps_ns),
+            [seen.degradation(stamp_ns) for stamp_ns in stamps_ns],
+        )
+        for state, seen in detections.items()
+    }
+    return staged | {OFF: in_state(None, [False] * len(measured), [1.0] * len(measured))}
 
 
 def _reference(source: Source, staging: Staging, stamps_ns: Sequence[int]) -> list[FloatArray]:
@@ -67,7 +75,7 @@ def _found(
 
 
 class _Again:
-    """What a signature model said of every hop, said once more in the same order."""
+    """Repeats the evidence of every hop in the same order."""
 
     def __init__(self, measured: Sequence[Heard]) -> None:
         self._said = iter([measurement.signature for _, measurement in measured])
@@ -77,7 +85,7 @@ class _Again:
 
 
 def _asked(source: Source, measured: Sequence[Heard], query: VisionQuery | None) -> Iterator[Measurement]:
-    """Ask the camera again about what was heard."""
+    """Query the camera again at every hop."""
     # Frames are only interpreted, so the rate of the sound does not matter here.
     adapter = AcousticAdapter(source.array, 48_000.0, _Again(measured), vision=query)
     return (adapter.interpret(frame) for frame, _ in measured)

@@ -19,7 +19,8 @@ from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.recording_folds import recording_folds
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
-from worldstate.operations.recordings.hop_stream import HOP_S, HopStream
+from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import (
     StatisticSwitches,
     presence_statistic,
@@ -97,7 +98,7 @@ class AblationRow:
 class _Scored:
     """One held-out recording with what the calibration folds made of it."""
 
-    stream: HopStream
+    stream: HopTable
     statistic: FloatArray
     risk: FloatArray
     alarm: BoolArray
@@ -106,7 +107,7 @@ class _Scored:
 
 
 def evaluate_ablation(
-    streams: Sequence[HopStream],
+    streams: Sequence[HopTable],
     reference_prior: Sequence[float],
     rng: np.random.Generator,
     switches: AblationSwitches | None = None,
@@ -115,7 +116,7 @@ def evaluate_ablation(
 
     Parameters
     ----------
-    streams : sequence of HopStream
+    streams : sequence of HopTable
         Approaches with a T0, and hazard-free recordings.
     reference_prior : sequence of float
         Prior of the statistic.
@@ -139,12 +140,13 @@ def evaluate_ablation(
     Twenty made-up recordings, half of them approaches that are heard from 6 s on:
 
     >>> def stream(i):
-    ...     quiet, rng = HopStream.blank(f"street/{i}", hops=100), np.random.default_rng(i)
-    ...     scores = rng.normal(0.0, 0.3, (100, 4)) + np.array([0.0, 0.0, 0.0, 3.0])
-    ...     if i % 2:
-    ...         scores[50:, 0] += 8.0
-    ...     return replace(quiet, label="left" if i % 2 else "none", t0_s=9.0 if i % 2 else np.nan,
-    ...                    log_likelihoods=scores)
+    ...     time_s, hazard = 1.0 + 0.1 * np.arange(100), bool(i % 2)
+    ...     scores = np.random.default_rng(i).normal(0.0, 0.3, (100, 4)) + np.array([0.0, 0.0, 0.0, 3.0])
+    ...     scores[50:, 0] += 8.0 * hazard
+    ...     columns = {"time_s": time_s, "log_likelihoods": scores, "clutter_rate": np.zeros(100)}
+    ...     columns |= dict.fromkeys(("answer", "seen", "there"), np.zeros(100, dtype=bool))
+    ...     columns["miss_rate"] = np.ones(100)
+    ...     return HopTable(columns, f"{i}", "left" if hazard else "none", 9.0 if hazard else np.nan)
     >>> row = evaluate_ablation([stream(i) for i in range(20)], (0.25,) * 4, np.random.default_rng(0))
     >>> row.detected
     1.0
@@ -161,7 +163,7 @@ def evaluate_ablation(
 
 
 def ablation_table(
-    streams: Sequence[HopStream],
+    streams: Sequence[HopTable],
     reference_prior: Sequence[float],
     seed: int,
     switches: AblationSwitches | None = None,
@@ -185,12 +187,12 @@ class _Learned:
     """Weight, thresholds and risk map of the calibration folds."""
 
     def __init__(
-        self, streams: Sequence[HopStream], prior: Sequence[float], switches: AblationSwitches
+        self, streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
     ) -> None:
         free = [stream for stream in streams if stream.hazard_free]
         if not free:
             raise InvalidArgumentError("streams: expected a hazard-free recording in every calibration fold")
-        approaches = [stream for stream in streams if stream.before_sight.any()]
+        approaches = [stream for stream in streams if stream.before_sight().any()]
         self._prior, self._switches = prior, switches
         self.weight = self._best_weight(free, approaches)
         calm = [self._statistic(stream, self.weight) for stream in free]
@@ -201,23 +203,23 @@ class _Learned:
         if switches.calibrated and approaches:
             self._risk_map = fit_isotonic(*_windows(calm, self._hazards(approaches, self.weight)))
 
-    def score(self, stream: HopStream) -> _Scored:
+    def score(self, stream: HopTable) -> _Scored:
         statistic = self._statistic(stream, self.weight)
         risk = statistic if self._risk_map is None else self._risk_map(statistic)
         alarm = sustained_alarm(statistic >= self.gamma, self._switches.sustain_hops)
         aware = stream.seen | (self._presence(stream) >= self.presence_gamma)
         return _Scored(stream, statistic, risk, alarm, aware, self.weight)
 
-    def _statistic(self, stream: HopStream, weight: float) -> FloatArray:
+    def _statistic(self, stream: HopTable, weight: float) -> FloatArray:
         return stream_statistic(stream, self._prior, self._switches.statistic_with(weight))
 
-    def _presence(self, stream: HopStream) -> FloatArray:
+    def _presence(self, stream: HopTable) -> FloatArray:
         return presence_statistic(stream, self._prior, self._switches.statistic_with(0.0))
 
-    def _hazards(self, approaches: Sequence[HopStream], weight: float) -> list[FloatArray]:
-        return [self._statistic(stream, weight)[stream.before_sight] for stream in approaches]
+    def _hazards(self, approaches: Sequence[HopTable], weight: float) -> list[FloatArray]:
+        return [self._statistic(stream, weight)[stream.before_sight()] for stream in approaches]
 
-    def _best_weight(self, free: Sequence[HopStream], approaches: Sequence[HopStream]) -> float:
+    def _best_weight(self, free: Sequence[HopTable], approaches: Sequence[HopTable]) -> float:
         weights = self._switches.approach_weights
         if len(weights) == 1 or not approaches:
             return weights[0]
@@ -235,8 +237,8 @@ def _windows(calm: Sequence[FloatArray], hazards: Sequence[FloatArray]) -> tuple
 
 def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
     free = [one for one in scored if one.stream.hazard_free]
-    approaches = [one for one in scored if one.stream.before_sight.any()]
-    before = [one.stream.before_sight for one in approaches]
+    approaches = [one for one in scored if one.stream.before_sight().any()]
+    before = [one.stream.before_sight() for one in approaches]
     statistic, hazards = _windows(
         [one.statistic for one in free], [one.statistic[b] for one, b in zip(approaches, before, strict=True)]
     )
@@ -267,7 +269,6 @@ def _onsets_s(one: _Scored) -> list[float]:
 
 def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[BoolArray]) -> float | None:
     """Return the share of hops after T0, the vehicle in view, in which a flag holds."""
-    streams = [one.stream for one in scored]
-    after = [flag[s.there & ~s.before_sight] for s, flag in zip(streams, flags, strict=True)]
+    after = [flag[one.stream.after_sight()] for one, flag in zip(scored, flags, strict=True)]
     hops = np.concatenate(after) if after else np.empty(0)
     return float(hops.mean()) if hops.size else None

@@ -11,8 +11,7 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.recordings.advisories import detection, rising_edges
-
-from .recording_features import TwinRecording
+from worldstate.operations.recordings.hop_table import HopTable
 
 FOLDS = 5
 SUSTAIN_CHOICES = (2, 3, 4, 5)
@@ -31,10 +30,10 @@ class RuleOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TwinScore:
+class RuleScores:
     """All rules over all recordings."""
 
-    recordings: tuple[TwinRecording, ...]  # Scored ones
+    recordings: tuple[HopTable, ...]  # Scored ones
     vision: RuleOutcome  # The camera alone: something that moves is detected
     published: RuleOutcome  # The argmax is left or right, at any window and over k windows
     sustained: RuleOutcome
@@ -43,7 +42,7 @@ class TwinScore:
     risk: tuple[FloatArray, ...]  # Calibrated risk of each window of each recording, by the other folds
 
 
-def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -> TwinScore:
+def score_rules(recordings: Sequence[HopTable], rng: np.random.Generator) -> RuleScores:
     """Set k, gamma(alpha) and the risk map on four folds, apply them to the fifth, five times."""
     # k maximises the share of approaches detected less the share of hazard-free recordings with an alarm,
     # both on the calibration folds; the smaller k of equals.
@@ -60,14 +59,14 @@ def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -
         gammas = {alpha: _gamma(calibration, alpha, hops) for alpha in ALPHAS}
         risk_map = fit_isotonic(*labelled_windows(calibration))
         for i in np.flatnonzero(fold_of == fold).tolist():
-            sustained[i] = sustained_alarm(recordings[i].argmax_hazard, hops)
+            sustained[i] = sustained_alarm(recordings[i].argmax_is_side, hops)
             risk[i] = risk_map(recordings[i].statistic)
             for alpha, gamma in gammas.items():
                 ours[alpha][i] = sustained_alarm(recordings[i].statistic >= gamma, hops)
-    return TwinScore(
+    return RuleScores(
         recordings=tuple(recordings),
         vision=_outcome(recordings, [np.isfinite(r.reference_rad) for r in recordings]),
-        published=_outcome(recordings, [r.argmax_hazard for r in recordings]),
+        published=_outcome(recordings, [r.argmax_is_side for r in recordings]),
         sustained=_outcome(recordings, sustained),
         ours={alpha: _outcome(recordings, alarms) for alpha, alarms in ours.items()},
         sustain_hops=tuple(chosen),
@@ -75,14 +74,13 @@ def score_twins(recordings: Sequence[TwinRecording], rng: np.random.Generator) -
     )
 
 
-def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: int = FOLDS) -> IndexArray:
+def deal(recordings: Sequence[HopTable], rng: np.random.Generator, folds: int = FOLDS) -> IndexArray:
     """Deal recordings to folds so that each holds its share of every approach at every site, shape (R,).
 
     Examples
     --------
-    >>> from dataclasses import replace
-    >>> quiet = [TwinRecording.blank(str(i), 1) for i in range(2)]
-    >>> folds = deal(quiet + [replace(r, approach="left") for r in quiet], np.random.default_rng(0))
+    >>> quiet = [HopTable({}, name=str(i), about={"site": "SA1"}) for i in range(2)]
+    >>> folds = deal(quiet + [one.replace(label="left") for one in quiet], np.random.default_rng(0))
     >>> sorted(folds[:2]), sorted(folds[2:])
     ([np.int64(0), np.int64(1)], [np.int64(0), np.int64(1)])
     """
@@ -94,14 +92,14 @@ def deal(recordings: Sequence[TwinRecording], rng: np.random.Generator, folds: i
     fold_of = np.zeros(len(recordings), np.intp)
     for kind in (free, ~free):
         members = np.flatnonzero(kind).tolist()
-        keys = [(recordings[i].approach, recordings[i].site, rng.random()) for i in members]
+        keys = [(recordings[i].label, recordings[i].about["site"], rng.random()) for i in members]
         # Dealing goes on where the last stratum stopped, so that no fold collects the remainders.
         order = sorted(range(len(members)), key=keys.__getitem__)
         fold_of[[members[i] for i in order]] = np.arange(len(members)) % most
     return fold_of
 
 
-def labelled_windows(recordings: Sequence[TwinRecording]) -> tuple[FloatArray, BoolArray]:
+def labelled_windows(recordings: Sequence[HopTable]) -> tuple[FloatArray, BoolArray]:
     """Statistic and hazard label of all windows up to T0 and all hazard-free ones, shape (n,) each."""
     scores, labels = [], []
     for recording in recordings:
@@ -111,21 +109,21 @@ def labelled_windows(recordings: Sequence[TwinRecording]) -> tuple[FloatArray, B
     return np.concatenate(scores), np.concatenate(labels)
 
 
-def _gamma(calibration: Sequence[TwinRecording], alpha: float, sustain_hops: int) -> float:
+def _gamma(calibration: Sequence[HopTable], alpha: float, sustain_hops: int) -> float:
     calm = [recording.statistic for recording in calibration if recording.hazard_free]
     return neyman_pearson_threshold(calm, alpha, sustain_hops)
 
 
-def _best_sustain(calibration: Sequence[TwinRecording]) -> int:
+def _best_sustain(calibration: Sequence[HopTable]) -> int:
     free = np.array([recording.hazard_free for recording in calibration])
     gain = {}
     for hops in SUSTAIN_CHOICES:
-        done = _outcome(calibration, [sustained_alarm(r.argmax_hazard, hops) for r in calibration])
+        done = _outcome(calibration, [sustained_alarm(r.argmax_is_side, hops) for r in calibration])
         gain[hops] = float(done.detected[~free].mean() - (done.false_onsets[free] > 0).mean())
     return max(SUSTAIN_CHOICES, key=lambda hops: (gain[hops], -hops))
 
 
-def _outcome(recordings: Sequence[TwinRecording], alarms: Sequence[BoolArray]) -> RuleOutcome:
+def _outcome(recordings: Sequence[HopTable], alarms: Sequence[BoolArray]) -> RuleOutcome:
     leads, false = np.full(len(recordings), np.nan), np.zeros(len(recordings), np.intp)
     for i, (recording, alarm) in enumerate(zip(recordings, alarms, strict=True)):
         onsets = rising_edges(alarm)

@@ -10,15 +10,15 @@ from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.bearing_gating import draw_gating
 
-from .decision_rules import ALPHA, TwinScore, labelled_windows
-from .published_figures import HORIZONS, rule_figures, twin_bearings, twin_figures
+from .decision_rules import ALPHA, RuleScores, labelled_windows
+from .published_figures import HORIZONS, checked_bearings, published_figures, rule_figures
 from .report import TARGETS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def write_twin_figure(score: TwinScore, path: Path) -> None:
+def write_comparison_figure(score: RuleScores, path: Path) -> None:
     """Draw the score and write it as PNG, SVG or PDF, by the ending of `path`."""
     from matplotlib.figure import Figure
 
@@ -27,7 +27,7 @@ def write_twin_figure(score: TwinScore, path: Path) -> None:
     _draw_roc(roc, score)
     _draw_reliability(reliability, score)
     _draw_operating(operating, score)
-    draw_gating(gating, twin_bearings([r for r in score.recordings if not r.hazard_free]))
+    draw_gating(gating, checked_bearings([r for r in score.recordings if not r.hazard_free]))
     gating.set_title("bearings in view")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150, format=path.suffix.lstrip(".") or "png")
@@ -50,9 +50,9 @@ def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray,
     return false, true
 
 
-def _draw_roc(axes: "Axes", score: TwinScore) -> None:
+def _draw_roc(axes: "Axes", score: RuleScores) -> None:
     calm = np.concatenate([r.published_statistic for r in score.recordings if r.hazard_free])
-    figures = twin_figures(score)
+    figures = published_figures(score)
     for name, horizon_s in HORIZONS.items():
         hazards = [r.published_statistic[r.before_sight(horizon_s)] for r in score.recordings]
         label = "all occluded" if name == "all" else f"last {horizon_s:.0f} s"
@@ -65,7 +65,7 @@ def _draw_roc(axes: "Axes", score: TwinScore) -> None:
     axes.legend(fontsize="small", loc="lower right")
 
 
-def _draw_reliability(axes: "Axes", score: TwinScore) -> None:
+def _draw_reliability(axes: "Axes", score: RuleScores) -> None:
     raw, labels = labelled_windows(score.recordings)
     used = [
         risk if recording.hazard_free else risk[recording.before_sight()]
@@ -79,7 +79,7 @@ def _draw_reliability(axes: "Axes", score: TwinScore) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_operating(axes: "Axes", score: TwinScore) -> None:
+def _draw_operating(axes: "Axes", score: RuleScores) -> None:
     rows = np.arange(len(score.recordings))
     curve = [rule_figures(outcome, score, rows) for outcome in score.ours.values()]
     rates, shares = ([one[key] for one in curve] for key in ("false_alarms_per_hour", "detection"))

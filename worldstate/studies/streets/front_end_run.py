@@ -1,6 +1,4 @@
-"""What of a simulated recording the published figures need: listened to once, by the whole front-end."""
-
-from dataclasses import replace
+"""Run the front-end on a simulated recording and keep what the published figures need, hop by hop."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,10 +24,10 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_stream import hop_stream
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.state import Context
 
-from .recording_features import NONE_APPROACH, TwinRecording
-
+NONE_APPROACH = "none"
 # The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
 DOPPLER = DopplerSettings(min_partials=2)
 # Half a camera period: the frame nearest in time to the middle of a bearing's window is the one to compare.
@@ -37,14 +35,18 @@ NEAREST_S = 0.5 / FRAME_RATE_HZ
 
 
 class _Silent:
-    """A classifier that favours nothing: judging comes later, on the features."""
+    """A classifier that favours nothing: the features are classified later."""
 
     def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
         return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 
-def run_front_end(recording: SimulatedRecording, name: str = "") -> TwinRecording:
-    """Listen to a recording with its own array; `TwinRecording.judged` comes after."""
+def run_front_end(recording: SimulatedRecording, name: str = "") -> HopTable:
+    """Return one row a hop of a recording, heard with its own array; `classified` comes after.
+
+    `reference_rad`, `srp_rad` and `music_rad` are the azimuth of the camera's moving box and the two acoustic
+    bearings, NaN where no box is there; `doppler` says why the tone of the pass-by cannot be used, if so.
+    """
     array = recording.array
     vision = VisionQuery(
         PinholeCamera(), detection_log(recording), line_of_sight=unoccluded_sector(Context())
@@ -55,24 +57,22 @@ def run_front_end(recording: SimulatedRecording, name: str = "") -> TwinRecordin
     reference = np.array([_reference(frame, vision) for frame in frames])
     settings = recording.truth["settings"]
     approaches = settings["approach"] != NONE_APPROACH
-    return replace(
-        TwinRecording.blank(name, len(stream)),
-        site=settings["site"]["name"],
-        approach=settings["approach"],
-        t0_s=recording.t0_frame / FRAME_RATE_HZ if approaches else np.nan,
-        pass_s=pass_time_s(recording) if approaches else np.nan,
-        doppler=_doppler(recording, array) if approaches else "no vehicle",
-        time_s=stream.time_s,
-        features=np.array([frame.feature for frame in frames]),
-        answer=stream.answer,
-        miss_rate=stream.miss_rate,
-        clutter_rate=stream.clutter_rate,
-        prominence=np.array([frame.srp.max() / np.median(frame.srp) for frame in frames]),
-        log_slope_hz=np.array([_log_slope(frame) for frame in frames]),
-        reference_rad=reference,
-        srp_rad=np.where(np.isfinite(reference), [frame.bearing_rad for frame in frames], np.nan),
-        music_rad=_music(recording, array, frames, np.isfinite(reference)),
-    )
+    columns = {
+        **{name: stream.columns[name] for name in ("time_s", "answer", "miss_rate", "clutter_rate")},
+        "features": np.array([frame.feature for frame in frames]),
+        "prominence": np.array([frame.srp.max() / np.median(frame.srp) for frame in frames]),
+        "log_slope_hz": np.array([_log_slope(frame) for frame in frames]),
+        "reference_rad": reference,
+        "srp_rad": np.where(np.isfinite(reference), [frame.bearing_rad for frame in frames], np.nan),
+        "music_rad": _music(recording, array, frames, np.isfinite(reference)),
+    }
+    about = {
+        "site": settings["site"]["name"],
+        "pass_s": pass_time_s(recording) if approaches else None,
+        "doppler": _doppler(recording, array) if approaches else "no vehicle",
+    }
+    t0_s = recording.t0_frame / FRAME_RATE_HZ if approaches else np.nan
+    return HopTable(columns, name, settings["approach"], t0_s, about)
 
 
 def detection_log(recording: SimulatedRecording) -> DetectionLog:

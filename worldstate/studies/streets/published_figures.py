@@ -8,11 +8,11 @@ from worldstate.abduction.cueing.calibration_error import expected_calibration_e
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
-from worldstate.operations.recordings.bearing_gating import BearingChecks, joined
+from worldstate.operations.recordings.bearing_gating import bearing_figures
 from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HopTable, joined
 
-from .decision_rules import ALPHA, ALPHA_LOOSE, RuleOutcome, TwinScore, labelled_windows
-from .recording_features import TwinRecording
+from .decision_rules import ALPHA, ALPHA_LOOSE, RuleOutcome, RuleScores, labelled_windows
 
 Interval = tuple[float, float]
 
@@ -24,7 +24,7 @@ IMMINENT_S = 3.0
 LONGEST_TTA_S = 30.0
 
 
-def twin_figures(score: TwinScore, rows: IndexArray | None = None) -> dict[str, float]:
+def published_figures(score: RuleScores, rows: IndexArray | None = None) -> dict[str, float]:
     """Return every figure on the chosen recordings; NaN where nothing is there to count."""
     chosen = np.arange(len(score.recordings)) if rows is None else rows
     recordings = [score.recordings[i] for i in chosen]
@@ -45,12 +45,12 @@ def twin_figures(score: TwinScore, rows: IndexArray | None = None) -> dict[str, 
         | _bearings(approaches)
         | _prominences(approaches, calm)
         | _looming(approaches, calm)
-        | {"doppler_share": float(np.mean([r.doppler == "" for r in approaches]))}
+        | {"doppler_share": float(np.mean([r.about["doppler"] == "" for r in approaches]))}
         | _calibration(recordings, [score.risk[i] for i in chosen])
     )
 
 
-def rule_figures(outcome: RuleOutcome, score: TwinScore, rows: IndexArray) -> dict[str, float]:
+def rule_figures(outcome: RuleOutcome, score: RuleScores, rows: IndexArray) -> dict[str, float]:
     """Return detection rate, mean lead over detected approaches and false alarms per hazard-free hour."""
     free = np.array([score.recordings[i].hazard_free for i in rows])
     hops = sum(len(score.recordings[i].time_s) for i in rows[free])
@@ -65,19 +65,19 @@ def rule_figures(outcome: RuleOutcome, score: TwinScore, rows: IndexArray) -> di
     }
 
 
-def twin_intervals(score: TwinScore, rng: np.random.Generator, draws: int = DRAWS) -> dict[str, Interval]:
+def figure_intervals(score: RuleScores, rng: np.random.Generator, draws: int = DRAWS) -> dict[str, Interval]:
     """Return the middle 95 % of every figure over samples of recordings, drawn within approach and site."""
     # A figure that a sample does not have, such as a bearing without anything in view, is left out of it.
     strata: dict[tuple[str, str], list[int]] = {}
     for i, recording in enumerate(score.recordings):
-        strata.setdefault((recording.approach, recording.site), []).append(i)
+        strata.setdefault((recording.label, recording.about["site"]), []).append(i)
     groups = [np.array(members) for _, members in sorted(strata.items())]
     samples = [np.concatenate([rng.choice(group, group.size) for group in groups]) for _ in range(draws)]
-    drawn = [twin_figures(score, sample) for sample in samples]
+    drawn = [published_figures(score, sample) for sample in samples]
     return {name: _middle(np.array([one[name] for one in drawn])) for name in drawn[0]}
 
 
-def _auroc(approaches: Sequence[TwinRecording], calm: Sequence[TwinRecording], horizon_s: float) -> float:
+def _auroc(approaches: Sequence[HopTable], calm: Sequence[HopTable], horizon_s: float) -> float:
     hazards = [r.published_statistic[r.before_sight(horizon_s)] for r in approaches]
     return _area(hazards, [r.published_statistic for r in calm])
 
@@ -88,23 +88,19 @@ def _area(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> f
     return float("nan") if area is None else area
 
 
-def _bearings(approaches: Sequence[TwinRecording]) -> dict[str, float]:
+def _bearings(approaches: Sequence[HopTable]) -> dict[str, float]:
     errors = {"srp": [r.srp_rad - r.reference_rad for r in approaches]}
     errors["music"] = [r.music_rad - r.reference_rad for r in approaches]
     medians = {f"bearing_{name}_deg": _median_deg(parts) for name, parts in errors.items()}
-    gated = twin_bearings(approaches).figures()["bearing_gated_deg"]
+    gated = bearing_figures(checked_bearings(approaches))["bearing_gated_deg"]
     return medians | {"bearing_gated_deg": float("nan") if gated is None else gated}
 
 
-def twin_bearings(recordings: Sequence[TwinRecording]) -> BearingChecks:
-    """Put the bearings of recordings beside the prominence of their windows.
-
-    Examples
-    --------
-    >>> twin_bearings([TwinRecording.blank("a", hops=2)]).prominence
-    array([1., 1.])
-    """
-    return joined(BearingChecks(r.prominence, r.srp_rad - r.reference_rad) for r in recordings)
+def checked_bearings(recordings: Sequence[HopTable]) -> HopTable:
+    """Put the bearings of recordings beside the prominence of their windows."""
+    return joined(
+        HopTable({"prominence": r.prominence, "error_rad": r.srp_rad - r.reference_rad}) for r in recordings
+    )
 
 
 def _median_deg(parts: Sequence[FloatArray]) -> float:
@@ -112,7 +108,7 @@ def _median_deg(parts: Sequence[FloatArray]) -> float:
     return float(np.degrees(np.median(error[np.isfinite(error)]))) if np.isfinite(error).any() else np.nan
 
 
-def _prominences(approaches: Sequence[TwinRecording], calm: Sequence[TwinRecording]) -> dict[str, float]:
+def _prominences(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[str, float]:
     """Of windows with a moving box in view, and of hazard-free ones."""
     seen = np.concatenate([r.prominence[np.isfinite(r.reference_rad)] for r in approaches])
     silent = np.concatenate([r.prominence for r in calm])
@@ -122,9 +118,9 @@ def _prominences(approaches: Sequence[TwinRecording], calm: Sequence[TwinRecordi
     }
 
 
-def _looming(approaches: Sequence[TwinRecording], calm: Sequence[TwinRecording]) -> dict[str, float]:
+def _looming(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[str, float]:
     """How well the slope tells the last seconds before the pass from silence, and time-to-arrival itself."""
-    left_s = [r.pass_s - r.time_s for r in approaches]
+    left_s = [r.about["pass_s"] - r.time_s for r in approaches]
     imminent = [
         _known(r.log_slope_hz[(left > 0.0) & (left < IMMINENT_S)])
         for r, left in zip(approaches, left_s, strict=True)
@@ -142,7 +138,7 @@ def _known(values: FloatArray) -> FloatArray:
     return values[np.isfinite(values)]
 
 
-def _calibration(recordings: Sequence[TwinRecording], risks: Sequence[FloatArray]) -> dict[str, float]:
+def _calibration(recordings: Sequence[HopTable], risks: Sequence[FloatArray]) -> dict[str, float]:
     raw, labels = labelled_windows(recordings)
     used = [
         risk if recording.hazard_free else risk[recording.before_sight()]

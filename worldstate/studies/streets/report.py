@@ -70,7 +70,7 @@ TARGETS: Mapping[str, Target] = {
 }
 
 
-def twin_report(
+def comparison_report(
     figures: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, object]:
     """Return the figures beside the published ones as JSON-able values; unknown is None.
@@ -78,7 +78,7 @@ def twin_report(
     Examples
     --------
     >>> values = dict.fromkeys(TARGETS, 0.9)
-    >>> report = twin_report(values, {name: (0.8, 1.0) for name in TARGETS})
+    >>> report = comparison_report(values, {name: (0.8, 1.0) for name in TARGETS})
     >>> report["figures"]["auroc_1s"]["agrees"], report["judged"]
     (True, 13)
     """
@@ -104,14 +104,14 @@ def twin_report(
     }
 
 
-def twin_table(report: Mapping[str, object]) -> str:
+def comparison_table(report: Mapping[str, object]) -> str:
     """Return the table for people, one line a figure.
 
     Examples
     --------
     >>> values = dict.fromkeys(TARGETS, 0.9)
-    >>> report = twin_report(values, {name: (0.8, 1.0) for name in TARGETS})
-    >>> twin_table(report).splitlines()[3]
+    >>> report = comparison_report(values, {name: (0.8, 1.0) for name in TARGETS})
+    >>> comparison_table(report).splitlines()[3]
     'window AUROC, <= 1 s to T0       0.9  [0.8, 1]              0.92  yes'
     """
     rows = report["figures"]

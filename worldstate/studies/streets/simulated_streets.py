@@ -15,16 +15,16 @@ from worldstate.adapters.simulation.dataset.recording import simulate_recording
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.settings import draw_settings
 from worldstate.ground.parallel import in_processes
+from worldstate.operations.recordings.hop_table import HopTable, load_tables, save_tables
 
 from .front_end_run import run_front_end
-from .recording_features import TwinRecording, load_twin, save_twin
 
 # What is heard of a recording depends on this code: a change of it is another number.
 VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)
-class TwinSettings:
+class StreetSettings:
     """What the twin is made of."""
 
     preset: Preset  # Levels of the simulation, the rate of distant vehicles among them
@@ -44,24 +44,25 @@ class TwinSettings:
         return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def listen_twins(
-    folder: Path, plans: Sequence[Plan], settings: TwinSettings, jobs: int = 1
-) -> Iterator[TwinRecording]:
+def simulated_hops(
+    folder: Path, plans: Sequence[Plan], settings: StreetSettings, jobs: int = 1
+) -> Iterator[HopTable]:
     """Yield the recordings of the twin in the order of the plans; those in `folder` are not made again."""
-    work = partial(_recall_or_listen, folder, settings)
+    work = partial(_kept_or_simulated, folder, settings)
     yield from in_processes(work, plans, jobs)
 
 
-def _recall_or_listen(folder: Path, settings: TwinSettings, plan: Plan) -> TwinRecording:
+def _kept_or_simulated(folder: Path, settings: StreetSettings, plan: Plan) -> HopTable:
     path, origin = folder / f"{plan.number:04d}.npz", settings.origin(plan)
-    kept = load_twin(path, origin)
-    if kept is None:
-        kept = listen_twin(plan, settings)
-        save_twin(path, kept, origin)
-    return kept
+    kept = load_tables(path, "simulated hops", origin) if path.is_file() else []
+    if kept:
+        return kept[0]
+    made = simulate_hops(plan, settings)
+    save_tables(path, [made], origin)
+    return made
 
 
-def listen_twin(plan: Plan, settings: TwinSettings) -> TwinRecording:
+def simulate_hops(plan: Plan, settings: StreetSettings) -> HopTable:
     """Simulate one recording, the same that `simulate` writes for this plan and preset, and listen to it."""
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, settings.duration_s)

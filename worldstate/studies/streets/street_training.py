@@ -27,7 +27,7 @@ PER_APPROACH = 17
 N_RECORDINGS = 4 * PER_APPROACH * len(SITES)
 
 
-def train_on_twin(
+def train_on_simulation(
     folder: Path,
     levels: Preset,
     seed: int,

@@ -1,0 +1,160 @@
+"""A recording as a table: one row a hop, columns by name."""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.files.npz_file import load_npz, save_npz
+from worldstate.ground.checks import check_shape
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import AnyArray, BoolArray
+
+# An hour of hops with a feature of 60 values each takes 20 MB.
+MAX_BYTES = 512 << 20
+MAX_RECORDINGS = 100_000
+# Files of other versions are caches of other code: they are refused, and made again where they can be.
+VERSION = 3
+# Stamps are whole nanoseconds, T0 a camera frame: a hop that ends at T0 may miss it by round-off.
+_SLACK_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HopTable:
+    """Columns of equal length, and what holds for the whole recording; a column is read as an attribute.
+
+    Examples
+    --------
+    >>> table = HopTable({"time_s": np.array([1.0, 1.1, 1.2])}, name="a", label="left", t0_s=1.1)
+    >>> len(table), table.time_s[0], table.before_sight().tolist(), table.replace(risk=np.zeros(3)).risk
+    (3, np.float64(1.0), [True, True, False], array([0., 0., 0.]))
+    """
+
+    columns: Mapping[str, AnyArray]  # shape (n, ...) each
+    name: str = ""  # Of the recording
+    label: str = "none"  # Side that a vehicle comes from, or "none" for a hazard-free recording
+    t0_s: float = float("nan")  # Line-of-sight entry; NaN where there is none or it is not known
+    about: Mapping[str, Any] = field(default_factory=dict)  # Whatever else, ready for JSON
+
+    def __post_init__(self) -> None:
+        for name, column in self.columns.items():
+            check_shape(name, np.shape(column)[:1], (len(self),))
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def __getattr__(self, name: str) -> AnyArray:
+        # Without the first test a half-built copy, as pickle makes one, would look for `columns` for ever.
+        if name == "columns" or name not in self.columns:
+            raise AttributeError(f"no column {name}")
+        return self.columns[name]
+
+    @classmethod
+    def of_rows(cls, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> "HopTable":
+        """Return the table of rows with one value a column.
+
+        Examples
+        --------
+        >>> HopTable.of_rows(("time_s", "risk"), [(1.0, 0.2), (1.1, 0.4)]).risk
+        array([0.2, 0.4])
+        """
+        values = list(zip(*rows, strict=True)) or [()] * len(names)
+        return cls({name: np.array(column) for name, column in zip(names, values, strict=True)})
+
+    def replace(self, **changes: Any) -> "HopTable":
+        """Return the table with other columns, or another name, label, T0 or `about`."""
+        own = {name: changes.pop(name) for name in _OWN if name in changes}
+        return replace(self, columns={**self.columns, **changes}, **own)
+
+    @property
+    def hazard_free(self) -> bool:
+        """Whether nothing approaches in this recording."""
+        return self.label == "none"
+
+    def before_sight(self, horizon_s: float = float("inf")) -> BoolArray:
+        """Hops of an approach that end within `horizon_s` before T0, T0 included, shape (n,)."""
+        left_s = self.t0_s - self.time_s
+        inside = (left_s >= -_SLACK_S) & (left_s <= horizon_s + _SLACK_S)
+        return np.asarray(inside & (not self.hazard_free))
+
+    def after_sight(self) -> BoolArray:
+        """Hops of an approach after T0 with the vehicle in view, which column `there` says, shape (n,)."""
+        return np.asarray(self.there & ~self.before_sight() & (not self.hazard_free))
+
+
+_OWN = tuple(one.name for one in fields(HopTable) if one.name != "columns")
+
+
+def joined(tables: Iterable[HopTable]) -> HopTable:
+    """Return the rows of several recordings, of the columns of the first, as one nameless table.
+
+    Examples
+    --------
+    >>> one = HopTable({"risk": np.array([0.5])}, name="a")
+    >>> joined([one, one]).risk
+    array([0.5, 0.5])
+    """
+    kept = list(tables)
+    return HopTable({name: np.concatenate([one.columns[name] for one in kept]) for name in kept[0].columns})
+
+
+def save_tables(path: str | Path, tables: Iterable[HopTable], origin: str = "") -> None:
+    """Write recordings with the same columns as npz without objects, whole or not at all.
+
+    `origin` names what they depend on.
+    """
+    kept = list(tables)
+    about = [{name: getattr(one, name) for name in _OWN} | {"hops": len(one)} for one in kept]
+    head = {"version": VERSION, "origin": origin, "recordings": about}
+    save_npz(path, {"": np.array(json.dumps(head)), **joined(kept).columns})
+
+
+def load_tables(
+    path: str | Path,
+    what: str,
+    origin: str = "",
+    check: Callable[[HopTable], None] = lambda table: None,
+) -> list[HopTable]:
+    """Read what `save_tables` wrote; nothing if it is of another origin. `check` refuses what does not fit.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> table = HopTable({"risk": np.array([0.5, 0.7])}, name="a", about={"site": "SA1"})
+    >>> with TemporaryDirectory() as folder:
+    ...     save_tables(Path(folder) / "a.npz", [table, table.replace(name="b")], origin="seed 1")
+    ...     back = load_tables(Path(folder) / "a.npz", "risks", origin="seed 1")
+    ...     load_tables(Path(folder) / "a.npz", "risks", origin="seed 2")
+    []
+    >>> back[1].name, back[1].about["site"], back[1].risk
+    ('b', 'SA1', array([0.5, 0.7]))
+    """
+
+    def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
+        tables = _tables(arrays, origin)
+        for table in tables:
+            check(table)
+        return tables
+
+    return load_npz(path, what, MAX_BYTES, read)
+
+
+def _tables(arrays: dict[str, AnyArray], origin: str) -> list[HopTable]:
+    head = json.loads(str(arrays.pop("")))
+    if head["version"] != VERSION:
+        raise InvalidArgumentError(f"version: expected {VERSION}, got {head['version']}")
+    if head["origin"] != origin:
+        return []
+    hops = [int(one.pop("hops")) for one in head["recordings"]]
+    if len(hops) > MAX_RECORDINGS:
+        raise InvalidArgumentError(f"hops: expected at most {MAX_RECORDINGS} recordings, got {len(hops)}")
+    if min(hops, default=-1) < 0 or any(len(column) != sum(hops) for column in arrays.values()):
+        raise InvalidArgumentError("hops: expected counts that sum to the number of rows")
+    parts = {name: np.split(column, np.cumsum(hops)[:-1]) for name, column in arrays.items()}
+    return [
+        HopTable({name: part[i] for name, part in parts.items()}, **one)
+        for i, one in enumerate(head["recordings"])
+    ]
