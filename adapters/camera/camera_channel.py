@@ -1,4 +1,4 @@
-"""A camera with a detector and a measured miss rate, whose health is read from its own frames."""
+"""A camera with a detector and measured miss rates, whose degradation is read from its own images."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from .pinhole import PinholeCamera
 from .video import Video
 from .vision_query import VisionQuery, VisionSettings
 
-# Health is read this often: a lens that soils or a night that falls takes longer than a frame.
+# Period of the degradation estimate: it costs as much as a detection, and dirt or dusk take longer.
 HEALTH_PERIOD_NS = 400_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Watched:
-    """What a camera reported, and how far it could be trusted while it did."""
+    """Detections of a camera, with its degradation at the time."""
 
     detections: DetectionLog  # One entry a frame
     degradation: DegradationLog  # d as last read, on the scale of the measured table
@@ -37,7 +37,7 @@ class Watched:
         settings: VisionSettings | None = None,
         line_of_sight: Sector | None = None,
     ) -> VisionQuery:
-        """Return the channel to be asked: beta and clutter follow d, which nobody had to tell."""
+        """Return the co-evidence channel, whose miss and clutter rates follow the measured degradation."""
         return VisionQuery(
             camera,
             self.detections,
@@ -50,14 +50,14 @@ class Watched:
 
 
 class Watcher:
-    """Looks at the frames of one camera as they come: what is in them, and how far to trust it.
+    """Run a detector on the images of one camera as they come, and estimate the camera's degradation.
 
     Parameters
     ----------
     detector : Detector
-        A fresh one, where it keeps a state.
+        A new one, if it has a state.
     rates : MissRates
-        Of this detector and camera, with the scale of its health.
+        Measured for this detector and camera, with the scale of its health.
 
     Raises
     ------
@@ -89,7 +89,15 @@ class Watcher:
         self._found: list[DetectionFrame] = []
 
     def look(self, stamp_ns: int, frame: ImageArray) -> None:
-        """Take the next frame, in the order of time."""
+        """Take the next image.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Capture time, nanoseconds, increasing.
+        frame : ndarray of uint8, shape (height, width, 3)
+            Blue first.
+        """
         self._stamps_ns.append(stamp_ns)
         self._found.append(self._detector.detect(frame))
         if not self._read_ns or stamp_ns - self._read_ns[-1] >= HEALTH_PERIOD_NS:
@@ -97,12 +105,17 @@ class Watcher:
             self._levels.append(self._rates.level(self._monitor.update(stamp_ns, image_quality(frame))))
 
     def watched(self) -> Watched:
-        """Return what was seen so far.
+        """Return the detections and degradation so far.
+
+        Returns
+        -------
+        Watched
+            From the first image to the last.
 
         Raises
         ------
         InvalidArgumentError
-            If there was no frame.
+            If there was no image.
         """
         stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
         degradation = DegradationLog(np.array(self._read_ns, dtype=np.int64), np.array(self._levels))
@@ -112,7 +125,7 @@ class Watcher:
 
 
 def watch(frames: Iterable[tuple[int, ImageArray]], detector: Detector, rates: MissRates) -> Watched:
-    """Run a detector over stamped frames and read the camera's health from the same frames."""
+    """Run a detector on stamped images and estimate the camera's degradation from the same images."""
     watcher = Watcher(detector, rates)
     for stamp_ns, frame in frames:
         watcher.look(stamp_ns, frame)
@@ -120,7 +133,7 @@ def watch(frames: Iterable[tuple[int, ImageArray]], detector: Detector, rates: M
 
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
-    """Read d from every frame of a video that starts with the recording."""
+    """Estimate d from every image of a video that starts with the recording."""
     health = _scale(rates)
     stamped = ((nanoseconds(i / video.frame_rate_hz), frame) for i, frame in enumerate(video.frames()))
     return degradation_log(stamped, health, rates.level)
@@ -133,7 +146,7 @@ def _scale(rates: MissRates) -> CameraHealth:
 
 
 def any_motion(label: str = "car") -> DetectionFilter:
-    """Return the filter that lets all of a motion detector's boxes through: their score is no confidence.
+    """Return the filter that keeps all boxes of a motion detector, whose score is no confidence.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""How degraded a camera is, read from its own images: nobody has to tell the filter."""
+"""Degradation of a camera, estimated from its own images."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -41,7 +41,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth:
-    """What this camera's images measure when clean and at every staged level: the scale that d is read on.
+    """Brightness, sharpness and noise of a camera's images, clean and at every staged level: the scale of d.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class CameraHealth:
 
     def estimate(self, quality: ImageQuality) -> Health:
         """Return d of each family."""
-        # Sharpness that the noise drowns says nothing of blur: then the noise is the larger trouble anyway.
+        # Sharpness below the noise gives no estimate of blur; the noise is then the larger degradation.
         blur = 0.0
         if quality.sharpness is not None:
             blur = float(np.interp(-quality.sharpness, -np.array(self.sharpness), LEVELS))
@@ -76,7 +76,7 @@ class CameraHealth:
 
 
 def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> CameraHealth:
-    """Learn the scale of a camera from clean images, by degrading them itself."""
+    """Measure the scale of a camera on clean images and on degraded copies of them."""
     brightness, sharpness, noise = [], [], []
     for frame in clean:
         brightness.append(image_quality(frame).brightness)
@@ -84,7 +84,7 @@ def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> Camer
         sharpness.append([np.nan if value is None else value for value in blurred])
         noise.append([image_quality(degrade(frame, "noise", d, rng)).noise for d in LEVELS])
     if not brightness or np.isnan(sharpness).all(axis=0).any():
-        raise InvalidArgumentError("clean: expected at least one image with something sharp in it")
+        raise InvalidArgumentError("clean: expected at least one image with a measurable sharpness")
     return CameraHealth(
         brightness=float(np.median(brightness)),
         sharpness=tuple(np.minimum.accumulate(np.nanmedian(sharpness, axis=0)).tolist()),
@@ -93,7 +93,7 @@ def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> Camer
 
 
 class HealthMonitor:
-    """Follows a camera's health, with a clean reference that moves along with the day.
+    """Track a camera's degradation against a clean reference that follows the daylight.
 
     Examples
     --------
@@ -106,8 +106,8 @@ class HealthMonitor:
     """
 
     # While an image is clean (every d at most `clean`) the brightness and sharpness of reference follow it
-    # with time constant `follow_s`, but never by more than a factor `most_drift` from what was learned: a
-    # lens that soils slowly must not become the measure of cleanliness.
+    # with time constant `follow_s`, but never by more than a factor `most_drift` from the learned values:
+    # slow soiling must not become the reference.
 
     def __init__(
         self, health: CameraHealth, follow_s: float = 120.0, clean: float = 0.15, most_drift: float = 1.5
@@ -120,7 +120,7 @@ class HealthMonitor:
         self._stamp_ns: int | None = None
 
     def update(self, stamp_ns: int, quality: ImageQuality) -> Health:
-        """Take in the quality of the next image; return the degradation by family."""
+        """Take the quality of the next image; return the degradation by family."""
         seen = self.reference.estimate(quality)
         elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) / 1e9
         self._stamp_ns = stamp_ns
@@ -145,7 +145,7 @@ class HealthMonitor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DegradationLog:
-    """Degradation over time, callable as `VisionQuery` wants it.
+    """Degradation over time, as the function of the stamp that `VisionQuery` takes.
 
     Examples
     --------
@@ -173,7 +173,7 @@ def degradation_log(
     health: CameraHealth,
     level: Callable[[Health], float] = lambda health: health.worst,
 ) -> DegradationLog:
-    """Read the degradation of every frame of a video."""
+    """Estimate the degradation of every image of a video."""
     monitor, stamps, levels = HealthMonitor(health), [], []
     for stamp_ns, frame in frames:
         stamps.append(stamp_ns)

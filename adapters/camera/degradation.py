@@ -30,9 +30,9 @@ STRENGTHS: Mapping[str, tuple[float, ...]] = MappingProxyType(
 
 # Below, a neighbour's weight exp(-1 / 2 sigma^2) is less than half a grey level, and OpenCV finds no kernel.
 _NO_BLUR_PX = 0.25
-# A blur of so many pixels leaves nothing that half the pixels would not show.
+# A blur of this many pixels leaves no detail that half the resolution would lose.
 _WIDE_PX = 4.0
-# Of the staged noise; it ends at 4.3 sigma.
+# Number of quantiles of the staged noise, which ends at 4.3 sigma.
 _QUANTILES = 1 << 16
 
 

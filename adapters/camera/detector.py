@@ -1,4 +1,4 @@
-"""What a detector must offer, and how well its boxes fit others."""
+"""Interface of a detector, overlap of boxes and non-maximum suppression."""
 
 from typing import Protocol
 
@@ -10,9 +10,9 @@ from .detections import DetectionFrame
 
 
 class Detector(Protocol):
-    """Finds objects in frames, given in the order of time.
+    """Detector of objects in images that are given in the order of time.
 
-    A detector may keep a state, as one of motion must; a new one is made for every video.
+    A detector may have a state, as one of motion must; a new one is made for every video.
 
     Examples
     --------
@@ -24,7 +24,18 @@ class Detector(Protocol):
     """
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
-        """Return boxes in pixels, scores in [0, 1] and labels of a frame (height, width, 3), blue first."""
+        """Return the detections in one image.
+
+        Parameters
+        ----------
+        frame : ndarray of uint8, shape (height, width, 3)
+            Blue first.
+
+        Returns
+        -------
+        DetectionFrame
+            Boxes in pixels, scores in [0, 1], labels.
+        """
         ...
 
 
@@ -48,9 +59,7 @@ def overlaps(boxes_px: FloatArray, others_px: FloatArray) -> FloatArray:
 
 
 def suppress(boxes_px: FloatArray, scores: FloatArray, most_overlap: float) -> IntArray:
-    """Return the indices of boxes that no better one overlaps by more, the best first.
-
-    Shapes: boxes_px (n, 4), scores (n,).
+    """Return the indices after non-maximum suppression of boxes (n, 4) by scores (n,), the best first.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Is a change in the image an object or light? An object has an outline, light fades out."""
+"""Separate moving objects from changes of the light by the sharpness of their outline."""
 
 import numpy as np
 
@@ -8,16 +8,14 @@ from worldstate.ground.typing import BoolArray, Float32Array, ImageArray
 
 from .opencv import opencv
 
-# Takes the pixel noise off the gradient; far narrower than any width asked for.
+# Smoothing against pixel noise in the gradient; far narrower than any edge width in use.
 _SMOOTHING_PX = 0.7
 # The contrast of a change is the level that it reaches over most of its area.
 _CONTRAST_PERCENTILE = 75.0
 
 
 def difference(frame: ImageArray, background: ImageArray) -> Float32Array:
-    """Return how far a frame differs from its background, the largest over the colours, (height, width).
-
-    Shapes: frame, background (height, width, 3).
+    """Return the largest difference over the colours between a frame and its background, (height, width).
 
     Examples
     --------
@@ -45,11 +43,6 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
 
     Shapes: apart (height, width), region (height, width).
 
-    References
-    ----------
-    Javed, Shafique, Shah, "A hierarchical approach to robust background subtraction using color and gradient
-    information", 2002: regions that have no gradient at their boundary are changes of the light.
-
     Examples
     --------
     >>> sharp, region = np.zeros((60, 80), np.float32), np.zeros((60, 80), bool)
@@ -58,8 +51,9 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
     >>> [round(outlined_share(image, region, width_px=6.0), 1) for image in (sharp, soft)]
     [1.0, 0.0]
     """
-    # A pixel of the outline counts where, within `width_px` of it, the change rises by its whole contrast
-    # over at most that width,
+    # A pixel of the outline is an edge if within `width_px` of it the change rises by its whole contrast over
+    # at most that width: regions without a gradient at their boundary are changes of the light (Javed,
+    # Shafique and Shah, 2002).
     in_range("width_px", width_px, 0.0, 1e6, open_low=True)
     if apart.shape != region.shape or not region.any():
         raise InvalidArgumentError(

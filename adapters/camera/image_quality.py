@@ -1,4 +1,4 @@
-"""How sharp, bright and noisy an image is, read from the image itself."""
+"""Brightness, noise and sharpness of an image, estimated from the image itself."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from scipy.ndimage import convolve, gaussian_filter, sobel
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, ImageArray
 
-# Side of the central part that is looked at, at full resolution: reducing it would hide blur and noise.
+# Side of the central part that is analysed, at full resolution: a reduced image would hide blur and noise.
 LARGEST_PX = 640
 FINE_PX, COARSE_PX = 1.0, 4.0
 _SECOND_DIFFERENCE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
@@ -20,7 +20,7 @@ _QUANTISATION = 1.0 / 12.0
 
 @dataclass(frozen=True, slots=True)
 class ImageQuality:
-    """Three numbers of one image.
+    """Brightness, noise and sharpness of one image.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Measured miss rates of a camera's detector, on disk: tables, counts, clutter, and where they come from."""
+"""Measured miss and clutter rates of a camera's detector, with their counts, on disk."""
 
 import json
 from collections.abc import Mapping
@@ -21,8 +21,9 @@ from worldstate.ground.typing import FloatArray
 from .camera_health import CameraHealth, Health
 from .degradation import LEVELS
 
+# Far more than there are kinds of degradation; a bound for files from elsewhere.
 MOST_FAMILIES = 100
-# Jeffreys' prior of a rate.
+# Jeffreys' prior of a rate: no cell is 0 or 1, which would make a look infallible.
 PRIOR = 0.5
 
 Rows = tuple[tuple[float, ...], ...]
@@ -30,7 +31,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True, slots=True)
 class FamilyCounts:
-    """What one family of degradations came to.
+    """Counts of one family of degradations.
 
     Examples
     --------
@@ -39,8 +40,8 @@ class FamilyCounts:
     ([[0.05, 0.14, 0.23, 0.5, 0.95]], 0.005)
     """
 
-    # Reference objects that were there, and those that were not found again; one row an azimuth bin, one
-    # column a level of degradation.
+    # Number of reference objects, and of those not detected; rows are azimuth bins, columns levels of
+    # degradation.
     looks: Rows
     misses: Rows
     # Query sectors without a reference object, and those of them with a false detection, at each level.
@@ -57,14 +58,13 @@ class FamilyCounts:
 
     def miss_rates(self, repeats: float = 1.0) -> FloatArray:
         """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation."""
-        # A cell that nobody looked at is at one half, as far as its neighbours let it: not known is neither
-        # found nor missed.
+        # A cell without data has the prior mean of one half, as far as monotony allows.
         looks, misses = np.array(self.looks) / repeats, np.array(self.misses) / repeats
         weight = looks + 2.0 * PRIOR
         return isotonic_grid((misses + PRIOR) / weight, weight)
 
     def interval(self, repeats: float = 1.0) -> tuple[FloatArray, FloatArray]:
-        """Return the 95 % limits of each cell's own Beta posterior, two of shape (bins, levels)."""
+        """Return the 95 % limits of the Beta posterior of each cell, two arrays of shape (bins, levels)."""
         from scipy.stats import beta
 
         looks, misses = np.array(self.looks) / repeats, np.array(self.misses) / repeats
@@ -79,20 +79,24 @@ class FamilyCounts:
 
 @dataclass(frozen=True)
 class MissRates:
-    """Miss and clutter rates of one detector behind one camera.
+    r"""Miss and clutter rates of one detector behind one camera.
+
+    .. math:: \hat\beta = \frac{m / r + 1/2}{n / r + 1}
+
+    with m misses of n looks and r repeats per cell, made monotone in azimuth and degradation.
 
     Parameters
     ----------
     azimuth_deg : tuple of float
-        Edges of the azimuth bins off the optical axis, from 0 to the edge of the view.
+        Edges of the azimuth bins off the optical axis, degrees, from 0 to the edge of the view.
     families : mapping of str to FamilyCounts
-        Counts of each family of degradations.
+        Looks and misses of each family of degradations.
     provenance : mapping of str to str
-        Detector, data, version.
+        Detector, data and version.
     health : CameraHealth, optional
-        The scale on which this camera's d is read from its images.
+        Scale on which the degradation d of this camera is read from its images.
     repeats : float
-        Frames that say the same, see `FamilyCounts.miss_rates`.
+        Number r of successive images that carry the same information.
 
     Raises
     ------
@@ -128,12 +132,12 @@ class MissRates:
 
     @cached_property
     def tables(self) -> dict[str, MissRateTable]:
-        """beta(theta, d) of every family, constant from the middle of the last bin to the edge."""
+        """beta(theta, d) by family, constant from the middle of the last bin to its edge."""
         return {name: self._table(counts.miss_rates(self.repeats)) for name, counts in self.families.items()}
 
     @cached_property
     def table(self) -> MissRateTable:
-        """The largest beta of all families at every d: absence claims no more than the worst allows."""
+        """Largest beta over the families at every d: absence is then never overrated."""
         return self._table(
             np.max([counts.miss_rates(self.repeats) for counts in self.families.values()], axis=0)
         )
@@ -141,12 +145,22 @@ class MissRates:
     def level(self, health: Health) -> float:
         """Return the d at which `table` has, at boresight, the miss rate of the worst family.
 
-        A blur that a detector hardly minds is then no strong degradation, however strong the blur. A family
-        that was not measured counts like the worst of those that were.
+        A blur that hardly affects the detector is then no strong degradation. A family that was not measured
+        counts as the worst of those that were.
+
+        Parameters
+        ----------
+        health : Health
+            Degradation by family, each in [0, 1].
+
+        Returns
+        -------
+        float
+            d in [0, 1].
         """
         rates = [self.tables.get(name, self.table)(0.0, d) for name, d in health.by_family.items()]
         at_boresight = np.array([self.table(0.0, d) for d in LEVELS])
-        # Of several levels with the same rate the lowest: interpolation wants them increasing.
+        # Of several levels with the same rate the lowest: np.interp needs increasing abscissae.
         rising = np.concatenate([[True], np.diff(at_boresight) > 0.0])
         return float(np.interp(max(rates), at_boresight[rising], np.array(LEVELS)[rising]))
 

@@ -1,4 +1,4 @@
-"""A detector of whatever moves before a standing camera, by background subtraction."""
+"""A detector of moving objects for a standing camera, by background subtraction."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -24,7 +24,7 @@ Background = Literal["mog2", "knn"]
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
-    """What counts as a moving object.
+    """Settings of the motion detector.
 
     Examples
     --------
@@ -63,12 +63,12 @@ class MotionSettings:
 
 
 class MotionDetector:
-    """Finds moving objects in the frames of a standing camera.
+    """Detect moving objects in the images of a standing camera by background subtraction.
 
     Parameters
     ----------
     settings : MotionSettings, optional
-        What counts.
+        Background model, contrast, sizes and edges.
 
     Raises
     ------
@@ -92,7 +92,17 @@ class MotionDetector:
         self._seen = 0
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
-        """Return what moves; the score is the share of its box that does.
+        """Return the moving objects; the score is the share of the box that moves.
+
+        Parameters
+        ----------
+        frame : ndarray of uint8, shape (height, width) or (height, width, 3)
+            The next image of the video.
+
+        Returns
+        -------
+        DetectionFrame
+            Boxes in pixels; empty during the warm-up.
 
         Raises
         ------
@@ -128,7 +138,7 @@ class MotionDetector:
         return reduced
 
     def _moving(self, frame: ImageArray) -> ImageArray:
-        """Mask of what moves: specks removed, parts of one object joined."""
+        """Return the mask of moving pixels, specks removed and parts of one object joined."""
         mask = self._background.apply(frame)
         speck = np.ones((3, 3), dtype=np.uint8)
         joint = np.ones((frame.shape[1] // 80 * 2 + 1,) * 2, dtype=np.uint8)
@@ -149,7 +159,7 @@ class MotionDetector:
         return DetectionFrame(boxes, area / (width * height), (self.settings.label,) * numbers.size)
 
     def _has_outline(self, frame: ImageArray, labels: NDArray[np.int32], numbers: IntArray) -> BoolArray:
-        """Tell which regions are objects and not light."""
+        """Return which regions are objects and not changes of the light."""
         apart = difference(frame, self._background.getBackgroundImage())
         width_px = max(self.settings.edge_width * frame.shape[1], NARROWEST_EDGE_PX)
         shares = [outlined_share(apart, labels == number, width_px) for number in numbers]

@@ -16,8 +16,9 @@ from .detections import MAX_BOXES_A_FRAME, DetectionFrame
 from .detector import suppress
 from .opencv import opencv
 
+# ONNX files are protocol buffers, which end at 2 GiB.
 MAX_BYTES = 2 << 30
-# What a letterbox is filled up with.
+# Grey level of the border of a letterbox, that of YOLO's training.
 GREY = 114
 
 
@@ -35,7 +36,7 @@ class Session(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class OnnxSettings:
-    """How the output of a model is read.
+    """Classes, thresholds and input size of a model.
 
     Examples
     --------
@@ -57,17 +58,17 @@ class OnnxSettings:
 
 
 class OnnxDetector:
-    """Runs an ONNX model of YOLO's form on frames.
+    """Run an ONNX model of YOLO's form on images.
 
-    The frame is fitted into a square, the rest filled with grey, and handed over as (1, 3, side, side), red
-    first, in [0, 1]. For the output see `decode_yolo`.
+    The image is fitted into a square, the rest filled with grey, and passed as (1, 3, side, side), red first,
+    in [0, 1]. For the output see `decode_yolo`.
 
     Parameters
     ----------
     session : Session
         An open model; `open_onnx` opens one from a file.
     settings : OnnxSettings
-        How its output is read.
+        Classes, thresholds and input size.
 
     Raises
     ------
@@ -100,7 +101,17 @@ class OnnxDetector:
         )
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
-        """Return the model's boxes in pixels of the frame.
+        """Return the detections of the model.
+
+        Parameters
+        ----------
+        frame : ndarray of uint8, shape (height, width, 3)
+            Blue first.
+
+        Returns
+        -------
+        DetectionFrame
+            Boxes in pixels of the image, after non-maximum suppression.
 
         Raises
         ------
@@ -143,7 +154,7 @@ def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
     path : str or Path
         Model file.
     settings : OnnxSettings
-        How its outputs are read.
+        Classes, thresholds and input size.
 
     Returns
     -------

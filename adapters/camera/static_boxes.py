@@ -1,4 +1,4 @@
-"""Which boxes stand still: a parked car is no co-evidence for the sound of a moving one."""
+"""Boxes that do not move: a parked car is no co-evidence for the sound of a moving one."""
 
 import math
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class ParkedRule:
     5.0
     """
 
-    # For a standing camera: seen from a moving one nothing stands still, so that nothing is parked.
+    # For a standing camera: from a moving one every box moves, and none is parked.
 
     span_s: float = 1.0  # How long it must have stood, > 0
     tolerance_px: float = 5.0  # How far every edge may have moved
@@ -36,9 +36,7 @@ class ParkedRule:
 
 
 def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule) -> BoolArray:
-    """Tell which boxes of `frame` have stood still, from that frame and earlier ones alone.
-
-    Shapes: boxes_px (n, 4), returns (n,).
+    """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,).
 
     Examples
     --------
@@ -53,17 +51,14 @@ def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule
     past = log.frames[first:frame]
     if not past or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
         return np.zeros(len(boxes_px), dtype=bool)
-    there = [_held(earlier.boxes_px, boxes_px, rule.tolerance_px) for earlier in past]
-    return np.asarray(np.mean(there, axis=0) >= rule.share)
+    present = [_held(earlier.boxes_px, boxes_px, rule.tolerance_px) for earlier in past]
+    return np.asarray(np.mean(present, axis=0) >= rule.share)
 
 
 def kept_and_parked(
     log: DetectionLog, frame: int, keep: DetectionFilter, rule: ParkedRule
 ) -> tuple[IntArray, BoolArray]:
-    """Return the indices of the boxes of `frame` that count, and which of those are parked.
-
-    Shapes: returns (n,), returns (n,).
-    """
+    """Return the indices of the boxes of an image that are used, and which of those are parked."""
     here = log.frames[frame]
     kept = here.select(keep)
     return kept, parked(log, frame, here.boxes_px[kept], rule)
@@ -103,6 +98,6 @@ def count_boxes(log: DetectionLog, keep: DetectionFilter, rule: ParkedRule) -> B
 
 
 def _held(earlier_px: FloatArray, boxes_px: FloatArray, tolerance_px: float) -> BoolArray:
-    """Which of `boxes_px` (n, 4) some earlier box was at the place of, shape (n,)."""
+    """Return which of the boxes (n, 4) coincide with an earlier box, shape (n,)."""
     distances = np.abs(boxes_px[:, None, :] - earlier_px[None, :, :])
     return np.asarray(np.any(np.all(distances <= tolerance_px, axis=2), axis=1))

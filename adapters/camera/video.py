@@ -13,6 +13,7 @@ from .opencv import opencv
 
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
+# A bound on the memory of one decoded image: 200 MB.
 MAX_SIDE_PX = 8192
 
 

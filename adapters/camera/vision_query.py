@@ -1,4 +1,4 @@
-"""Is the co-evidence there? Asks recorded camera detections about a sector."""
+"""Camera detections as co-evidence: present, absent or unqueried in a sector."""
 
 import math
 from collections.abc import Callable, Collection
@@ -21,26 +21,28 @@ from .pinhole import PinholeCamera
 from .static_boxes import ParkedRule, kept_and_parked
 
 # Points at which a miss rate is averaged over the part of the sector that is in view.
+# The table is piecewise linear over tens of degrees: more points do not change the mean.
 SAMPLES = 8
+# Detectors round boxes outwards; more than a pixel outside the image means another camera.
 BORDER_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class VisionSettings:
-    """How the camera is asked.
+    """Settings of the vision query.
 
     Parameters
     ----------
     half_width_rad : float
-        Half the width of the sector around a bearing, in (0, pi/2].
+        Half the width of the sector around a bearing, radians, in (0, pi/2].
     clutter_rate : float
         Probability that a moving object of the class is reported where there is none, in (0, 1).
     max_frame_age_s : float
-        A frame older than this no longer answers.
+        Largest age, seconds, at which an image is used.
     keep : DetectionFilter
-        Which boxes count.
+        Classes, scores and sizes of the boxes that are used.
     still : ParkedRule
-        Which boxes are parked.
+        Rule by which a box is parked.
 
     Raises
     ------
@@ -66,9 +68,9 @@ class VisionSettings:
 
 
 class VisionQuery:
-    r"""The camera as the channel that is asked for co-evidence.
+    r"""The camera as a co-evidence channel.
 
-    The answer to "is a moving object of a class that the signature predicts in this sector?" is
+    The result for a sector and the classes that the signature predicts is
 
     - `Unqueried` where there are no detections, no frame at that time, or nothing of the sector is in view;
     - `Present` where a moving box of an expected class reaches into the sector;
@@ -79,27 +81,27 @@ class VisionQuery:
 
     .. math:: \beta = \frac{1}{|S|} \int_S \frac{1}{|C|} \sum_{c \in C} \beta_c(\theta, d)\, d\theta
 
-    with theta the angle off the optical axis. The frame used is the latest one at or before the stamp.
+    with theta the angle off the optical axis. The image used is the latest one at or before the stamp.
 
     Parameters
     ----------
     camera : PinholeCamera
-        The camera that took the frames.
+        Camera that took the images.
     detections : DetectionLog or None
-        None where there are none, as for all moving-ego recordings: every answer is `Unqueried`.
+        None if there are none, as for all moving-ego recordings: every result is `Unqueried`.
     miss_rate : MissRateTable, optional
-        beta_c(theta, d); the paper's figures where none was measured.
+        beta_c(theta, d); the values of the paper if none was measured.
     degradation : float or callable
         d in [0, 1], or a function from the stamp to d.
     settings : VisionSettings, optional
-        How it is asked.
+        Sector, clutter and boxes used.
     line_of_sight : Sector, optional
-        Directions in which a visible source can stand at all, known from the occluders of the context; all
-        where not given. What sounds from behind an occluder is hidden, or the image of a source in a wall: if
-        it is visible, it stands somewhere in line of sight, so that is what is searched.
+        Directions in line of sight, known from the occluders of the context; all if not given. A sound from
+        behind an occluder is that of a hidden source or its image in a wall; a visible source is in line of
+        sight, so that sector is searched.
     clutter : callable, optional
-        From d to the probability of a false detection in the sector, where it was measured; that of the
-        settings where not given. What a degraded camera reports is then worth less too.
+        Measured probability of a false detection in the sector as a function of d; that of the settings if
+        not given.
 
     Raises
     ------
@@ -130,7 +132,7 @@ class VisionQuery:
     ) -> None:
         self.camera = camera
         self.detections = detections
-        # What the camera does not see is cut off here, so the default table need not know where that begins.
+        # The field of view is applied here, so that the default table covers the whole half plane.
         self.miss_rate = miss_rate or default_miss_rates(half_view_deg=90.0)
         self.settings = settings or VisionSettings()
         self._degradation = degradation
@@ -148,16 +150,16 @@ class VisionQuery:
         expected_labels: Collection[str] | None = None,
         side: Side | None = None,
     ) -> CoEvidence:
-        """Search a sector of the frame at `stamp_ns`.
+        """Search a sector of the image at `stamp_ns`.
 
         Parameters
         ----------
         stamp_ns : int
-            On the stream's clock.
+            Time on the clock of the stream, nanoseconds.
         bearing : Bearing or NotUsable
-            The sector lies around it, unless `side` is given. Without either all that lies ahead is searched.
+            Centre of the sector, unless `side` is given; without either everything ahead is searched.
         expected_labels : collection of str, optional
-            Classes that the signature predicts; all that the filter lets through where not given.
+            Classes that the signature predicts; all that the filter keeps if not given.
         side : {"left", "right"}, optional
             Search that whole side, 0 to 90 deg, for a source whose bearing is coarse.
 
@@ -165,6 +167,12 @@ class VisionQuery:
         -------
         CoEvidence
             Present, Absent or Unqueried.
+
+        Examples
+        --------
+        >>> nothing = VisionQuery(PinholeCamera(), detections=None)
+        >>> nothing.ask(0, Bearing(0.0, 0.05))
+        Unqueried(reason='no detections file')
         """
         if self.detections is None:
             return Unqueried("no detections file")
@@ -184,7 +192,23 @@ class VisionQuery:
         return Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
-        """Return all that the filter lets through in the frame at `stamp_ns`, parked ones included."""
+        """Return the boxes that the filter keeps in the image at `stamp_ns`, parked ones included.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Time on the clock of the stream, nanoseconds.
+
+        Returns
+        -------
+        tuple of Sighting
+            Empty without an image at that time.
+
+        Examples
+        --------
+        >>> VisionQuery(PinholeCamera(), detections=None).sightings(0)
+        ()
+        """
         frame = self._frame(stamp_ns)
         if frame is None or self.detections is None:
             return ()
@@ -206,7 +230,7 @@ class VisionQuery:
         )
 
     def _sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:
-        """Return where a visible source would stand that explains what was heard."""
+        """Return the sector in which a visible source would explain the sound."""
         if side is not None or isinstance(bearing, NotUsable):
             sector = WHOLE_SIDES[side]
         else:
