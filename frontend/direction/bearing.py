@@ -7,7 +7,7 @@ import numpy as np
 
 from worldstate.ground.typing import FloatArray
 
-from .peaks import Peak, find_peaks
+from .peaks import Peak
 
 # Excess of the prominence over one at which noise doubles the variance of a bearing.
 _PROMINENCE_KNEE = 0.15
@@ -48,28 +48,6 @@ def bearing_std_rad(
         return float(uniform)
     spread = broadside_std_rad / max(np.cos(azimuth_rad), _MIN_COSINE)
     return float(min(spread * np.hypot(1.0, _PROMINENCE_KNEE / excess), uniform))
-
-
-def strongest_bearing(
-    spectrum: FloatArray, azimuths_rad: FloatArray, broadside_std_rad: float
-) -> AcousticBearing:
-    r"""Return the highest peak of a spectrum as a bearing; in silence the middle with the span's uncertainty.
-
-    .. math:: \hat\theta = \arg\max_\theta P(\theta), \qquad \rho = P(\hat\theta) / \mathrm{median}_\theta P
-
-    with the standard deviation of `bearing_std_rad`.
-
-    Shapes: spectrum, azimuths_rad (A,).
-
-    Examples
-    --------
-    >>> grid = np.radians(np.arange(-90.0, 91.0))
-    >>> strongest_bearing(np.exp(-((grid - 0.3) ** 2)), grid, 0.06).azimuth_rad.__round__(2)
-    0.3
-    >>> strongest_bearing(np.zeros(181), grid, 0.06).prominence
-    1.0
-    """
-    return bearing_of(find_peaks(spectrum, azimuths_rad, max_peaks=1), azimuths_rad, broadside_std_rad)
 
 
 def bearing_of(peaks: Sequence[Peak], azimuths_rad: FloatArray, broadside_std_rad: float) -> AcousticBearing:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NotUsable, wrap_angle
+from worldstate.ground.values import wrap_angle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,33 +43,6 @@ class GatingCurve:
     threshold: FloatArray
     coverage: FloatArray
     median_error_rad: FloatArray
-
-    def threshold_for(self, median_error_rad: float) -> float | NotUsable:
-        r"""Return the lowest threshold from which on the median error stays within a limit.
-
-        .. math:: \rho^* = \min\{\rho_0 : e(\rho) \le e_{max} \text{ for all } \rho \ge \rho_0\}
-
-        Parameters
-        ----------
-        median_error_rad : float
-            Largest median error allowed, radians.
-
-        Returns
-        -------
-        float or NotUsable
-            Peak-to-median ratio; not usable if no threshold keeps the limit.
-
-        Examples
-        --------
-        >>> curve = gating_curve([1.1, 1.2, 2.0, 3.0], [0.4, 0.3, 0.02, 0.01])
-        >>> curve.threshold_for(0.1), curve.threshold_for(0.001)
-        (1.2, NotUsable(reason='no threshold keeps the median error within 0.001 rad'))
-        """
-        too_large = np.flatnonzero(self.median_error_rad > median_error_rad)
-        first = int(too_large[-1]) + 1 if len(too_large) else 0
-        if first == len(self.threshold):
-            return NotUsable(f"no threshold keeps the median error within {median_error_rad:g} rad")
-        return float(self.threshold[first])
 
     def at_coverage(self, share: float) -> tuple[float, float]:
         r"""Return the highest threshold that keeps at least a share of the bearings, and the error there.

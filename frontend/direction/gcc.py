@@ -16,8 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.spectra import finite_complex
-from worldstate.ground.checks import finite_array
+from worldstate.ground.checks import finite_array, finite_complex
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 
@@ -69,30 +68,6 @@ def all_pairs(microphones: int) -> IndexArray:
     if microphones < 2:
         raise InvalidArgumentError(f"microphones: expected at least 2, got {microphones}")
     return np.column_stack(np.triu_indices(microphones, k=1))
-
-
-def pair_coherence(spectra: ArrayLike, pairs: ArrayLike) -> FloatArray:
-    r"""Estimate the magnitude-squared coherence of pairs, averaged over frames.
-
-    .. math:: C_{ij}(f) = |G_{ij}|^2 / (G_{ii} G_{jj})
-
-    Shapes: spectra (frames, bins, M), pairs (P, 2).
-
-    References
-    ----------
-    G. C. Carter, "Coherence and time delay estimation", Proc. IEEE 75, 1987.
-
-    Examples
-    --------
-    >>> x = np.exp(1j * np.arange(12)).reshape(3, 4, 1)
-    >>> pair_coherence(np.concatenate([x, 2 * x], axis=2), [[0, 1]]).round(6)
-    array([[1., 1., 1., 1.]])
-    """
-    # With K independent frames its mean is about 1/K where there is no common signal; one frame always
-    # gives 1.
-    X = finite_complex("spectra", spectra, (None, None, None))
-    index = _checked_pairs(pairs, X.shape[2])
-    return _coherence(*_moments(X, index))
 
 
 def gcc_delays(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.spectra.spectra import finite_complex
+from worldstate.ground.checks import finite_complex
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, RealArray
 
@@ -66,7 +66,7 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
             f"microphones, got {sources}"
         )
     if frames >= microphones:
-        return _leading(covariance(X), sources)
+        return covariance_subspace(covariance(X), sources)
     by_bin = X.transpose(1, 2, 0)
     gram = (by_bin.conj().transpose(0, 2, 1) @ by_bin) / np.float32(frames)
     inner = _leading(gram, sources)
@@ -87,7 +87,11 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
     >>> covariance_subspace([np.diag([1.0, 5.0])], 1).eigenvalues.tolist()
     [[5.0]]
     """
-    R = checked_covariance(covariance_matrix, sources)
+    R = finite_complex("covariance", covariance_matrix, (None, None, None))
+    if R.shape[1] != R.shape[2]:
+        raise InvalidArgumentError(f"covariance: expected shape (bins, M, M), got {R.shape}")
+    if not 1 <= sources < R.shape[1]:
+        raise InvalidArgumentError(f"sources: expected 1 .. {R.shape[1] - 1}, got {sources}")
     return _leading(R, sources)
 
 
@@ -160,13 +164,3 @@ def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
     if 0 in X.shape:
         raise InvalidArgumentError(f"spectra: expected at least one frame, bin and microphone, got {X.shape}")
     return X
-
-
-def checked_covariance(covariance_matrix: ArrayLike, sources: int) -> ComplexArray:
-    """Return covariances (bins, M, M) that are finite and large enough for a subspace of this dimension."""
-    R = finite_complex("covariance", covariance_matrix, (None, None, None))
-    if R.shape[1] != R.shape[2]:
-        raise InvalidArgumentError(f"covariance: expected shape (bins, M, M), got {R.shape}")
-    if not 1 <= sources < R.shape[1]:
-        raise InvalidArgumentError(f"sources: expected 1 .. {R.shape[1] - 1}, got {sources}")
-    return R

@@ -81,7 +81,7 @@ class MusicStage:
         covariance = mask.cross(self._window.total)
         if not np.einsum("kmm->", covariance).real > 0.0:
             return NotUsable("silence")
-        subspace = self._tracker.follow(covariance)
+        subspace = self._tracker.update(covariance)
         spectrum = self._spectrum(subspace.vectors, mask)
         profile = spectrum.reshape(-1, len(self._azimuths)).max(axis=0)
         peak = find_peaks(profile, self._azimuths, max_peaks=1)[0]

@@ -14,13 +14,12 @@ added:
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, RealArray
 
-from .music import Subspace, checked_covariance
+from .music import Subspace
 
 # Bins that two rounds do not settle are decomposed in full.
 ROUNDS = 2
@@ -57,18 +56,14 @@ class SubspaceTracker:
         self._values: RealArray | None = None
         self.full_decompositions = 0
 
-    def update(self, covariance: ArrayLike) -> Subspace:
-        r"""Return the signal subspace of this covariance, starting from the last one.
+    def update(self, R: ComplexArray) -> Subspace:
+        r"""Return the signal subspace of covariances (bins, M, M), starting from that of the last call.
 
         .. math:: V \leftarrow \mathrm{Ritz}\big(T_m(2 R / c - I)\, [V, r]\big), \qquad
                   \sin\angle(e, E_s) \le \frac{\|R e - \lambda e\|}{\lambda_k - \lambda_{k+1}}
 
         with the Chebyshev polynomial T_m, the edge c of the noise and the probe r.
         """
-        return self.follow(checked_covariance(covariance, self._sources))
-
-    def follow(self, R: ComplexArray) -> Subspace:
-        """Do what `update` does, without checks."""
         width = min(self._sources + self._guard, R.shape[1] - 1)
         if self._basis is None or self._values is None or self._basis.shape != (len(R), width, R.shape[1]):
             self._basis, self._values = self._decomposed(R, width)

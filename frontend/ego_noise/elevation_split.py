@@ -43,7 +43,7 @@ class ElevationSplit:
     >>> def wave(elevation):
     ...     a = array.steering([500.0, 1000.0], 0.3, elevation)
     ...     return (a @ a.conj().transpose(0, 2, 1)).astype(np.complex64)
-    >>> [split.share(wave(np.radians(elevation))) > 0.5 for elevation in (-40, 5)]
+    >>> [share_of(*split.powers(wave(np.radians(elevation)))) > 0.5 for elevation in (-40, 5)]
     [True, False]
     """
 
@@ -84,10 +84,6 @@ class ElevationSplit:
             return np.array([1.0, 0.0])
         parts = covariance.reshape(len(covariance), -1).view(np.float32)
         return np.array([np.vdot(parts, self.below), np.vdot(parts, self.street)], np.float64)
-
-    def share(self, covariance: Complex64Array) -> float:
-        """Return q = P_b / (P_b + P_s), near 0 for a street and near 1 for ego-noise."""
-        return share_of(*self.powers(covariance))
 
 
 def share_of(below: float, street: float) -> float:

@@ -6,7 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from worldstate.frontend.array.channel_mask import ChannelMask
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable
 
 from .dropouts import Dropout
@@ -137,26 +137,6 @@ class ArrayHealth:
         """Whether there is no fault, no dropout and no wrong sample rate."""
         rate_is_wrong = isinstance(self.sample_rate, RateEstimate) and self.sample_rate.is_wrong
         return not (self.faults or self.n_dropouts or rate_is_wrong)
-
-    def with_fault(self, *kinds: Fault) -> IndexArray:
-        """Return the channels that have one of these faults, ascending.
-
-        Parameters
-        ----------
-        *kinds : Fault
-            Any of these.
-
-        Returns
-        -------
-        ndarray of int
-            Channel indices from 0.
-
-        Examples
-        --------
-        >>> ArrayHealth.unknown(2).with_fault(Fault.DEAD)
-        array([], dtype=int64)
-        """
-        return np.unique(np.array([f.channel for f in self.faults if f.fault in kinds], np.intp))
 
 
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:

@@ -37,21 +37,6 @@ def test_every_point_is_what_its_threshold_keeps(pairs: list[tuple[float, float]
         assert median == pytest.approx(np.median(wrapped[kept]), abs=1e-9)
 
 
-@given(pairs=PAIRS, limit=st.floats(0, 3))
-def test_the_threshold_keeps_its_promise_from_there_on(
-    pairs: list[tuple[float, float]], limit: float
-) -> None:
-    curve = gating_curve(*np.array(pairs).T)
-    threshold = curve.threshold_for(limit)
-    if isinstance(threshold, NotUsable):
-        assert curve.median_error_rad[-1] > limit
-        return
-    above = curve.threshold >= threshold
-    assert (curve.median_error_rad[above] <= limit).all()
-    below = np.flatnonzero(~above)
-    assert not len(below) or curve.median_error_rad[below[-1]] > limit
-
-
 def test_points_are_spread_over_the_coverage() -> None:
     rng = np.random.default_rng(0)
     curve = gating_curve(1 + rng.exponential(1, 5000), rng.standard_normal(5000), max_points=11)

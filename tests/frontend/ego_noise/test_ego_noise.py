@@ -19,7 +19,7 @@ from worldstate.frontend.direction.music import covariance_subspace, music_spect
 from worldstate.frontend.direction.srp import steered_power
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
-from worldstate.frontend.ego_noise.prewhitening import Prewhitener, inverse_root, white_share
+from worldstate.frontend.ego_noise.prewhitening import shrunk_inverse_root, white_share
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.phat import whiten
 from worldstate.frontend.spectra.stft import StreamingStft
@@ -140,15 +140,20 @@ def test_a_bad_drive_is_named(positions: np.ndarray, speed: np.ndarray, named: s
 # Prewhitening.
 
 
+def inverse_root(R: np.ndarray, shrinkage: float = 0.0) -> np.ndarray:
+    """Inverse roots of all bins."""
+    return np.stack([shrunk_inverse_root(matrix, shrinkage) for matrix in R])
+
+
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10_000), microphones=st.integers(2, 12), level=st.floats(1e-6, 1e6))
 def test_whitened_noise_is_white_whatever_its_level(seed: int, microphones: int, level: float) -> None:
     R = level * noise_covariance(np.random.default_rng(seed), 2, microphones)
-    whitener = Prewhitener.of(R, shrinkage=0.0)
+    root = inverse_root(R)
     power = np.einsum("bmm->b", R).real / microphones
     expected = np.eye(microphones) * power[:, None, None]
-    np.testing.assert_allclose(whitener.covariance(R), expected, atol=1e-6 * level * microphones)
-    np.testing.assert_allclose(whitener.roots, whitener.roots.conj().transpose(0, 2, 1), atol=1e-12)
+    np.testing.assert_allclose(root @ R @ root, expected, atol=1e-6 * level * microphones)
+    np.testing.assert_allclose(root, root.conj().transpose(0, 2, 1), atol=1e-12)
 
 
 @settings(deadline=None, max_examples=25)
@@ -158,39 +163,21 @@ def test_eigenvalues_are_the_generalised_ones(seed: int, microphones: int) -> No
     rng = np.random.default_rng(seed)
     R, noise = noise_covariance(rng, 1, microphones), noise_covariance(rng, 1, microphones)
     noise /= np.trace(noise[0]).real / microphones
-    ours = np.linalg.eigvalsh(Prewhitener.of(noise, shrinkage=0.0).covariance(R)[0])
+    root = inverse_root(noise)
+    ours = np.linalg.eigvalsh((root @ R @ root)[0])
     np.testing.assert_allclose(ours, scipy.linalg.eigh(R[0], noise[0], eigvals_only=True), rtol=1e-7)
 
 
 @settings(deadline=None, max_examples=10)
-@given(seed=st.integers(0, 10_000), level=st.floats(1e-3, 1e3), shrinkage=st.floats(0.0, 1.0))
-def test_white_noise_changes_nothing(seed: int, level: float, shrinkage: float) -> None:
-    rng = np.random.default_rng(seed)
-    whitener = Prewhitener.of(np.tile(level * np.eye(5), (3, 1, 1)), shrinkage)
-    frames = rng.standard_normal((4, 3, 5)) + 1j * rng.standard_normal((4, 3, 5))
-    steering = np.exp(1j * rng.uniform(0, 6, (3, 5, 7)))
-    np.testing.assert_allclose(whitener.spectra(frames), frames, rtol=1e-12)
-    np.testing.assert_allclose(whitener.steering(steering), steering, rtol=1e-12)
-
-
-def test_spectra_covariance_and_steering_are_whitened_alike() -> None:
-    rng = np.random.default_rng(7)
-    whitener = Prewhitener.of(noise_covariance(rng, 2, 4))
-    frames = rng.standard_normal((9, 2, 4)) + 1j * rng.standard_normal((9, 2, 4))
-    R = np.einsum("tbi,tbj->bij", frames, frames.conj())
-    white = whitener.spectra(frames)
-    np.testing.assert_allclose(whitener.covariance(R), np.einsum("tbi,tbj->bij", white, white.conj()))
-    turned = whitener.steering(frames[:1].transpose(1, 2, 0))[:, :, 0]
-    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), np.linalg.norm(frames[0], axis=1))
-    assert np.abs(np.vdot(turned[0], white[0, 0])) == pytest.approx(
-        np.linalg.norm(turned[0]) * np.linalg.norm(white[0, 0])
-    )
+@given(level=st.floats(1e-3, 1e3), shrinkage=st.floats(0.0, 1.0))
+def test_white_noise_changes_nothing(level: float, shrinkage: float) -> None:
+    np.testing.assert_allclose(shrunk_inverse_root(level * np.eye(5), shrinkage), np.eye(5), atol=1e-12)
 
 
 def test_a_dead_microphone_has_no_say_and_silence_changes_nothing() -> None:
     R = noise_covariance(np.random.default_rng(8), 2, 4)
     R[:, 2] = R[:, :, 2] = 0.0
-    root = inverse_root(R)
+    root = inverse_root(R, 0.03)
     assert not root[:, 2].any()
     assert np.einsum("bmm->bm", root).real[:, [0, 1, 3]].min() > 0
     np.testing.assert_array_equal(inverse_root(np.zeros((2, 3, 3))), np.tile(np.eye(3), (2, 1, 1)))
@@ -219,27 +206,19 @@ def test_the_shrinkage_knows_white_noise_from_structure(seed: int, microphones: 
     assert white_share(x.T @ x / n_frames, n_frames) == pytest.approx(shrinkage, rel=0.25)
 
 
-@pytest.mark.parametrize(("R", "s"), [(np.ones((1, 2, 3)), 0.1), (np.eye(2)[None], 1.5), (np.eye(2), 0.1)])
-def test_bad_covariances_are_refused(R: np.ndarray, s: float) -> None:
-    with pytest.raises(InvalidArgumentError):
-        inverse_root(R, s)
-
-
 def test_generalised_music_finds_the_source_under_a_louder_interferer() -> None:
-    rng = np.random.default_rng(9)
     grid = np.radians(np.arange(-90.0, 91.0))
     A = ROOF.steering([700.0, 1000.0, 1300.0], grid)
     noise_at, source_at = 60, 115
     interferer = 10.0 * A[:, :, [noise_at]] @ A[:, :, [noise_at]].conj().transpose(0, 2, 1)
     noise = interferer + np.eye(ROOF.n_microphones)
     R = noise + A[:, :, [source_at]] @ A[:, :, [source_at]].conj().transpose(0, 2, 1)
-    whitener = Prewhitener.of(noise, shrinkage=1e-3)
+    root = inverse_root(noise, 1e-3)
     plain = music_spectrum(covariance_subspace(R, 1), A)
-    general = music_spectrum(covariance_subspace(whitener.covariance(R), 1), whitener.steering(A))
+    whitened = root @ A / np.linalg.norm(root @ A, axis=1, keepdims=True)
+    general = music_spectrum(covariance_subspace(root @ R @ root, 1), whitened)
     assert plain.argmax() == noise_at
     assert general.argmax() == source_at
-    mixed = noise_covariance(rng, 3, ROOF.n_microphones)
-    assert not np.allclose(whitener.covariance(mixed), mixed)
 
 
 # Learning.

@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
+from worldstate.frontend.ego_noise.elevation_split import ElevationSplit, share_of
 from worldstate.frontend.ego_noise.guard_delay import GuardDelay
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
@@ -82,7 +82,7 @@ def test_elevation_decides_and_white_noise_has_no_say(
     for elevation in (-below, above):
         a = array.steering(BINS_HZ, azimuth, elevation)
         R = a @ a.conj().transpose(0, 2, 1) + white * np.eye(array.n_microphones)
-        shares.append(judge.share(R.astype(np.complex64)))
+        shares.append(share_of(*judge.powers(R.astype(np.complex64))))
     assert shares[0] > 0.6
     assert shares[1] < 0.3
 
@@ -94,10 +94,11 @@ def test_the_share_grows_with_what_comes_from_below(mixed: float, azimuth: float
     low, high = (WHOLE.steering(BINS_HZ, azimuth, el) for el in (-0.7, 0.1))
     R_low, R_high = (a @ a.conj().transpose(0, 2, 1) for a in (low, high))
     less, more = (
-        judge.share((p * R_low + (1 - p) * R_high).astype(np.complex64)) for p in (mixed, mixed + 0.05)
+        share_of(*judge.powers((p * R_low + (1 - p) * R_high).astype(np.complex64)))
+        for p in (mixed, mixed + 0.05)
     )
     assert less < more
-    assert judge.share(np.zeros((len(BINS_HZ), 56, 56), np.complex64)) == 0.0
+    assert share_of(*judge.powers(np.zeros((len(BINS_HZ), 56, 56), np.complex64))) == 0.0
 
 
 def test_a_level_line_cannot_tell_and_trusts_its_caller() -> None:
@@ -106,7 +107,7 @@ def test_a_level_line_cannot_tell_and_trusts_its_caller() -> None:
     assert JUDGES[56].is_separable
     assert JUDGES[14].is_separable
     assert not judge.is_separable
-    assert judge.share(np.ones((len(BINS_HZ), 9, 9), np.complex64)) == 1.0
+    assert share_of(*judge.powers(np.ones((len(BINS_HZ), 9, 9), np.complex64))) == 1.0
 
 
 @pytest.mark.parametrize("array", [WHOLE, THIN], ids=["56", "14"])

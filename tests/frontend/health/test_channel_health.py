@@ -14,7 +14,7 @@ from worldstate.adapters.simulation import draw_settings, simulate_recording
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.health.channel_health import ArrayHealth, Fault
+from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.clipping import ClippingCounter
 from worldstate.frontend.health.dropouts import DropoutFinder
 from worldstate.frontend.health.position_fit import position_scores, position_weights
@@ -261,7 +261,7 @@ def test_leaving_out_noise_keeps_the_bearing() -> None:
     watched, unwatched = (
         FrontEnd(ROOF, 48_000, FrontEndSettings(watch_channels=on)).process(sound) for on in (True, False)
     )
-    assert all(set(frame.health.with_fault(Fault.NOISY)) == set(noisy) for frame in watched[11:])  # type: ignore[union-attr]
+    assert all(set(named(frame.health)["noisy"]) == set(noisy) for frame in watched[11:])  # type: ignore[union-attr]
     assert rms_deg(watched[11:], azimuth) < 0.5
     assert np.mean([f.prominence for f in watched[11:]]) > np.mean([f.prominence for f in unwatched[11:]])
 
@@ -287,7 +287,7 @@ def test_clipping_costs_no_bearing_and_so_no_microphone() -> None:
     clipped = np.random.default_rng(3).choice(56, 20, replace=False)
     sound[:, clipped] = sound[:, clipped].clip(-0.5 * sound.std(), 0.5 * sound.std())
     frames = FrontEnd(ROOF, 48_000).process(sound)
-    assert set(frames[-1].health.with_fault(Fault.CLIPPED)) == set(clipped)  # type: ignore[union-attr]
+    assert set(named(frames[-1].health)["clipped"]) == set(clipped)  # type: ignore[union-attr]
     assert frames[-1].health.mask.is_whole  # type: ignore[union-attr]
     assert rms_deg(frames, azimuth) < clean + 0.1
 
