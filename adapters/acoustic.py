@@ -14,7 +14,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing, Measurement
-from worldstate.measurement.protocols import CoEvidenceChannel, Side
+from worldstate.measurement.protocols import CoEvidenceChannel, MeasurementAdapter, Side
 
 from .acoustic_domain import feature_order
 from .acoustic_grounding import Grounding, observe
@@ -68,7 +68,7 @@ class AcousticSettings:
         in_range("coarse_std_rad", self.coarse_std_rad, 0.0, math.inf)
 
 
-class AcousticAdapter:
+class AcousticAdapter(MeasurementAdapter[Float32Array]):
     """Measures hidden and visible road users by their sound, and asks the camera about what it hears.
 
     Parameters

@@ -1,12 +1,12 @@
 from .abduction.co_evidence import Absent as Absent
 from .abduction.co_evidence import Present as Present
 from .abduction.co_evidence import Unqueried as Unqueried
-from .abduction.cueing.cueing_policy import CueingPolicy as CueingPolicy
 from .abduction.evidence import SignatureEvidence as SignatureEvidence
 from .adapters.acoustic import AcousticAdapter as AcousticAdapter
 from .adapters.camera.detections import DetectionFrame as DetectionFrame
 from .adapters.camera.pinhole import PinholeCamera as PinholeCamera
-from .adapters.files.model_file import load_model as load_model
+from .adapters.files.model_file import read_model as read_model
+from .adapters.listen import ListenSettings as ListenSettings
 from .adapters.listen import listen as listen
 from .adapters.listen import listen_steps as listen_steps
 from .adapters.listen import open_source as open_source
