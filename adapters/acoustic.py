@@ -155,7 +155,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         Parameters
         ----------
         block : ndarray
-            Shape (n, M), any n; full scale 1.
+            Shape (n, M), any n; floats of full scale 1, int16 or int32.
 
         Returns
         -------

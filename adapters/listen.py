@@ -1,7 +1,7 @@
 """The whole chain over a recording: sound in, one world-state a hop out."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_signature import SiteSignature
-from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.audio.open_sound import SoundInput, as_sound, open_sound, path_of
 from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.detection_formats import read_any_detections
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
@@ -131,8 +131,8 @@ class Source:
 
     Parameters
     ----------
-    audio_path : Path
-        Multichannel sound file.
+    sound : Path, tuple of Path or RawPcm
+        Multichannel sound file, a file a microphone, or a pipe.
     array : MicrophoneArray
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
@@ -170,7 +170,7 @@ class Source:
     (True, True)
     """
 
-    audio_path: Path
+    sound: SoundInput
     array: MicrophoneArray
     detections: DetectionLog | None
     model: AnySignature
@@ -182,6 +182,11 @@ class Source:
     miss_rates: MissRates | None = None
     degradation: float | Callable[[int], float] = 0.0
     site: SiteEstimate | None = None
+
+    @property
+    def audio_path(self) -> Path:
+        """The sound file; of several the first, and a pipe's name."""
+        return path_of(self.sound)
 
     def signature(self) -> Signature:
         """Return the model as it is at the start of the recording; one that learns its site learns anew."""
@@ -237,7 +242,7 @@ class Step:
 
 
 def open_source(
-    path: Path | str,
+    path: SoundInput | str | Sequence[str],
     *,
     array: Path | str | MicrophoneArray | None = None,
     detections: Path | str | DetectionLog | None = None,
@@ -253,8 +258,9 @@ def open_source(
 
     Parameters
     ----------
-    path : path
-        Multichannel sound file, or a recording folder in the OVAD layout.
+    path : path, sequence of paths or RawPcm
+        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order, or
+        raw samples from a pipe.
     array : path or MicrophoneArray, optional
         Acoular XML, CSV or JSON as `read_array` reads them; that of the data set where not given, OVAD's
         where it names none; the model's own for a sound file of as many channels.
@@ -304,8 +310,8 @@ def open_source(
     >>> len(source.array.positions_m), source.policy.alpha
     (56, 0.05)
     """
-    path, settings = Path(path), settings or ListenSettings()
-    recording = Recording.open(path) if path.is_dir() else None
+    sound, settings = as_sound(path), settings or ListenSettings()
+    recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     chosen = model if isinstance(model, Model) else read_model(model)
     microphones = read_array(array) if isinstance(array, Path | str) else array
     lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
@@ -313,13 +319,13 @@ def open_source(
     alpha, policies = settings.alpha, chosen.policies
     policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
     assumed = None if chosen.domain is None else array_of(chosen.domain)
-    heard_by = choose_array(path, microphones, assumed=assumed, trust_given=settings.uncalibrated)
+    heard_by = choose_array(path_of(sound), microphones, assumed=assumed, trust_given=settings.uncalibrated)
     context = context or Context()
     moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
     if settings.uncalibrated or not states_budget(chosen.domain, heard_by, moves):
         policy = replace(policy, alpha=0.0)
     return Source(
-        audio_path=recording.audio_path if recording else path,
+        sound=recording.audio_path if recording else sound,
         array=heard_by,
         detections=_detections(detections, detector, recording, lens),
         model=chosen.signature,
@@ -362,7 +368,7 @@ def _degradation(recording: Recording | None, rates: MissRates | None) -> float 
 
 
 def listen(
-    path: Path | str,
+    path: SoundInput | str | Sequence[str],
     *,
     array: Path | str | MicrophoneArray | None = None,
     detections: Path | str | DetectionLog | None = None,
@@ -377,8 +383,9 @@ def listen(
 
     Parameters
     ----------
-    path : path
-        Multichannel sound file, or a recording folder in the OVAD layout.
+    path : path, sequence of paths or RawPcm
+        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order, or
+        raw samples from a pipe.
     array, detections, detector, camera, miss_rates, model, context, settings
         As `open_source` takes them: files, or the objects that they hold.
 
@@ -496,7 +503,7 @@ def measure_steps(
     ['no detections file', 'no detections file', 'no detections file']
     """
     strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
-    with open_audio(source.audio_path, expect_channels=n_microphones, strict=strict) as audio:
+    with open_sound(source.sound, expect_channels=n_microphones, strict=strict) as audio:
         adapter = AcousticAdapter(
             source.array,
             audio.sample_rate_hz,

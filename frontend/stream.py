@@ -1,6 +1,7 @@
 """The streaming acoustic front-end: samples in, one `AcousticFrame` per hop out."""
 
 from collections import deque
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +34,13 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 # Far above full scale of any converter; the power of an STFT frame still fits single precision.
 _LOUDEST = 1e15
 _MUSIC_IS_OFF = NotUsable("MUSIC is off: see FrontEndSettings.music_sources")
+
+
+def _full_scale(dtype: np.dtype[Any]) -> np.float32:
+    """Return what brings whole numbers of a converter to full scale 1."""
+    if dtype not in (np.int16, np.int32):
+        raise InvalidArgumentError(f"block: expected floats of full scale 1, int16 or int32, got {dtype}")
+    return np.float32(1.0 / -float(np.iinfo(dtype).min))
 
 
 class FrontEnd:
@@ -114,7 +122,8 @@ class FrontEnd:
         Parameters
         ----------
         block : array_like, shape (n, M)
-            Samples, any n from one sample to a whole file; converted to float32.
+            Samples, any n from one sample to a whole file: floats of full scale 1, or int16 and int32 as a
+            converter gives them, which are scaled to that.
         captured_ns : int, optional
             Capture time of the last of these samples by the caller's clock, nanoseconds. It measures the
             sample rate (`AcousticFrame.health`) and has no other effect.
@@ -127,8 +136,8 @@ class FrontEnd:
         Raises
         ------
         InvalidArgumentError
-            On another number of channels, values that are no numbers, NaN, infinity or beyond 1e15; the state
-            is unchanged.
+            On another number of channels, values that are no numbers, whole numbers of another width, NaN,
+            infinity or beyond 1e15; the state is unchanged.
 
         Examples
         --------
@@ -211,6 +220,8 @@ class FrontEnd:
                 samples = np.ascontiguousarray(block, dtype=np.float32)
         except (TypeError, ValueError) as error:
             raise InvalidArgumentError(f"block: expected numbers, got {type(block).__name__}") from error
+        if isinstance(block, np.ndarray) and block.dtype.kind in "iu":
+            samples = samples * _full_scale(block.dtype)
         check_shape("block", samples.shape, (None, self.array.n_microphones))
         # One pass without a copy: a finite sum of squares below the limit holds no NaN and no infinity.
         flat = samples.ravel()

@@ -89,7 +89,7 @@ class AudioSource:
         for start in range(0, self.frames, frames):
             block = self._read(min(frames, self.frames - start))
             if self._floating:
-                _refuse_non_finite(self.path, block, start)
+                check_finite(self.path, block, start)
             yield block
 
     def close(self) -> None:
@@ -185,7 +185,7 @@ def open_audio(path: str | Path, expect_channels: int | None = None, *, strict: 
     source = AudioSource(name, _open_file(name))
     try:
         _check(source, expect_channels)
-        _refuse_silent(source, strict)
+        check_silence(source.path, source.silent_channels, source.channels, strict)
     except BaseException:
         source.close()
         raise
@@ -211,16 +211,25 @@ def _check(source: AudioSource, expect_channels: int | None) -> None:
     _refuse_cut_file(source)
     if source.frames == 0:
         raise InputFileError(source.path, "expected samples, the recording is empty")
-    if expect_channels is not None and source.channels != expect_channels:
-        problem = f"expected {expect_channels} channels, one per microphone, got {source.channels}"
-        raise InputFileError(source.path, problem)
+    check_channels(source.path, source.channels, expect_channels)
     if source.duration_s < SHORTEST_S:
         raise InputFileError(source.path, f"expected at least 1 s of audio, got {source.duration_s:.3f} s")
     source.check_end()
     first = source.first_second()
-    _refuse_non_finite(source.path, first, 0)
-    constant = (first == first[0]).all(axis=0)
-    source.silent_channels = tuple(int(channel) + 1 for channel in np.flatnonzero(constant))
+    check_finite(source.path, first, 0)
+    source.silent_channels = constant_channels(first)
+
+
+def constant_channels(first: Float32Array) -> tuple[int, ...]:
+    """Return the channels, from 1, that hold one constant value."""
+    constant = (first == first[:1]).all(axis=0)
+    return tuple(int(channel) + 1 for channel in np.flatnonzero(constant))
+
+
+def check_channels(path: Path, channels: int, expected: int | None) -> None:
+    """Refuse a recording of another number of channels than microphones."""
+    if expected is not None and channels != expected:
+        raise InputFileError(path, f"expected {expected} channels, one per microphone, got {channels}")
 
 
 def _refuse_cut_file(source: AudioSource) -> None:
@@ -234,7 +243,8 @@ def _cut_short(path: Path, frames: int) -> InputFileError:
     return InputFileError(path, f"cut short or damaged: expected {frames} samples a channel by its header")
 
 
-def _refuse_non_finite(path: Path, block: Float32Array, start: int) -> None:
+def check_finite(path: Path, block: Float32Array, start: int) -> None:
+    """Refuse NaN and infinity; `start` is the number of the block's first sample."""
     finite = np.isfinite(block)
     if not finite.all():
         sample, channel = np.argwhere(~finite)[0]
@@ -242,9 +252,9 @@ def _refuse_non_finite(path: Path, block: Float32Array, start: int) -> None:
         raise InputFileError(path, f"expected finite samples, got {block[sample, channel]} in {where}")
 
 
-def _refuse_silent(source: AudioSource, strict: bool) -> None:
-    silent = source.silent_channels
+def check_silence(path: Path, silent: tuple[int, ...], channels: int, strict: bool) -> None:
+    """Refuse silent channels; where not strict, a recording in which more are silent than not."""
     if silent and strict:
-        raise SilentChannelsError(source.path, silent, "every channel")
-    if 2 * len(silent) > source.channels:
-        raise SilentChannelsError(source.path, silent, f"at least half of {source.channels} channels")
+        raise SilentChannelsError(path, silent, "every channel")
+    if 2 * len(silent) > channels:
+        raise SilentChannelsError(path, silent, f"at least half of {channels} channels")

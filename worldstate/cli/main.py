@@ -16,6 +16,7 @@ from worldstate.ground.version import __version__
 COMMANDS = (
     "users.demo",
     "users.run",
+    "users.bearings",
     "users.doctor",
     "users.bounds",
     "users.simulate",

@@ -4,7 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .sound_options import sound_of
+
 if TYPE_CHECKING:
+    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.listen import ListenSettings
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 HELP = """\
@@ -48,6 +52,29 @@ def given_array(arguments: argparse.Namespace) -> "MicrophoneArray | None":
     from worldstate.adapters.files.array_file import read_array
 
     return None if arguments.array is None else read_array(arguments.array, arguments.array_axes)
+
+
+def search_of(arguments: argparse.Namespace) -> "ListenSettings":
+    """Return where a bearing is looked for, all else by default."""
+    from worldstate.adapters.listen import ListenSettings
+
+    band = arguments.band
+    return ListenSettings(
+        band_hz=None if band is None else (band[0], band[1]), azimuth_span_deg=arguments.azimuth_span
+    )
+
+
+def sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, MicrophoneArray]":
+    """Return what INPUT and --array name, or the array that belongs to the sound."""
+    from worldstate.adapters.audio.open_sound import path_of
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.datasets.ovad import Recording
+
+    sound = sound_of(arguments)
+    array = choose_array(path_of(sound), given_array(arguments))
+    if isinstance(sound, Path) and sound.is_dir():
+        sound = Recording.open(sound).audio_path
+    return sound, array
 
 
 def stance(array: "MicrophoneArray") -> str:

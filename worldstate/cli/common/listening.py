@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from worldstate.adapters.audio.sound_file import open_audio
+from worldstate.adapters.audio.open_sound import RawPcm, open_sound
 from worldstate.adapters.listen import Source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.calibration.calibration_input import find_inputs, read_input
@@ -15,8 +15,10 @@ from .progress import progress_bar, track
 
 def listen_with_progress(source: Source, *, title: str, states_path: Path | None) -> RecordingReport:
     """Listen to `source` to its end while a bar on standard error counts seconds of audio."""
-    with open_audio(source.audio_path, strict=not source.settings.mask_dead) as audio:
-        hops = 10.0 * audio.frames / audio.sample_rate_hz
+    hops = None
+    if not isinstance(source.sound, RawPcm):
+        with open_sound(source.sound, strict=not source.settings.mask_dead) as audio:
+            hops = 10.0 * audio.duration_s
     with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
         return run_recording(source, title=title, states_path=states_path, on_hop=lambda step: bar.advance())
 

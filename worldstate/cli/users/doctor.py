@@ -4,12 +4,18 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.array_options import (
+    add_array_options,
+    add_search_options,
+    search_of,
+    sound_and_array,
+)
 from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.sound_options import add_sound_options
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.sound_file import AudioSource
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.adapters.audio.open_sound import Audio
+    from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.channel_report import RecordingHealth
 
 DESCRIPTION = """\
@@ -34,8 +40,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="sound file or recording folder")
+    add_sound_options(parser)
     add_array_options(parser)
+    add_search_options(parser)
     parser.add_argument("--duration", type=float, metavar="S", help="its length by another clock, seconds")
     parser.add_argument(
         "--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)"
@@ -48,20 +55,25 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     import json
+    from dataclasses import replace
 
-    from worldstate.adapters.audio.sound_file import open_audio
-    from worldstate.adapters.datasets.array_choice import choose_array
-    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.frontend.health.sample_clock import rate_from_duration
+    from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.arrays.array_figure import write_array_figure
 
     from .doctor_report import as_json, as_text
 
     check_outputs(arguments, figures=("figure",))
-    path: Path = arguments.input
-    sound = Recording.open(path).audio_path if path.is_dir() else path
-    array = choose_array(path, given_array(arguments))
-    with open_audio(sound, expect_channels=array.n_microphones, strict=False) as audio:
-        health = examine(audio, array, arguments.duration, arguments.duration_error)
+    sound, array = sound_and_array(arguments)
+    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
+        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        health = examine(audio, FrontEnd(array, audio.sample_rate_hz, settings))
+        if arguments.duration is not None:
+            rate = rate_from_duration(
+                audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
+            )
+            health = replace(health, sample_rate=rate)
         if arguments.json:
             print(json.dumps(as_json(health, audio, array), allow_nan=False))
         else:
@@ -71,34 +83,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if health.is_healthy else 1
 
 
-def examine(
-    audio: "AudioSource", array: "MicrophoneArray", duration_s: float | None, duration_std_s: float
-) -> "RecordingHealth":
-    """Listen to a recording to its end.
-
-    Parameters
-    ----------
-    audio : AudioSource
-        Open.
-    array : MicrophoneArray
-        One microphone a channel.
-    duration_s : float or None
-        Length of the recording by another clock, where one is known.
-    duration_std_s : float
-        Standard deviation of that.
-    """
-    from dataclasses import replace
-
-    from worldstate.frontend.health.sample_clock import rate_from_duration
-    from worldstate.frontend.stream import FrontEnd
+def examine(audio: "Audio", front_end: "FrontEnd") -> "RecordingHealth":
+    """Listen to an open recording to its end."""
     from worldstate.operations.recordings.channel_report import HealthLog
 
-    front_end, log = FrontEnd(array, audio.sample_rate_hz), HealthLog()
+    log = HealthLog()
     for block in audio.blocks(audio.sample_rate_hz):
         for frame in front_end.process(block):
             log.add(frame)
-    health = log.summary()
-    if duration_s is None:
-        return health
-    rate = rate_from_duration(audio.frames, duration_s, duration_std_s, float(audio.sample_rate_hz))
-    return replace(health, sample_rate=rate)
+    return log.summary()

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from worldstate.adapters.audio.sound_file import AudioSource
+from worldstate.adapters.audio.open_sound import Audio
 from worldstate.cli.common.array_options import stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import Fault
@@ -11,7 +11,7 @@ from worldstate.ground.values import NotUsable
 from worldstate.operations.recordings.channel_report import ChannelVerdict, RecordingHealth
 
 
-def as_json(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray) -> dict[str, object]:
+def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray) -> dict[str, object]:
     """Return the report as JSON-able values; channels are counted from 1, unknown is None."""
     rate = health.sample_rate if isinstance(health.sample_rate, RateEstimate) else None
     return {
@@ -46,7 +46,7 @@ def _fault_json(verdict: ChannelVerdict) -> dict[str, object]:
     }
 
 
-def as_text(health: RecordingHealth, audio: AudioSource, array: MicrophoneArray) -> Iterator[str]:
+def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray) -> Iterator[str]:
     """Yield the lines of the report."""
     alias = array.alias_hz()
     yield f"{audio.path}: {audio.channels} channels, {audio.sample_rate_hz} Hz, {audio.duration_s:.1f} s"

@@ -4,10 +4,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, add_search_options, given_array, stance
+from worldstate.cli.common.array_options import (
+    add_array_options,
+    add_search_options,
+    given_array,
+    search_of,
+    stance,
+)
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
 from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.sound_options import add_sound_options, sound_of
 from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
@@ -16,8 +23,7 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Listen to a recording and keep the world-state.
 
-INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), or the folder of one recording in the OVAD layout
-(out_multi.wav and, where there is one, camera_baseline_results.json). Without detections the camera counts as
+Without detections the camera counts as
 not asked, which is neither presence nor absence.
 
 --gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
@@ -38,7 +44,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="sound file or recording folder")
+    add_sound_options(parser)
     add_array_options(parser)
     add_search_options(parser)
     _add_model_options(parser)
@@ -96,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs(arguments, "out", figures=("figure", "gating"))
     source = _source(arguments)
     try:
-        report = listen_with_progress(source, title=str(arguments.input), states_path=arguments.out)
+        report = listen_with_progress(source, title=str(source.audio_path), states_path=arguments.out)
     except SilentChannelsError as error:
         if arguments.mask_dead:
             raise
@@ -108,20 +114,21 @@ def run(arguments: argparse.Namespace) -> int:
         "detections": box_counts(source, as_json=arguments.json),
     }
     if arguments.gating is not None:
-        write_gating_figure(report.bearings, arguments.gating, title=str(arguments.input))
+        write_gating_figure(report.bearings, arguments.gating, title=str(source.audio_path))
         summary |= bearing_figures(report.bearings)
     print_summary(summary, as_json=arguments.json)
     return 0
 
 
 def _source(arguments: argparse.Namespace) -> "Source":
-    from worldstate.adapters.acoustic_grounding import Grounding
-    from worldstate.adapters.listen import ListenSettings, open_source
+    from dataclasses import replace
 
-    settings = ListenSettings(
+    from worldstate.adapters.acoustic_grounding import Grounding
+    from worldstate.adapters.listen import open_source
+
+    settings = replace(
+        search_of(arguments),
         alpha=arguments.alpha,
-        band_hz=None if arguments.band is None else (arguments.band[0], arguments.band[1]),
-        azimuth_span_deg=arguments.azimuth_span,
         mask_dead=arguments.mask_dead,
         site_adaptation=arguments.site_adaptation,
         forgetting_s=arguments.forgetting,
@@ -131,7 +138,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         uncalibrated=arguments.uncalibrated,
     )
     return open_source(
-        arguments.input,
+        sound_of(arguments),
         array=given_array(arguments),
         detections=arguments.detections,
         camera=arguments.camera,

@@ -1,0 +1,201 @@
+"""Recordings and arrays as users have them: bearings, bounds and doctor take them all."""
+
+import csv
+import io
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.audio.open_sound import RawPcm, open_sound
+from worldstate.adapters.files.array_file import read_array
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+RATE = 8_000
+
+
+def ring(n: int, radius_m: float) -> list[list[float]]:
+    return [[radius_m * math.cos(a), radius_m * math.sin(a), 1.5] for a in 2 * np.pi * np.arange(n) / n]
+
+
+def line(n: int, spacing_m: float, axis: int = 1) -> list[list[float]]:
+    return [[spacing_m * i if k == axis else 0.0 for k in range(3)] for i in range(n)]
+
+
+def plate(rows: int, columns: int, pitch_m: float, u: int, v: int) -> list[list[float]]:
+    return [
+        [pitch_m * i if k == u else pitch_m * j if k == v else 0.0 for k in range(3)]
+        for i in range(rows)
+        for j in range(columns)
+    ]
+
+
+RNG = np.random.default_rng(3)
+OWN = {
+    "pair across": line(2, 0.15),
+    "pair along": line(2, 0.15, 0),
+    "four in a row": line(4, 0.05),
+    "eight in a row": line(8, 0.2),
+    "sixteen along": line(16, 0.04, 0),
+    "triangle": ring(3, 0.1),
+    "four on a square": ring(4, 0.5),
+    "six on a puck": ring(6, 0.046),
+    "eight on 10 cm": ring(8, 0.05),
+    "twelve round the roof": ring(12, 0.8),
+    "sixteen on a board": plate(4, 4, 0.042, 1, 2),
+    "board on the roof": plate(4, 4, 0.042, 0, 1),
+    "board on the door": plate(4, 4, 0.042, 0, 2),
+    "64 in a plate": plate(8, 8, 0.09, 1, 2),
+    "four corners of a van": [[4.0, 0.9, 2], [4.0, -0.9, 2], [0, 0.9, 2], [0, -0.9, 2]],
+    "tetrahedron": [[0, 0, 0], [0.1, 0, 0], [0.05, 0.09, 0], [0.05, 0.03, 0.08]],
+    "cube": [[x, y, z] for x in (0, 0.2) for y in (0, 0.2) for z in (0, 0.2)],
+    "two rings": ring(8, 0.1) + [[x, y, 1.6] for x, y, _ in ring(8, 0.07)],
+    "32 at random": RNG.uniform(-0.4, 0.4, (32, 3)).tolist(),
+    "tilted plate": [[0.3 * y, y, z] for _, y, z in plate(3, 5, 0.07, 2, 1)],
+}
+FORMS = ("xml", "csv", "json", "txt")
+
+
+def write_array(path: Path, positions: list[list[float]]) -> Path:
+    if path.suffix == ".xml":
+        rows = "".join(f'<pos Name="{i}" x="{-y}" y="{z}" z="{x}"/>' for i, (x, y, z) in enumerate(positions))
+        path.write_text(f"<MicArray>{rows}</MicArray>")
+    elif path.suffix == ".json":
+        path.write_text(json.dumps({"positions_m": positions}))
+    else:
+        mark = "," if path.suffix == ".csv" else " "
+        head = "name,x,y,z\n" if path.suffix == ".csv" else ""
+        path.write_text(
+            head + "".join(mark.join([f"m{i}", *map(str, p)]) + "\n" for i, p in enumerate(positions))
+        )
+    return path
+
+
+def wave(array: MicrophoneArray, azimuth_deg: float, duration_s: float = 1.3) -> np.ndarray:
+    """White noise from one direction, with a little of its own in each microphone."""
+    n = round(RATE * duration_s)
+    spectrum = np.fft.rfft(np.random.default_rng(0).normal(0, 0.1, n))
+    delays = array.delays_s(math.radians(azimuth_deg))
+    turned = spectrum[:, None] * np.exp(-2j * np.pi * np.fft.rfftfreq(n, 1 / RATE)[:, None] * delays)
+    return np.fft.irfft(turned, n, axis=0) + np.random.default_rng(1).normal(0, 0.01, (n, len(delays)))
+
+
+def rows_of(path: Path) -> np.ndarray:
+    table = list(csv.reader(path.read_text().splitlines()))
+    assert table[0][:4] == ["time_s", "azimuth_deg", "std_deg", "prominence"]
+    return np.array(table[1:], dtype=np.float64)
+
+
+@pytest.mark.parametrize(("number", "name"), list(enumerate(OWN)))
+def test_no_command_refuses_a_right_array(number: int, name: str, tmp_path: Path) -> None:
+    file = write_array(tmp_path / f"mics.{FORMS[number % 4]}", OWN[name])
+    array = read_array(file)
+    np.testing.assert_allclose(array.positions_m, OWN[name])
+    broadside = 90.0 if array.aperture_m[1] < 1e-3 else 0.0
+    soundfile.write(tmp_path / "a.wav", wave(array, broadside), RATE)
+    given = ["--array", str(file)]
+    out = tmp_path / "b.csv"
+    assert main(["bearings", str(tmp_path / "a.wav"), *given, "--out", str(out), "--sources"]) == 0
+    rows = rows_of(out)
+    assert len(rows) == 4
+    assert np.abs(np.abs(rows[:, 1]) - broadside).max() < 8.0
+    assert main(["bounds", *given, "--json"]) == 0
+    assert main(["doctor", str(tmp_path / "a.wav"), *given]) in (0, 1)
+
+
+def test_all_round_with_a_ring(tmp_path: Path) -> None:
+    array = MicrophoneArray(ring(8, 0.2))
+    file = write_array(tmp_path / "ring.csv", ring(8, 0.2))
+    soundfile.write(tmp_path / "a.wav", wave(array, 150.0), RATE)
+    options = ["--array", str(file), "--azimuth-span", "360", "--out", str(tmp_path / "b.csv")]
+    assert main(["bearings", str(tmp_path / "a.wav"), *options, "--figure", str(tmp_path / "b.png")]) == 0
+    np.testing.assert_allclose(rows_of(tmp_path / "b.csv")[:, 1], 150.0, atol=1.0)
+    assert (tmp_path / "b.png").is_file()
+
+
+def test_two_sources_are_counted(tmp_path: Path) -> None:
+    array = MicrophoneArray(OWN["sixteen on a board"])
+    sound = wave(array, 40.0) + np.roll(wave(array, -30.0), 999, axis=0)
+    sound += np.random.default_rng(2).normal(0, 0.05, sound.shape)
+    soundfile.write(tmp_path / "a.wav", sound, RATE)
+    file = write_array(tmp_path / "m.json", OWN["sixteen on a board"])
+    options = ["--array", str(file), "--sources", "--out", str(tmp_path / "b.csv")]
+    assert main(["bearings", str(tmp_path / "a.wav"), *options]) == 0
+    assert rows_of(tmp_path / "b.csv")[0, 4] == 2
+
+
+def test_whole_numbers_of_a_converter_are_brought_to_full_scale() -> None:
+    array = MicrophoneArray(ring(4, 0.2))
+    sound = wave(array, 20.0)
+    exact = np.round(sound * 2**15)
+    (frame, *_) = FrontEnd(array, RATE).process(exact / 2**15)
+    for whole in (exact.astype(np.int16), exact.astype(np.int32) * 2**16):
+        (other, *_) = FrontEnd(array, RATE).process(whole)
+        np.testing.assert_array_equal(other.band_log_energy, frame.band_log_energy)
+    with pytest.raises(InvalidArgumentError, match="int16 or int32, got int64"):
+        FrontEnd(array, RATE).process(exact.astype(np.int64))
+
+
+@pytest.mark.parametrize("encoding", ["s16", "s24", "s32", "f32"])
+def test_raw_samples_on_standard_input(
+    encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    array = MicrophoneArray(ring(4, 0.2))
+    file, out = write_array(tmp_path / "m.csv", ring(4, 0.2)), tmp_path / "b.csv"
+    subtype = {"s16": "PCM_16", "s24": "PCM_24", "s32": "PCM_32", "f32": "FLOAT"}[encoding]
+    soundfile.write(tmp_path / "a.raw", wave(array, 20.0), RATE, format="RAW", subtype=subtype)
+    soundfile.write(tmp_path / "a.wav", wave(array, 20.0), RATE, subtype=subtype)
+    raw = (tmp_path / "a.raw").read_bytes()
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(raw)))
+    said = ["--rate", str(RATE), "--channels", "4", "--format", encoding]
+    assert main(["bearings", "-", *said, "--array", str(file), "--out", str(out)]) == 0
+    by_pipe = out.read_text()
+    assert main(["bearings", str(tmp_path / "a.wav"), "--array", str(file), "--out", str(out)]) == 0
+    assert by_pipe == out.read_text()
+    capsys.readouterr()
+    assert main(["bearings", "-", "--array", str(file), "--out", str(out)]) == 2
+    assert "--rate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "problem"),
+    [
+        (3, "whole samples of 2 channels"),
+        (4 * 4000, "at least 1 s"),
+        (0, "at least 1 s"),
+        (4 * RATE, "one constant"),
+    ],
+)
+def test_bad_pipes(n_bytes: int, problem: str) -> None:
+    with pytest.raises(InputFileError, match=problem):
+        open_sound(RawPcm(io.BytesIO(bytes(n_bytes)), RATE, 2))
+    with pytest.raises(InputFileError, match="expected 3 channels"):
+        open_sound(RawPcm(io.BytesIO(bytes(n_bytes - n_bytes % 4)), RATE, 2), 3)
+
+
+def test_a_file_a_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    array = MicrophoneArray(ring(4, 0.2))
+    sound = wave(array, 20.0)
+    file, out = write_array(tmp_path / "m.csv", ring(4, 0.2)), tmp_path / "b.csv"
+    names = [tmp_path / f"mic{i}.wav" for i in range(4)]
+    for name, channel in zip(names, sound.T, strict=True):
+        soundfile.write(name, channel, RATE)
+    soundfile.write(tmp_path / "a.wav", sound, RATE)
+    options = ["--array", str(file), "--out", str(out)]
+    assert main(["bearings", *map(str, names), *options]) == 0
+    together = out.read_text()
+    assert main(["bearings", str(tmp_path / "a.wav"), *options]) == 0
+    assert together == out.read_text()
+    soundfile.write(names[2], sound[:-1, 2], RATE)
+    assert main(["bearings", *map(str, names), *options]) == 2
+    assert "mic2.wav: expected 10400 samples at 8000 Hz as in mic0.wav" in capsys.readouterr().err
+    soundfile.write(names[2], sound[:, :2], RATE)
+    assert main(["bearings", *map(str, names), *options]) == 2
+    assert "expected 1 channels" in capsys.readouterr().err
