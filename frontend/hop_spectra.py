@@ -40,16 +40,7 @@ class HopSums:
 
 
 class HopSpectra:
-    """Transform, whiten and steer one hop; only the transform and the optional stages have a memory.
-
-    Examples
-    --------
-    >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0.1], [0, -0.1, 0]])
-    >>> spectra = HopSpectra(array, 48_000, FrontEndSettings())
-    >>> hop = np.random.default_rng(0).standard_normal((4800, 3)).astype(np.float32)
-    >>> spectra.push(hop).power.shape
-    (181,)
-    """
+    """Transform, whiten and steer one hop; only the transform and the optional stages have a memory."""
 
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings) -> None:
         nfft, speed = settings.nfft, settings.speed_of_sound_m_s

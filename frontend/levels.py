@@ -15,14 +15,7 @@ _HIGHEST = 0.45
 
 
 class LevelMeter:
-    """Log-energy per band and hop, averaged over a few microphones: the level is the same at all of them.
-
-    Examples
-    --------
-    >>> meter = LevelMeter(n_channels=2, sample_rate_hz=16_000, settings=FrontEndSettings())
-    >>> meter.push(np.zeros((1600, 2), np.float32)).shape
-    (16,)
-    """
+    """Log-energy per band and hop, averaged over a few microphones: the level is the same at all of them."""
 
     def __init__(self, n_channels: int, sample_rate_hz: float, settings: FrontEndSettings) -> None:
         low, high = settings.level_band_hz

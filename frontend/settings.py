@@ -144,7 +144,12 @@ class FrontEndSettings:
         Returns
         -------
         ndarray, shape (A,)
-            Radians.
+            Radians, left positive.
+
+        Examples
+        --------
+        >>> np.degrees(FrontEndSettings(azimuth_step_deg=90.0).azimuths_rad())
+        array([-90.,   0.,  90.])
         """
         return _grid_rad(self.azimuth_span_deg, self.azimuth_step_deg)
 
@@ -174,6 +179,12 @@ class FrontEndSettings:
         -------
         azimuths, elevations : ndarray, shape (E * A,)
             Radians.
+
+        Examples
+        --------
+        >>> azimuths, elevations = FrontEndSettings(elevation_span_deg=(0.0, 5.0)).directions_rad()
+        >>> len(azimuths), round(float(np.degrees(elevations[-1])))
+        (362, 5)
         """
         azimuths, elevations = np.meshgrid(self.azimuths_rad(), self.elevations_rad())
         return azimuths.ravel(), elevations.ravel()

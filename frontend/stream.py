@@ -157,8 +157,9 @@ class FrontEnd:
     def learn_ego_noise(self, none_probability: float) -> None:
         """Set the probability that no source is present, with which the sound is learned as ego-noise.
 
-        It holds for all hops from now on; before the first call nothing is learned. A caller with a filter
-        passes its posterior of "none" after every update; on a calibration drive one passes 1, then 0.
+        The noise covariance forgets with that weight w: ``R <- (a^w W R + w sum x x^H) / (a^w W + w T)``. The
+        weight holds for all hops from now on; before the first call nothing is learned. A caller with a
+        filter passes its posterior of "none" after every update; on a calibration drive one passes 1, then 0.
 
         Parameters
         ----------
@@ -180,7 +181,7 @@ class FrontEnd:
         self._ego_noise().weight = in_range("none_probability", none_probability, 0.0, 1.0)
 
     def follow_engine(self, fundamental_hz: float | None, tolerance: float = 0.02) -> None:
-        """Set the fundamental of the own engine, whose harmonics are then cancelled; None stops it.
+        """Set the fundamental f of the own engine, whose harmonics ``h f`` are cancelled; None stops it.
 
         It is tracked between calls: one call per hop follows a changing speed best, an occasional one is
         enough at a steady speed.

@@ -71,13 +71,6 @@ def spectrum_and_floor(
               \nu_k[b] = \frac{1}{\ln 2}\, \mathrm{median}_{b'}\, P_k[b'] \text{ around } b
 
     Shapes: frames (K, n).
-
-    Examples
-    --------
-    >>> noise = np.random.default_rng(0).normal(size=(2, 1000)) * np.hanning(1000)
-    >>> power, floor = spectrum_and_floor(noise, 4000.0, HarmonicSettings())
-    >>> bool(0.8 < power.mean() / floor.mean() < 1.3)
-    True
     """
     size = ZERO_PADDING * frames.shape[1]
     keep = int(np.ceil(settings.band_high_hz * 1.02 * size / rate)) + 2
@@ -101,13 +94,6 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
     with Q above, i_k the index of f_k on the grid, and r the largest change from window to window.
 
     Shapes: ratio (K, bins).
-
-    Examples
-    --------
-    >>> ratio = np.ones((5, 1300))
-    >>> ratio[:, 60::60] = 100.0
-    >>> bool(np.abs(best_path(ratio, 1.0, HarmonicSettings()) / 60.0 - 1).max() < 2e-3)
-    True
     """
     # Half a resolution at the highest partial, so that no partial falls between two candidates.
     step = 0.5 / (settings.window_s * settings.band_high_hz)

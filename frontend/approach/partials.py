@@ -29,14 +29,7 @@ REACH = 0.75
 
 @dataclass(frozen=True, slots=True)
 class Fundamental:
-    """Fundamental of K windows, combined from their partials.
-
-    Examples
-    --------
-    >>> one = np.ones(1)
-    >>> Fundamental(60.0 * one, 0.01 * one, one.astype(int), 0.0 * one, one).frequency_hz
-    array([60.])
-    """
+    """Fundamental of K windows, combined from their partials."""
 
     # Fundamental and its variance, increased where the partials disagree; undefined without partials.
     frequency_hz: FloatArray
@@ -70,14 +63,6 @@ def measure_fundamental(
               \mathrm{var}(\hat f) = \frac{\max(\chi^2, 1)}{\sum_h h^2 / \sigma_h^2}
 
     Shapes: fundamental_hz, slope_hz_s (K,).
-
-    Examples
-    --------
-    >>> t = np.arange(1000) / 4000.0
-    >>> wave = np.cos(2 * np.pi * 60.3 * t) + np.cos(2 * np.pi * 120.6 * t)
-    >>> windows = Windows(wave[None], np.hanning(1000), np.ones((1, 2000)), 4000.0)
-    >>> measure_fundamental(windows, np.array([60.0]), np.zeros(1), HarmonicSettings()).frequency_hz.round(1)
-    array([60.3])
     """
     most = min(settings.max_harmonics, int(settings.band_high_hz / fundamental_hz.min()))
     partials = np.arange(1, most + 1)

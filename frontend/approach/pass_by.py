@@ -72,13 +72,6 @@ def fit_pass_by(
               \mathrm{cov} = (J^T J)^{-1}
 
     Shapes: time_s, frequency_hz, std_hz (K,).
-
-    Examples
-    --------
-    >>> t = np.linspace(0.0, 4.0, 40)
-    >>> f = 100.0 / (1 + radial_speed_m_s(t, 12.0, 2.1, 5.0, 343.0) / 343.0)
-    >>> fit_pass_by(t, f, np.full(40, 0.01), 60.0, 343.0).values.round(3)
-    array([100. ,  12. ,   2.1,   5. ])
     """
     duration = float(np.ptp(time_s))
     low = np.array([0.7 * frequency_hz.min(), SLOWEST_M_S, time_s[0] - 2 * duration - 1, NEAREST_M])

@@ -154,12 +154,6 @@ def climb(
     with P the projection off the columns of H, as in `estimate_tone` (variable projection).
 
     Shapes: y (n,).
-
-    Examples
-    --------
-    >>> omega, amplitude = climb(np.cos(1.0 * np.arange(101)), omega=1.01)
-    >>> round(omega, 9), round(abs(amplitude), 6)
-    (1.0, 1.0)
     """
     n: FloatArray = np.arange(len(y), dtype=np.float64) - 0.5 * (len(y) - 1)
     reach = np.pi / len(y)

@@ -62,18 +62,7 @@ class ToneReading:
 
 
 class ToneStage:
-    """Keep the decimated band of one averaged channel over the window and fit a tone; memory does not grow.
-
-    Examples
-    --------
-    >>> stage = ToneStage(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 8_000)
-    >>> rng, t = np.random.default_rng(0), np.arange(8_000) / 8_000
-    >>> engine = np.sin(2 * np.pi * 61.2 * t)[:, None] + 0.5 * rng.standard_normal((8_000, 2))
-    >>> stage.push(engine.astype(np.float32), ChannelMask.all_of(2))
-    >>> reading = stage.read()
-    >>> bool(abs(reading.frequency_hz - 61.2) < 3 * reading.frequency_std_hz < 0.1)
-    True
-    """
+    """Keep the decimated band of one averaged channel over the window and fit a tone."""
 
     def __init__(
         self,

@@ -25,18 +25,7 @@ _TOLERANCE = 1e-7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngularInterpolation:
-    """Node directions, and the weights that give the power in all others.
-
-    Examples
-    --------
-    With two microphones the power is a constant plus one wave, so that three directions suffice.
-
-    >>> phase = np.linspace(-1.5, 1.5, 31)
-    >>> nodes = AngularInterpolation.of(np.stack([np.exp(1j * phase), np.exp(-1j * phase)])[None])
-    >>> power = 1.0 + 0.5 * np.cos(2 * phase + 0.3)
-    >>> len(nodes.index), bool(np.allclose(power[nodes.index] @ nodes.spread, power))
-    (3, True)
-    """
+    """Node directions, and the weights that give the power in all others."""
 
     index: IndexArray  # shape (N,): Nodes among all directions
     spread: FloatArray  # shape (N, directions): Power in all directions is the power at the nodes times this

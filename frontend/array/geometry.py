@@ -23,12 +23,6 @@ def direction_vectors(azimuths_rad: ArrayLike, elevations_rad: ArrayLike = 0.0) 
     r"""Return unit vectors towards far-field sources, shape (..., 3).
 
     .. math:: u = (\cos\phi\cos\theta,\; \cos\phi\sin\theta,\; \sin\phi)
-
-    Examples
-    --------
-    >>> direction_vectors([0.0, np.pi / 2]).round(6) + 0.0
-    array([[1., 0., 0.],
-           [0., 1., 0.]])
     """
     azimuth, elevation = np.broadcast_arrays(
         np.asarray(azimuths_rad, dtype=np.float64), np.asarray(elevations_rad, dtype=np.float64)

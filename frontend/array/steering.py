@@ -123,15 +123,7 @@ class Steering:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeBeams:
-    """Beams at the node directions of `AngularInterpolation`.
-
-    Examples
-    --------
-    >>> array = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
-    >>> beams = Steering.towards(array, [500.0], np.linspace(-1.0, 1.0, 61))
-    >>> beams.nodes.weights.shape[2] < 30, beams.nodes.spread.shape[1]
-    (True, 61)
-    """
+    """Beams at the node directions of `AngularInterpolation`."""
 
     weights: Complex64Array  # shape (bins, r or M, N): C at the nodes, and its conjugate
     conjugate: Complex64Array
@@ -168,12 +160,5 @@ def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | No
 
 
 def cross_spectra(spectra: Complex64Array) -> Complex64Array:
-    r"""Sum over frames :math:`R_{ij} = \sum_t x_{t,i} \overline{x_{t,j}}`, (bins, frames, M) -> (bins, M, M).
-
-    Examples
-    --------
-    >>> cross_spectra(np.array([[[1, 1j]]], np.complex64))[0].round(1) + 0.0
-    array([[1.+0.j, 0.-1.j],
-           [0.+1.j, 1.+0.j]], dtype=complex64)
-    """
+    r"""Return :math:`R_{ij} = \sum_t x_{t,i} \overline{x_{t,j}}` from (bins, frames, M), (bins, M, M)."""
     return np.asarray(spectra.transpose(0, 2, 1) @ spectra.conj())

@@ -31,13 +31,6 @@ def bearing_std_rad(
 
     .. math:: \sigma = \min\Big( \frac{\sigma_0}{\max(\cos\theta, 0.2)}
               \sqrt{1 + \Big(\frac{0.15}{\rho - 1}\Big)^2},\; \frac{\Delta}{\sqrt{12}} \Big)
-
-    Examples
-    --------
-    >>> cases = ((0, 3.0), (60, 3.0), (0, 1.05))
-    >>> sigma = [bearing_std_rad(np.radians(a), p, np.radians(3.4), np.pi) for a, p in cases]
-    >>> np.degrees(sigma).round(1)
-    array([ 3.4,  6.8, 10.8])
     """
     # An empirical model, not a bound: sigma_0 is measured on prominent line-of-sight sources, the cosine is
     # the geometry of eq. (4), and with falling prominence the error becomes uniform over the searched span

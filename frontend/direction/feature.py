@@ -82,13 +82,6 @@ def pair_sum_of(
     .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
 
     The channels are counted in `order`, or in that of the array.
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array.steering import Steering
-    >>> steering = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0])
-    >>> pair_sum_of(np.ones((1, 2, 2), np.complex64), steering).round(3)
-    array([1.+0.j])
     """
     pairs = matrices * _pairs_mask(order or tuple(range(matrices.shape[2])))
     return steering.quadratic_form(steering.compress(pairs))

@@ -30,16 +30,6 @@ class MusicStage:
 
     With prewhitened spectra and beams it is the generalised eigenvalue form: the
     eigenvectors of :math:`R^{-1/2} R_x R^{-1/2}`, R being the noise (`prewhitening`).
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
-    >>> array, grid = MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)]), np.linspace(-1.5, 1.5, 31)
-    >>> stage = MusicStage(Steering.towards(array, [500.0, 700.0], grid), grid, 1, 4, window_hops=2)
-    >>> wave = array.steering([500.0, 700.0], 0.4)[None, :, :, 0].astype(np.complex64)
-    >>> stage.push(np.tile(wave, (5, 1, 1)))
-    >>> round(stage.read(ChannelMask.all_of(4)).azimuth_rad, 2)
-    0.4
     """
 
     def __init__(

@@ -70,6 +70,11 @@ def find_peaks(
     InvalidArgumentError
         On another shape, fewer than three points, NaN or infinity.
 
+    References
+    ----------
+    J. O. Smith and X. Serra, "PARSHL: an analysis/synthesis program for non-harmonic sounds", ICMC 1987 (the
+    parabola).
+
     Examples
     --------
     >>> grid = np.radians(np.arange(-90.0, 91.0))

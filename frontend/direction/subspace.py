@@ -34,17 +34,7 @@ _LEAST_GAP = 1e-4
 
 
 class SubspaceTracker:
-    r"""Track the k strongest eigenvectors of a running covariance.
-
-    Examples
-    --------
-    >>> tracker = SubspaceTracker(sources=1)
-    >>> R = np.diag([1.0, 2.0, 9.0, 1.0, 1.0, 1.0, 1.0, 1.0])[None].astype(complex)
-    >>> [float(tracker.update(R).eigenvalues[0, 0].round(6)) for _ in range(2)]
-    [9.0, 9.0]
-    >>> tracker.full_decompositions
-    1
-    """
+    r"""Track the k strongest eigenvectors of a running covariance."""
 
     def __init__(self, sources: int, *, guard: int = 3, tolerance: float = 0.05) -> None:
         if sources < 1 or guard < 0:

@@ -110,20 +110,7 @@ class EgoNoiseSettings:
 
 
 class EgoNoise:
-    """Learn the ego-noise of a stream and whiten its spectra, hop by hop.
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
-    >>> plain = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
-    >>> ego = EgoNoise(EgoNoiseSettings(guard_hops=0), 200.0, 2, [(plain, slice(1, 2))])
-    >>> hop = np.ones((20, 3, 2), np.complex64)
-    >>> ego.weight = 1.0
-    >>> for _ in range(3):
-    ...     ((whitened, steering),) = ego.process(hop)
-    >>> round(ego.learned_frames, 1), whitened.shape
-    (39.6, (20, 1, 2))
-    """
+    """Learn the ego-noise of a stream and whiten its spectra, hop by hop."""
 
     # Until noise from below the horizon has been learned, spectra are unchanged, bit for bit. `weight` is the
     # probability that no source is present, for all hops from then on.

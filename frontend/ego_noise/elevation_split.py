@@ -33,19 +33,7 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ElevationSplit:
-    """Separate the noise of the own vehicle from that of the street by elevation.
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array.microphone_array import roof_array_56
-    >>> array = roof_array_56()
-    >>> split = ElevationSplit.of(array, [500.0, 1000.0])
-    >>> def wave(elevation):
-    ...     a = array.steering([500.0, 1000.0], 0.3, elevation)
-    ...     return (a @ a.conj().transpose(0, 2, 1)).astype(np.complex64)
-    >>> [share_of(*split.powers(wave(np.radians(elevation)))) > 0.5 for elevation in (-40, 5)]
-    [True, False]
-    """
+    """Separate the noise of the own vehicle from that of the street by elevation."""
 
     # shape (bins, 2 M^2): Combinations of the model fields, real and imaginary parts in turn, that give the
     # power of one field times the determinant.

@@ -41,14 +41,7 @@ _TINY = 1e-30
 
 @dataclass(frozen=True, slots=True)
 class EngineState:
-    """Phase, frequency and rate of the fundamental at the middle of the last frame.
-
-    Examples
-    --------
-    >>> state = EngineState(phase_rad=0.0, frequency_hz=30.0)
-    >>> state.phases(np.array([0.1])).round(2), state.within(10.0, 25.0).frequency_hz
-    (array([18.85]), 25.0)
-    """
+    """Phase, frequency and rate of the fundamental at the middle of the last frame."""
 
     phase_rad: float  # Phase, its derivative over 2 pi, and the derivative of that
     frequency_hz: float
@@ -91,22 +84,7 @@ class EngineState:
 
 
 class HarmonicCanceller:
-    """Subtract the harmonics of an engine from the spectra of a stream.
-
-    Examples
-    --------
-    >>> from worldstate.frontend.spectra.stft import StreamingStft
-    >>> t = np.arange(16_000) / 16_000.0
-    >>> engine = sum(np.cos(2 * np.pi * 50.0 * h * t + h) for h in range(1, 30))
-    >>> spectra = StreamingStft(1, 256, range(5, 20)).push(engine[:, None].astype(np.float32))
-    >>> canceller = HarmonicCanceller(range(5, 20), 16_000, 256)
-    >>> canceller.follow(50.2)
-    >>> rest = [canceller.cancel(hop) for hop in np.array_split(spectra, 10)]
-    >>> bool(abs(canceller.fundamental_hz - 50.0) < 0.01)
-    True
-    >>> bool(np.square(np.abs(rest[-1])).mean() < 1e-2 * np.square(np.abs(spectra)).mean())
-    True
-    """
+    """Subtract the harmonics of an engine from the spectra of a stream."""
 
     def __init__(
         self, bins: range, sample_rate_hz: float, nfft: int, *, harmonics: int = 40, memory_s: float = 0.4

@@ -13,15 +13,7 @@ _LEVEL_HOPS = 10.0
 
 
 class NoiseCovariance:
-    """Recursive mean of unit-length snapshots' covariance, per bin.
-
-    Examples
-    --------
-    >>> noise = NoiseCovariance(n_bins=1, n_microphones=2, forgetting_frames=1e6)
-    >>> noise.learn(np.array([[[[2.0, 2.0], [2.0, 2.0]]]], np.complex64)[0], n_frames=2, weight=1.0)
-    >>> noise.mean(0).real.tolist(), noise.n_frames
-    ([[1.0, 1.0], [1.0, 1.0]], 2.0)
-    """
+    """Recursive mean of unit-length snapshots' covariance, per bin."""
 
     def __init__(self, n_bins: int, n_microphones: int, forgetting_frames: float) -> None:
         self.n_frames = 0.0
@@ -50,14 +42,7 @@ class NoiseCovariance:
 
 
 class NoiseLevel:
-    """Level of whitened noise relative to white noise, learned like the covariance.
-
-    Examples
-    --------
-    >>> level = NoiseLevel(guard_hops=0)
-    >>> level.push(3.0, 1.0), level.push(9.0, 0.0), level.push(5.0, 1.0)
-    (3.0, 3.0, 4.04...)
-    """
+    """Level of whitened noise relative to white noise, learned like the covariance."""
 
     def __init__(self, guard_hops: int) -> None:
         self._guard: GuardDelay[float] = GuardDelay(guard_hops)

@@ -51,12 +51,6 @@ def shrunk_inverse_root(R: ComplexArray, s: float) -> ComplexArray:
               R / M
 
     Shapes: R (M, M).
-
-    Examples
-    --------
-    >>> shrunk_inverse_root(np.diag([7.0, 1.0]), 1.0)
-    array([[1., 0.],
-           [0., 1.]])
     """
     # Shrinkage after O. Ledoit and M. Wolf (2004): no direction is amplified by more than 1 / sqrt(s), and s
     # = 1 changes nothing. The Hermitian root after A. Kessy et al. (2018). Dead microphones give zeros; where

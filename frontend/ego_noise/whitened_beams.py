@@ -14,15 +14,6 @@ class WhitenedBeams:
     With :math:`W = B C` of `Steering`, the weights for :math:`y = R^{-1/2} x` are
     :math:`\overline{R^{-1/2}} B C`, scaled to length :math:`\sqrt M` in every direction (M counts the
     microphones that are not dead).
-
-    Examples
-    --------
-    >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
-    >>> plain = Steering.towards(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [500.0], [0.0, 0.5])
-    >>> beams = WhitenedBeams(plain)
-    >>> beams.update(0, 3.0 * np.eye(2, dtype=np.complex64))
-    >>> bool(np.allclose(beams.steering.weights, plain.weights))
-    True
     """
 
     def __init__(self, plain: Steering) -> None:

@@ -13,16 +13,7 @@ _SILENCE_HOPS = 10
 
 
 class ChannelActivity:
-    """Flags of unusable hops of every channel over the last five seconds.
-
-    Examples
-    --------
-    >>> activity = ChannelActivity(3)
-    >>> for hop in range(4):
-    ...     bad = activity.push(np.array([False, True, hop % 2 == 0]))
-    >>> [(fault.channel, fault.fault.value, fault.value) for fault in activity.faults()]
-    [(1, 'dead', 1.0), (2, 'intermittent', 0.5)]
-    """
+    """Flags of unusable hops of every channel over the last five seconds."""
 
     # One stretch of bad hops that lasts until now is dead; several, or one that has ended, are intermittent.
     # A single bad hop is masked and not reported: a slammed door is no fault.

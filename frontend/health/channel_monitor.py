@@ -39,18 +39,7 @@ _EVERY_HOPS = 10
 
 
 class ChannelMonitor:
-    """Collect the statistics of all channels and report their faults; memory does not grow.
-
-    Examples
-    --------
-    >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0, 0], [0, -0.1, 0]])
-    >>> monitor = ChannelMonitor(array, np.array([500.0]), 48_000.0)
-    >>> sound = np.random.default_rng(0).standard_normal((4800, 1)).astype(np.float32) * [1.0, 1.0, 0.0]
-    >>> for _ in range(2):
-    ...     health = monitor.push(sound.astype(np.float32), np.array([[1.0, 1.0, 0.0]]), np.ones((1, 3, 3)))
-    >>> health.mask.keep, [(fault.channel, fault.fault.value) for fault in health.faults]
-    (array([ True,  True, False]), [(2, 'dead')])
-    """
+    """Collect the statistics of all channels and report their faults; memory does not grow."""
 
     def __init__(
         self,

@@ -14,18 +14,7 @@ _MIN_COUNT = 16
 
 
 class ClippingCounter:
-    """Count samples at and just below the highest and the lowest value of every channel.
-
-    Examples
-    --------
-    >>> sound = np.random.default_rng(0).standard_normal((4800, 2)).astype(np.float32)
-    >>> sound[:, 1] = sound[:, 1].clip(-1.5, 1.5)
-    >>> clipping = ClippingCounter(2)
-    >>> for _ in range(2):
-    ...     clipping.push(sound, sound.min(axis=0), sound.max(axis=0))
-    >>> clipping.clipped_share().round(2)
-    array([0.  , 0.06])
-    """
+    """Count samples at and just below the highest and the lowest value of every channel."""
 
     # An unclipped sound reaches its extreme once and the values just below it more often; a clipped one stays
     # at it. Only hops that reach the extreme again are counted, so that a clean stream costs nothing; a new

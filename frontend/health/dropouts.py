@@ -55,15 +55,7 @@ class Dropout:
 
 
 class DropoutFinder:
-    """Find dropouts hop by hop.
-
-    Examples
-    --------
-    >>> sound = np.random.default_rng(0).standard_normal((4800, 8)).astype(np.float32)
-    >>> sound[1000:1100] = 0.0
-    >>> DropoutFinder(8).push(sound, np.ones(8, bool))
-    [Dropout(kind='still', sample=1000, n_samples=100)]
-    """
+    """Find dropouts hop by hop."""
 
     def __init__(self, n_channels: int) -> None:
         self._n_seen = 0
@@ -97,15 +89,7 @@ class DropoutFinder:
 
 
 class StillRuns:
-    """Find runs of samples in which no channel changes, across hops; a run at the start is none.
-
-    Examples
-    --------
-    >>> runs, still = StillRuns(), np.zeros(300, bool)
-    >>> still[100:150] = True
-    >>> runs.push(still, end=300)
-    [Dropout(kind='still', sample=99, n_samples=51)]
-    """
+    """Find runs of samples in which no channel changes, across hops; a run at the start is none."""
 
     def __init__(self) -> None:
         self._length = 0
@@ -155,13 +139,6 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
               \Big\rangle_{channels},
 
     Shapes: change (channels, n), still (n,).
-
-    Examples
-    --------
-    >>> sound = np.cumsum(np.random.default_rng(0).standard_normal((8, 4000)), axis=1).cumsum(axis=1)
-    >>> change = np.diff(np.delete(sound, np.s_[2000:2100], axis=1)).astype(np.float32)
-    >>> find_splices(change, 1, np.zeros(3899, bool))
-    [Dropout(kind='splice', sample=2000, n_samples=None)]
     """
     # d are the differences of successive samples, e their prediction errors and J the jump over two samples:
     # a splice has J above 12 and above three times the fifth largest of the hop.
@@ -190,15 +167,7 @@ def _prediction_error(change: Float32Array) -> Float32Array:
 
 
 class RepeatFinder:
-    """Find samples that are repeated, by hashes of single samples over several channels.
-
-    Examples
-    --------
-    >>> sound = np.random.default_rng(0).standard_normal((8, 9600)).astype(np.float32)
-    >>> finder = RepeatFinder()
-    >>> finder.push(sound, end=9600), finder.push(sound[:, -4800:], end=14_400)[0].kind
-    ([], 'repeat')
-    """
+    """Find samples that are repeated, by hashes of single samples over several channels."""
 
     # Sound never repeats to the last bit on eight channels. Only hashes with five zero bits are kept (Manber,
     # "Finding similar files in a large file system", 1994), so that the same samples are kept when they

@@ -28,19 +28,7 @@ _PARTNER_MARGIN = 0.1
 
 
 class GeometryCheck:
-    """Check the positions of all channels once a second; a fault needs two verdicts in a row.
-
-    Examples
-    --------
-    >>> array = MicrophoneArray([[0, 0.1 * i, 0] for i in range(5)])
-    >>> check, frequencies = GeometryCheck(array, np.array([100.0])), np.array([100.0])
-    >>> wave = array.steering(frequencies, 0.3)[:, :, 0] * np.array([1, 1, -1, 1, 1])
-    >>> matrices = (wave[:, :, None] * wave[:, None].conj()).astype(np.complex64)
-    >>> for hop in range(20):
-    ...     check.push(18 * matrices, 18, np.ones(5, bool))
-    >>> [(fault.channel, fault.fault.value) for fault in check.faults()]
-    [(2, 'inverted')]
-    """
+    """Check the positions of all channels once a second; a fault needs two verdicts in a row."""
 
     def __init__(
         self, array: MicrophoneArray, frequencies_hz: FloatArray, speed_of_sound_m_s: float = 343.0
@@ -120,12 +108,6 @@ def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
     .. math:: \hat\pi = \arg\max_\pi \sum_m S_{m, \pi(m)}, \qquad g_m = S_{m, \hat\pi(m)} - S_{mm}
 
     Shapes: scores (M, M), candidates (M,).
-
-    Examples
-    --------
-    >>> scores = np.array([[0.1, 0.9, 0.1], [0.8, 0.2, 0.1], [0.1, 0.1, 0.7]])
-    >>> [(fault.channel, fault.looks_like) for fault in displaced(scores, np.ones(3, bool))]
-    [(0, 1), (1, 0)]
     """
     # The Hungarian method over the channels that fit elsewhere better. The others stay, so that a swap does
     # not displace a third channel to its second-best position.

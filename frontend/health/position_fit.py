@@ -46,12 +46,6 @@ def position_weights(
               \Gamma_{ij} = \frac{\sin(k d_{ij})}{k d_{ij}}
 
     Shapes: frequencies_hz (K,), usable (M,).
-
-    Examples
-    --------
-    >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0], [0, -0.1, 0]])
-    >>> position_weights(array, np.array([100.0]), np.ones(3, bool))[0, 1].round(2) + 0.0
-    array([0.46, 0.  , 0.46], dtype=float32)
     """
     positions = array.positions_m
     distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
@@ -70,13 +64,6 @@ def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArra
               {\sqrt{K \sum_k w_{k,p}^T R_k\, w_{k,p}}}
 
     Shapes: coherence (K, M, M), weights (K, M, M).
-
-    Examples
-    --------
-    >>> array = MicrophoneArray([[0, 0.1, 0], [0, 0.0, 0], [0, -0.1, 0]])
-    >>> weights = position_weights(array, np.array([100.0]), np.ones(3, bool))
-    >>> position_scores(np.ones((1, 3, 3), np.float32), weights).diagonal().round(2)
-    array([1., 1., 1.])
     """
     predicted = weights @ coherence
     power = (predicted * weights).sum(axis=(0, 2), dtype=np.float64)

@@ -10,16 +10,7 @@ _HOPS = 30
 
 
 class RunningMean:
-    """Exponential mean over hops, an ordinary mean until its time constant has passed.
-
-    Examples
-    --------
-    >>> mean = RunningMean((1, 2))
-    >>> mean.add([[1.0, 5.0]], np.array([True, True]))
-    >>> mean.add([[3.0, 7.0]], np.array([True, False]))
-    >>> mean.mean, mean.count
-    (array([[2., 5.]]), array([2, 1]))
-    """
+    """Exponential mean over hops, an ordinary mean until its time constant has passed."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.mean = np.zeros(shape)

@@ -155,6 +155,14 @@ class SampleClock:
         -------
         RateEstimate or NotUsable
             Hz, with its standard deviation.
+
+        Examples
+        --------
+        >>> clock = SampleClock(nominal_hz=1000.0)
+        >>> for second in range(10):
+        ...     clock.read(n_samples=1001 * second, captured_ns=10**9 * second)
+        >>> clock.estimate().is_wrong
+        True
         """
         if self._n < _MIN_READINGS or self._tt <= 0.0:
             return NotUsable(f"needs {_MIN_READINGS} readings of a clock, got {self._n}")

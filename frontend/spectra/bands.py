@@ -15,13 +15,6 @@ def band_edges(bins: range, n_bands: int) -> IntArray:
     .. math:: e_{b+1} = \max\big(e_b + 1,\; \mathrm{round}(e_b\, (e_B / e_b)^{1 / (B - b)})\big)
 
     with e_0 the first bin and e_B the end.
-
-    Examples
-    --------
-    50 Hz to 8 kHz in bins of 93.75 Hz:
-
-    >>> band_edges(range(1, 85), 16)
-    array([ 1,  2,  3,  4,  5,  6,  8, 10, 13, 16, 20, 25, 32, 41, 52, 66, 85])
     """
     if not 1 <= n_bands <= len(bins) or bins.start < 1:
         raise InvalidArgumentError(f"n_bands: expected 1 to {len(bins)} bands within {bins}, got {n_bands}")

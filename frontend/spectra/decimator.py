@@ -21,16 +21,6 @@ class Decimator:
     with a linear-phase Kaiser low-pass, flat up to :math:`f_{high}`, closed from :math:`f_s / D - f_{high}`.
     Only outputs whose L samples are all there are given; what is left over waits. In polyphase form: the
     samples as rows of D, one matrix product with the taps as columns of D, sums along its diagonals.
-
-    Examples
-    --------
-    >>> decimator = Decimator(sample_rate_hz=48_000, high_hz=400.0)
-    >>> decimator.factor, decimator.rate_hz
-    (40, 1200.0)
-    >>> blocks = np.split(np.ones(4800), [7, 1000])
-    >>> output = np.concatenate([decimator.push(block) for block in blocks])
-    >>> len(output) == (4800 - decimator.n_taps) // 40 + 1, bool(np.allclose(output, 1.0))
-    (True, True)
     """
 
     def __init__(self, sample_rate_hz: float, high_hz: float) -> None:

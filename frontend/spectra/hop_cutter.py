@@ -30,15 +30,7 @@ class Hop:
 
 
 class HopCutter:
-    """Collect blocks of any length and return whole hops, in time proportional to the samples.
-
-    Examples
-    --------
-    >>> cutter = HopCutter(n_channels=1, sample_rate_hz=25, hop_rate_hz=10)
-    >>> blocks = (np.zeros((n, 1), np.float32) for n in (2, 4, 1))
-    >>> [[(hop.index, len(hop.samples)) for hop in cutter.cut(block)] for block in blocks]
-    [[], [(1, 3), (2, 2)], []]
-    """
+    """Collect blocks of any length and return whole hops, in time proportional to the samples."""
 
     def __init__(self, n_channels: int, sample_rate_hz: float, hop_rate_hz: float) -> None:
         self._rates = sample_rate_hz, hop_rate_hz

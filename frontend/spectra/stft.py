@@ -11,14 +11,6 @@ class StreamingStft:
 
     .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N},
               \qquad w[n] = \tfrac12 - \tfrac12 \cos(2 \pi n / N)
-
-    Examples
-    --------
-    >>> stft = StreamingStft(n_channels=1, nfft=8, bins=range(1, 3))
-    >>> tone = np.cos(2 * np.pi * np.arange(12) / 8, dtype=np.float32)[:, None]
-    >>> stft.push(tone[:7]).shape, stft.push(tone[7:])[..., 0].round(3).real + 0.0
-    ((0, 2, 1), array([[ 2., -1.],
-                       [-2.,  1.]], dtype=float32))
     """
 
     # The first frame starts at the first sample; nothing is padded. A full FFT and decimation before it were

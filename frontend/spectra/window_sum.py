@@ -10,17 +10,7 @@ _EPS = float(np.finfo(np.float32).eps)
 
 
 class WindowSum:
-    """Sum of the last `length` sets of positive semidefinite matrices, in single precision.
-
-    Examples
-    --------
-    >>> window = WindowSum(3, n_bins=1, size=1)
-    >>> for value in (1e30, 1.0, 2.0, 4.0):
-    ...     window.open_slot()[...] = value
-    ...     window.close_slot()
-    >>> window.total.real
-    array([[[7.]]], dtype=float32)
-    """
+    """Sum of the last `length` sets of positive semidefinite matrices, in single precision."""
 
     # Adding the newest and subtracting the oldest set costs two passes, but leaves the round-off of loud sets
     # behind, in which a sound 100 dB below would be lost. The round-off is bounded by the traces added and
