@@ -48,7 +48,7 @@ def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
     --------
     >>> there = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.3], [0.0, 0.2, 0.2]])
     >>> array_difference(there, MicrophoneArray(there * [1, -1, 1]))
-    'microphones up to 400 mm elsewhere; looks mirrored'
+    'microphones up to 300 mm elsewhere; looks mirrored'
     """
     if array.n_microphones != len(expected_m):
         return f"{array.n_microphones} microphones, expected {len(expected_m)}"
