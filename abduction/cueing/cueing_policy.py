@@ -222,25 +222,6 @@ def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
     return sustained_statistic(np.asarray(held, dtype=bool), sustain_hops) >= 0.5
 
 
-def argmax_hazard(probabilities: ArrayLike, hazard_columns: tuple[int, ...] = (1, 3)) -> BoolArray:
-    r"""Return where the most probable class is a hazard: the published rule's decision, shape (windows,).
-
-    .. math:: \hat c = \arg\max_c P_c, \qquad \hat c \in \{left, right\}
-
-    Shapes: probabilities (windows, classes).
-
-    References
-    ----------
-    Y. Schulz et al., "Hearing what you cannot see: acoustic vehicle detection around corners", 2021.
-
-    Examples
-    --------
-    >>> argmax_hazard([[0.1, 0.6, 0.2, 0.1], [0.5, 0.3, 0.1, 0.1]])
-    array([ True, False])
-    """
-    return np.isin(finite_array("probabilities", probabilities, (None, None)).argmax(axis=1), hazard_columns)
-
-
 def _check_sustain_hops(sustain_hops: object) -> int:
     if not isinstance(sustain_hops, int | np.integer) or isinstance(sustain_hops, bool) or sustain_hops < 1:
         raise InvalidArgumentError(f"sustain_hops: expected a whole number >= 1, got {sustain_hops!r:.40}")

@@ -3,7 +3,6 @@ from .dataset.dataset import write_recording as write_recording
 from .dataset.plan import DatasetSettings as DatasetSettings
 from .dataset.recording import SimulatedRecording as SimulatedRecording
 from .dataset.recording import simulate_recording as simulate_recording
-from .dataset.recording import stream_recording as stream_recording
 from .scene.ego_motion import EgoMotion as EgoMotion
 from .scene.junction import MOVING_SITES as MOVING_SITES
 from .scene.junction import SITES as SITES

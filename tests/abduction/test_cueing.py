@@ -9,7 +9,6 @@ from worldstate.abduction.cueing.cueing_policy import (
     CueingPolicies,
     CueingPolicy,
     SustainedRule,
-    argmax_hazard,
     sustained_alarm,
     sustained_statistic,
 )
@@ -87,11 +86,6 @@ def test_runs_do_not_cross_recordings():
 def test_a_threshold_without_grounds_is_refused(recordings, alpha, k):
     with pytest.raises(InvalidArgumentError):
         neyman_pearson_threshold(recordings, alpha, k)
-
-
-def test_the_published_rule_takes_the_argmax():
-    probabilities = np.eye(4)[[0, 1, 2, 3]]
-    assert argmax_hazard(probabilities).tolist() == [False, True, False, True]
 
 
 @pytest.mark.parametrize("risk_map", [IsotonicMap((0.1, 0.9), (0.0, 1.0)), PlattMap(-2.0, 0.3)])

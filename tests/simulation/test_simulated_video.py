@@ -25,7 +25,7 @@ from worldstate.adapters.simulation import (
     write_recording,
 )
 from worldstate.adapters.simulation.camera.rays import Panel, Patch, View, cast_panels, cast_solid
-from worldstate.adapters.simulation.camera.street_view import ROAD_Z_M, look_at
+from worldstate.adapters.simulation.camera.street_view import ROAD_Z_M, paint_street
 from worldstate.adapters.simulation.camera.vehicle_view import Car, add_car
 from worldstate.adapters.simulation.dataset.rendered_video import (
     camera_frames,
@@ -132,7 +132,7 @@ def test_patch_holds_the_projection():
 
 def test_a_car_fills_the_projection_of_its_cuboid():
     """In the open, seen by its colour: the silhouette's box against OpenCV's projection of the corners."""
-    street = look_at(site("SB1"), View(MIDDLE))
+    street = paint_street(site("SB1"), View(MIDDLE))
     still = street.pixels()
     image = still.copy()
     car = Car(8.0, 2.2, 1, RED)
@@ -157,7 +157,7 @@ def test_a_mirrored_car_in_the_middle_mirrors_the_change():
     camera = replace(SMALL, position_m=(-0.567, 0.0, -0.485))
     plan = site("SB1")
     plan = replace(plan, corner_right_m=plan.corner_left_m, side_wall_right_m=plan.side_wall_left_m)
-    street = look_at(plan, View(camera))
+    street = paint_street(plan, View(camera))
     flat = replace(street, image=np.full_like(street.image, 90))
     seen = []
     for heading in (-1, 1):

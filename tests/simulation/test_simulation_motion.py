@@ -18,7 +18,6 @@ from worldstate.adapters.simulation import (
     preset,
     simulate_recording,
     site,
-    stream_recording,
 )
 from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
@@ -142,17 +141,6 @@ def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entr
     """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
     power = (heard(SCENES[name](), noise).reshape(200, -1) ** 2).mean(axis=1)
     assert np.abs(np.diff(10 * np.log10(power))).max() < 4.0
-
-
-@settings(max_examples=5, deadline=None)
-@given(st.sampled_from([*MOVING_SITES, "SA1", "SL1"]), st.integers(1, 5000), st.integers(0, 1000))
-def test_blocks_put_together_are_the_recording(name, block, seed):
-    rng = np.random.default_rng(seed)
-    scene = replace(draw_settings(name, "left", rng, 0.6), sample_rate_hz=8_000.0)
-    blocks = list(stream_recording(scene, np.random.default_rng(seed), block, PAIR))
-    whole = simulate_recording(scene, np.random.default_rng(seed), PAIR).audio
-    assert {len(one) for one in blocks[:-1]} <= {block}
-    assert np.array_equal(np.concatenate(blocks), whole)
 
 
 def test_truth_tells_ways_sight_and_time_of_every_vehicle():

@@ -38,7 +38,7 @@ class StreetView:
         return np.concatenate([reduced(self.image[row : row + step].astype(np.float32)) for row in rows])
 
 
-def look_at(site: Site, view: View) -> StreetView:
+def paint_street(site: Site, view: View) -> StreetView:
     """Paint a site; it has the same face in every recording."""
     panels = street_panels(site)
     rows, columns = view.shape

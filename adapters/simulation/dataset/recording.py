@@ -1,6 +1,5 @@
 """One recording: sound at every microphone, detections of the camera, and the truth."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +30,6 @@ from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .truth import describe
@@ -112,7 +110,7 @@ def simulate_recording(
     to_sound, to_camera = rng.spawn(2)
     array = ovad_array() if array is None else array
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
-        audio = _listen(settings, array, to_sound)
+        audio = _record(settings, array, to_sound)
     camera, frames = PinholeCamera(), _frame_times(settings)
     seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
     return SimulatedRecording(
@@ -125,47 +123,7 @@ def simulate_recording(
     )
 
 
-def stream_recording(
-    settings: SimulationSettings,
-    rng: np.random.Generator,
-    block_samples: int,
-    array: MicrophoneArray | None = None,
-) -> Iterator[Float32Array]:
-    """Simulate one recording and hand it out in blocks, as a sound card would, without a file.
-
-    The whole recording is rendered before the first block, for late sound needs what was emitted early.
-
-    Parameters
-    ----------
-    settings, rng, array
-        See `simulate_recording`.
-    block_samples : int
-        Samples per block; the last one may be shorter.
-
-    Yields
-    ------
-    ndarray of float32, shape (block_samples, M)
-        1.0 is `FULL_SCALE_PA`; put together they are `simulate_recording(...).audio`.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If `block_samples` is below 1.
-
-    Examples
-    --------
-    >>> from worldstate.adapters.simulation import SimulationSettings, site
-    >>> settings = SimulationSettings(site("SB1"), "none", duration_s=0.5, sample_rate_hz=8e3)
-    >>> [len(block) for block in stream_recording(settings, np.random.default_rng(1), 1500)]
-    [1500, 1500, 1000]
-    """
-    size = int(in_range("block_samples", block_samples, 1, 1 << 31))
-    audio = simulate_recording(settings, rng, array).audio
-    for start in range(0, len(audio), size):
-        yield audio[start : start + size]
-
-
-def _listen(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Float32Array:
+def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Float32Array:
     """Return what the array records, shape (n, M)."""
     to_emission, to_street, to_channels = rng.spawn(3)
     receiver = _receiver(settings, array, to_channels)

@@ -11,7 +11,7 @@ from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.simulation.camera.rays import View
 from worldstate.adapters.simulation.camera.simulated_detector import Frame
-from worldstate.adapters.simulation.camera.street_view import look_at
+from worldstate.adapters.simulation.camera.street_view import paint_street
 from worldstate.adapters.simulation.camera.vehicle_view import PAINTS, Car, add_car, with_parked_car
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
@@ -50,7 +50,7 @@ def camera_frames(
     # changes is the vehicle, its shadow and the sensor's noise.
     view = View(camera or PinholeCamera())
     paint, parked_paint = (PAINTS[i] for i in rng.integers(len(PAINTS), size=2))
-    street = look_at(settings.site, view)
+    street = paint_street(settings.site, view)
     if settings.parked_car:
         middle = parked_middle_m(recording.detections, settings.site)
         if middle is not None:

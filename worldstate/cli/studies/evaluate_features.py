@@ -13,6 +13,7 @@ from worldstate.cli.common.progress import progress_bar
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_table import FeatureTable
     from worldstate.operations.training.feature_evaluation import Predictions
+    from worldstate.operations.training.methods import Passes
 
 Figures = dict[str, Any]
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
@@ -92,26 +93,33 @@ def run(arguments: argparse.Namespace) -> int:
 def _evaluate_method(
     arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
 ) -> tuple[Figures, "list[Predictions]"]:
-    from worldstate.ground.errors import InvalidArgumentError
-    from worldstate.operations.training.methods import ROWS, row_of
-    from worldstate.studies.features.comparison import (
-        COMPARED,
-        COMPARED_AFAR,
-        comparison,
-        row_predictions,
-        run_passes,
-    )
+    from worldstate.operations.training.methods import row_of
+    from worldstate.studies.features.comparison import comparison, row_predictions
     from worldstate.studies.features.feature_report import report
 
-    for option in ("seeds", "jobs"):
-        if getattr(arguments, option) < 1:
-            raise InvalidArgumentError(f"--{option}: expected at least 1, got {getattr(arguments, option)}")
     row = row_of(arguments.method, arguments.protocol)
+    passes = _passes(arguments, whole, table, row)
+    detail = report(table, passes[row]) if row == "baseline" else {}
+    compared = comparison(table, passes, row, arguments.alpha)
+    origin = _origin(arguments, arguments.method, arguments.protocol, arguments.seeds)
+    return origin | {"row": row} | detail | compared, row_predictions(passes, row)
+
+
+def _passes(
+    arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable", row: str
+) -> "dict[str, Passes]":
+    """Run every seed of the method and of those that it is compared with."""
+    from worldstate.ground.checks import in_range
+    from worldstate.operations.training.methods import ROWS
+    from worldstate.studies.features.comparison import COMPARED, COMPARED_AFAR, run_passes
+
+    in_range("--seeds", arguments.seeds, 1, 10_000)
+    in_range("--jobs", arguments.jobs, 1, 256)
     afar = arguments.protocol == "transfer"
     names = (row,) if row == "baseline" else (row, *(COMPARED_AFAR if afar else COMPARED))
     methods = list(dict.fromkeys(ROWS[name].method for name in names))
     with progress_bar("evaluating", arguments.seeds * len(methods)) as bar:
-        passes = run_passes(
+        return run_passes(
             methods,
             table,
             arguments.protocol,
@@ -121,11 +129,6 @@ def _evaluate_method(
             jobs=arguments.jobs,
             on_pass=bar.advance,
         )
-    detail = report(table, passes[row]) if row == "baseline" else {}
-    compared = comparison(table, passes, row, arguments.alpha)
-    origin = _origin(arguments, arguments.method, arguments.protocol, arguments.seeds)
-    figures = origin | {"row": row} | detail | compared
-    return figures, row_predictions(passes, row)
 
 
 def _evaluate_model(

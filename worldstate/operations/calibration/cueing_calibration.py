@@ -213,16 +213,15 @@ def calibrate_cueing(
     approaches = [stream for stream in streams if stream.before_sight().any()]
     budgets, policies = [], []
     for beta in sorted(MISS_RATES):
-        calm = _statistics(free, reference_prior, beta)
-        tau = correlation_time_hops(calm)
-        hazards = _hazards(approaches, reference_prior, beta)
-        risk = _risk_map(calm, hazards, tau, _risk_of(kept, beta))
-        adaptive, hops = _adaptive(hazards, chosen), chosen.sustain_hops
-        for report in (_budget(calm, alpha, beta, chosen) for alpha in chosen.alphas):
-            budgets.append(report)
-            policies.append(
-                CueingPolicy(report.gamma, hops, report.alpha, reference_prior, risk, beta, adaptive)
-            )
+        calm, hazards = _statistics(free, reference_prior, beta), _hazards(approaches, reference_prior, beta)
+        risk = _risk_map(calm, hazards, correlation_time_hops(calm), _risk_of(kept, beta))
+        adaptive = _adaptive(hazards, chosen)
+        reports = [_budget(calm, alpha, beta, chosen) for alpha in chosen.alphas]
+        budgets += reports
+        policies += [
+            CueingPolicy(one.gamma, chosen.sustain_hops, one.alpha, reference_prior, risk, beta, adaptive)
+            for one in reports
+        ]
     blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
     tau = correlation_time_hops(_statistics(free, reference_prior, 0.0))
     return CueingCalibration(

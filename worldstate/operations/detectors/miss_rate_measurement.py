@@ -194,7 +194,7 @@ class _Tally:
     def _all(self) -> tuple[FloatArray, ...]:
         return self.looks, self.misses, self.sectors, self.clutter
 
-    def look(self, scene: LabelledVideo, number: int, found: DetectionFrame, level: int) -> None:
+    def count(self, scene: LabelledVideo, number: int, found: DetectionFrame, level: int) -> None:
         """Count what was found in a frame at a level."""
         if not self._settings.warm_up <= number < len(scene.reference):
             return
@@ -239,7 +239,7 @@ class _Look:
     def take(self, scene: LabelledVideo, number: int, frame: ImageArray, rng: np.random.Generator) -> None:
         """Degrade a frame, look at it and count."""
         found = self.detector.detect(degrade(frame, self.family, LEVELS[self.level], rng))
-        self.tally.look(scene, number, found, self.level)
+        self.tally.count(scene, number, found, self.level)
 
 
 def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> IntArray:

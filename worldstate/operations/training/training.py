@@ -116,30 +116,44 @@ def train_model(
     (('front', 'left', 'none', 'right'), 'made up')
     """
     rng = np.random.default_rng(settings.seed)
-    compares = settings.method == "worldstate"
     inputs = seen_by(table, settings.method)
-    make: MakeClassifier = site_ensemble if compares else PublishedClassifier
-    passes = []
-    for _ in range(settings.repeats):
-        passes.append(out_of_fold(inputs, folds_by_recording(table, rng), make, rng))
-        on_step()
-    levels = [passes]
-    if compares and len(np.unique(table.environments)) > 1:
-        levels.insert(0, [out_of_fold(inputs, junction_folds(table), make, rng)])
-    fitted = fit_signature(inputs, settings.method, rng)
-    signature = replace(fitted, domain=_domain(table))
+    levels = _out_of_fold_levels(table, inputs, settings, rng, on_step)
+    signature = replace(fit_signature(inputs, settings.method, rng), domain=_domain(table))
     on_step()
     provenance = Provenance(
         dataset=dataset,
         group=group,
-        classifier=ENSEMBLE if compares else CLASSIFIER,
+        classifier=ENSEMBLE if settings.method == "worldstate" else CLASSIFIER,
         scikit_learn=version("scikit-learn"),
         seed=settings.seed,
         training_recordings=tuple(np.unique(table.recording_keys).tolist()),
         excluded_lists=tuple(excluded_lists),
-        figures=_figures(table, signature, passes),
+        figures=_figures(table, signature, levels[-1]),
     )
     return Model(signature, _policies(table, signature, levels, settings), provenance)
+
+
+def _out_of_fold_levels(
+    table: FeatureTable,
+    inputs: FeatureTable,
+    settings: TrainingSettings,
+    rng: np.random.Generator,
+    on_step: Callable[[], None],
+) -> list[list[FloatArray]]:
+    """Posteriors of windows not trained on, from the most careful folds to the boldest: see `between`."""
+    make = maker_of(settings.method)
+    passes = []
+    for _ in range(settings.repeats):
+        passes.append(out_of_fold(inputs, folds_by_recording(table, rng), make, rng))
+        on_step()
+    if settings.method != "worldstate" or len(np.unique(table.environments)) < 2:
+        return [passes]
+    return [[out_of_fold(inputs, junction_folds(table), make, rng)], passes]
+
+
+def maker_of(method: TrainingMethod) -> MakeClassifier:
+    """Return what makes an untrained classifier of a method."""
+    return site_ensemble if method == "worldstate" else PublishedClassifier
 
 
 def _domain(table: FeatureTable) -> ModelDomain | None:

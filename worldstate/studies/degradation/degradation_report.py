@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from worldstate.adapters.files.atomic import atomic_path
+from worldstate.operations.figure_style import figure_file
 
 from .degradation_sweep import SweepRow
 from .degraded_detections import CLEAN, OFF
@@ -52,27 +52,26 @@ def sweep_table(rows: Sequence[SweepRow]) -> str:
 
 def write_sweep_figure(rows: Sequence[SweepRow], path: Path) -> None:
     """Draw awareness and vision alone over the share of misses, and false alarms, by the ending of `path`."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.5, 3.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    staged = [row for row in rows if row.state != OFF]
-    families = sorted({row.state.split()[0] for row in staged} - {CLEAN})
-    for family in families:
-        chosen = [row for row in staged if row.state.split()[0] in (CLEAN, family)]
-        missed = [1.0 - row.vision_only for row in chosen]
-        (line,) = left.plot(missed, [row.awareness for row in chosen], marker="o", label=family)
-        low, high = zip(*(row.awareness_interval for row in chosen), strict=True)
-        left.fill_between(missed, low, high, color=line.get_color(), alpha=0.12, lw=0)
-        d = range(len(chosen))
-        right.plot(d, [row.false_alarms_per_hour for row in chosen], marker="o", color=line.get_color())
-        right.plot(d, [row.false_awareness_per_hour for row in chosen], ls=":", color=line.get_color())
-    left.plot([0.0, 1.0], [1.0, 0.0], color="grey", label="vision alone")
-    left.set(
-        xlabel="share of hops that the detector misses", ylabel="hazard awareness after $T_0$", ylim=(0, 1.02)
-    )
-    left.legend(fontsize="small", loc="lower left")
-    right.set(xlabel="level of the family", ylabel="per hazard-free hour", ylim=(0, None))
-    right.set_title("advisories (solid), awareness (dotted)", fontsize="small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format=path.suffix.lstrip(".") or "png")
+    with figure_file(path, 8.5, 3.4) as figure:
+        left, right = figure.subplots(1, 2)
+        staged = [row for row in rows if row.state != OFF]
+        families = sorted({row.state.split()[0] for row in staged} - {CLEAN})
+        for family in families:
+            chosen = [row for row in staged if row.state.split()[0] in (CLEAN, family)]
+            missed = [1.0 - row.vision_only for row in chosen]
+            (line,) = left.plot(missed, [row.awareness for row in chosen], marker="o", label=family)
+            low, high = zip(*(row.awareness_interval for row in chosen), strict=True)
+            left.fill_between(missed, low, high, color=line.get_color(), alpha=0.12, lw=0)
+            d = range(len(chosen))
+            right.plot(d, [row.false_alarms_per_hour for row in chosen], marker="o", color=line.get_color())
+            aware = [row.false_awareness_per_hour for row in chosen]
+            right.plot(d, aware, ls=":", color=line.get_color())
+        left.plot([0.0, 1.0], [1.0, 0.0], color="grey", label="vision alone")
+        left.set(
+            xlabel="share of hops that the detector misses",
+            ylabel="hazard awareness after $T_0$",
+            ylim=(0, 1.02),
+        )
+        left.legend(fontsize="small", loc="lower left")
+        right.set(xlabel="level of the family", ylabel="per hazard-free hour", ylim=(0, None))
+        right.set_title("advisories (solid), awareness (dotted)", fontsize="small")

@@ -14,17 +14,15 @@ from worldstate.abduction.identifiability.information import (
     state_entropy_bits,
 )
 from worldstate.abduction.signature.published_signature import CLASSES
-from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_information
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
-from worldstate.operations.training.feature_evaluation import MakeClassifier, out_of_fold
-from worldstate.operations.training.methods import site_ensemble
+from worldstate.operations.training.feature_evaluation import out_of_fold
 from worldstate.operations.training.splits import folds_by_recording
-from worldstate.operations.training.training import TrainingMethod, seen_by
+from worldstate.operations.training.training import TrainingMethod, maker_of, seen_by
 
 # A kNN estimate in more dimensions than this is far below the truth at a few hundred windows.
 _COMPONENTS = 3
@@ -118,8 +116,7 @@ def reach_on_data(
 def reach_on_table(table: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> ReachOnData:
     """Bound the error of any classifier of the windows of a table, beside that of a method out of fold."""
     inputs = seen_by(table, method)
-    make: MakeClassifier = site_ensemble if method == "worldstate" else PublishedClassifier
-    posteriors = out_of_fold(inputs, folds_by_recording(inputs, rng), make, rng)
+    posteriors = out_of_fold(inputs, folds_by_recording(inputs, rng), maker_of(method), rng)
     states = np.array([CLASSES.index(label) for label in table.labels.tolist()])
     features = np.log(table.features)
     return reach_on_data(posteriors, states, rng, features=features, groups=table.recording_keys)

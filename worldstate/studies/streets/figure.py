@@ -1,4 +1,4 @@
-"""The figure of the twin: ROC at three horizons, reliability, detection against false alarms, gating."""
+"""The figure of the comparison: ROC, reliability, detection against false alarms, gating of bearings."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import reliability_curve
-from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.typing import FloatArray
+from worldstate.operations.figure_style import figure_file
 from worldstate.operations.recordings.bearing_gating import draw_gating
 
 from .decision_rules import ALPHA, RuleScores, labelled_windows
@@ -20,17 +20,13 @@ if TYPE_CHECKING:
 
 def write_comparison_figure(score: RuleScores, path: Path) -> None:
     """Draw the score and write it as PNG, SVG or PDF, by the ending of `path`."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(14.5, 3.6), layout="constrained")
-    roc, reliability, operating, gating = figure.subplots(1, 4)
-    _draw_roc(roc, score)
-    _draw_reliability(reliability, score)
-    _draw_operating(operating, score)
-    draw_gating(gating, checked_bearings([r for r in score.recordings if not r.hazard_free]))
-    gating.set_title("bearings in view")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format=path.suffix.lstrip(".") or "png")
+    with figure_file(path, 14.5, 3.6) as figure:
+        roc, reliability, operating, gating = figure.subplots(1, 4)
+        _draw_roc(roc, score)
+        _draw_reliability(reliability, score)
+        _draw_operating(operating, score)
+        draw_gating(gating, checked_bearings([r for r in score.recordings if not r.hazard_free]))
+        gating.set_title("bearings in view")
 
 
 def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray, FloatArray]:
