@@ -23,13 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
-    """Return the domain of windows that an array heard at these rates, the ego as the environments say.
-
-    Examples
-    --------
-    >>> domain_of(ovad_array(), [47_998.0], ["SA1", "SB3"]).ego_motion
-    'standing'
-    """
+    """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
     low, high = (1.0 - RATE_TOLERANCE) * min(rates_hz), (1.0 + RATE_TOLERANCE) * max(rates_hz)
     motion = ego_motion_of(environments)
     return ModelDomain(array.name, array.positions_m, (low, high), FEATURE_BAND_HZ, FEATURE_VERSION, motion)

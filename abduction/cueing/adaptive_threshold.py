@@ -109,19 +109,7 @@ class AdaptiveBudget:
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveThreshold:
-    """State of the adaptive threshold.
-
-    Examples
-    --------
-    Ten minutes of empty street without an alarm make it bolder, a false alarm more careful:
-
-    >>> budget, start = AdaptiveBudget(rate_per_hour=6.0), AdaptiveThreshold()
-    >>> round(start.advance(budget, visible=0.1, none=0.8, alarm=False, elapsed_s=600.0).shift_nats, 2)
-    -0.25
-    >>> alarmed = start.advance(budget, visible=0.1, none=0.2, alarm=True, elapsed_s=0.1)
-    >>> round(alarmed.advance(budget, visible=0.1, none=0.8, alarm=False, elapsed_s=0.1).shift_nats, 2)
-    0.25
-    """
+    """State of the adaptive threshold."""
 
     # x_t
     shift_nats: Annotated[float, Check("at most 100 nats", lambda x: abs(x) <= 100.0)] = 0.0

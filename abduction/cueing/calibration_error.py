@@ -124,11 +124,6 @@ def calibration_error_floor(
     ----------
     J. Bröcker and L. A. Smith, "Increasing the reliability of reliability diagrams", Weather and Forecasting
     22, 2007 (resampling under calibration).
-
-    Examples
-    --------
-    >>> round(calibration_error_floor(np.full(400, 0.5), np.random.default_rng(0)), 2)
-    0.02
     """
     return calibration_error_sampling(risk, rng, bins, draws)[0]
 

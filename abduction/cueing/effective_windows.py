@@ -20,12 +20,6 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
     References
     ----------
     Geyer, "Practical Markov chain Monte Carlo", 1992.
-
-    Examples
-    --------
-    >>> white = np.random.default_rng(0).normal(size=(20, 500))
-    >>> round(correlation_time_hops(white), 1), round(correlation_time_hops(np.repeat(white, 10, axis=1)))
-    (1.0, 10)
     """
     # summed while the sums of neighbouring pairs are positive (Geyer's initial positive sequence). N windows
     # tell as much of the mean as N / tau independent ones.

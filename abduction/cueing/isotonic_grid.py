@@ -22,12 +22,6 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
     References
     ----------
     Dykstra and Robertson, "An algorithm for isotonic regression for two or more independent variables", 1982.
-
-    Examples
-    --------
-    >>> isotonic_grid([[0.1, 0.5], [0.3, 0.3]], [[1, 1], [1, 1]])
-    array([[0.1, 0.4],
-           [0.3, 0.4]])
     """
     # by Dykstra's projections onto the two sets in turn, each a pooling of adjacent violators.
     grid = finite_array("values", values, (None, None)).copy()

@@ -39,12 +39,6 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
               \qquad t_+ = \frac{n_+ + 1}{n_+ + 2}, \quad t_- = \frac{1}{n_- + 2}
 
     Shapes: values (n,), positive (n,).
-
-    Examples
-    --------
-    >>> slope, offset = fit_sigmoid([-2.0, -1.0, 1.0, 2.0], [False, False, True, True])
-    >>> round(slope, 2), abs(round(offset, 2))
-    (-0.67, 0.0)
     """
     decision = finite_array("values", values, (None,))
     label = finite_array("positive", positive, decision.shape) > 0.5

@@ -18,13 +18,7 @@ SMALL_SAMPLE = 200
 
 @dataclass(frozen=True, slots=True)
 class IsotonicMap:
-    """Linear between knots, constant beyond them.
-
-    Examples
-    --------
-    >>> IsotonicMap((0.2, 0.6), (0.0, 1.0))(0.3).__round__(3)
-    0.25
-    """
+    """Linear between knots, constant beyond them."""
 
     LAYOUT: ClassVar = Layout(constants={"kind": "isotonic"})
 
@@ -54,11 +48,6 @@ class PlattMap:
     r"""A sigmoid of the statistic's log-odds: two numbers, for small samples.
 
     .. math:: r = 1 / (1 + \exp(a\, \mathrm{logit}(s) + b)), \qquad a \le 0.
-
-    Examples
-    --------
-    >>> PlattMap(-1.0, 0.0)(0.3).__round__(3)
-    0.3
     """
 
     LAYOUT: ClassVar = Layout(constants={"kind": "platt"})
@@ -95,11 +84,6 @@ def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
     ----------
     B. Zadrozny and C. Elkan, "Transforming classifier scores into accurate multiclass probability estimates",
     2002.
-
-    Examples
-    --------
-    >>> fit_isotonic([0.1, 0.2, 0.3, 0.9], [False, True, False, True])(0.25)
-    0.5
     """
     from sklearn.isotonic import IsotonicRegression
 
@@ -118,11 +102,6 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
     References
     ----------
     J. Platt, "Probabilistic outputs for support vector machines", 1999.
-
-    Examples
-    --------
-    >>> round(fit_platt([0.1, 0.2, 0.3, 0.9], [False, True, False, True])(0.9), 2)
-    0.74
     """
     # Errors are those of `fit_isotonic`.
     scores, labels = _checked_sample(statistics, hazards)

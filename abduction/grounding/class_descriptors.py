@@ -31,13 +31,7 @@ REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 / 3.6, 20.0 / 3.6
 
 @dataclass(frozen=True, slots=True)
 class Coupling:
-    """An observable that depends on the radial speed.
-
-    Examples
-    --------
-    >>> Coupling("spacing_hz", (0.0, 10.0), ((0.0, 100.0),), 5.0).expected([5.0])
-    array([[50.]])
-    """
+    """An observable that depends on the radial speed."""
 
     observable: str  # Its name, unit included
     speed_m_s: tuple[float, ...]  # Knots, rising; speed towards the listener is positive
@@ -141,11 +135,6 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
     .. math:: f = \max\Big( f_{idle},\ \frac{n_f\, G\, |v|}{2 \pi R} \Big)
 
     with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
-
-    Examples
-    --------
-    >>> engine_line().expected([10.0]).round(0).ravel()
-    array([149.,  85.,  57.,  44.,  35.])
     """
     speed = np.linspace(-40.0, 40.0, 161)
     per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
@@ -161,11 +150,6 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
 
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
     with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
-
-    Examples
-    --------
-    >>> tyre_noise_shape().expected([5.0, 10.0, 20.0]).round(0)
-    array([[-2.,  3.,  7.]])
     """
     speed = np.linspace(-40.0, 40.0, 161)
     at = np.maximum(np.abs(speed), LOWEST_SPEED_M_S)
@@ -217,11 +201,6 @@ def motorcycle() -> Descriptor:
     -------
     Descriptor
         With the Doppler coupling only.
-
-    Examples
-    --------
-    >>> motorcycle().name
-    'motorcycle'
     """
     return Descriptor("motorcycle", ("motorcycle",), 0.1, 9.0, 5.0, (doppler_trajectory(),))
 

@@ -32,13 +32,7 @@ _RANGES_M = np.geomspace(5.0, 60.0, 24)
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """Density of an observable that belongs to no source; all other densities are relative to it.
-
-    Examples
-    --------
-    >>> round(Background(60.0, 40.0).log_density(60.0), 2)
-    -4.61
-    """
+    """Density of an observable that belongs to no source; all other densities are relative to it."""
 
     mean: float  # Of a broad normal law, in the observable's unit
     std: float
@@ -62,13 +56,7 @@ BACKGROUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class AzimuthPrior:
-    """Prior of a source's azimuth under one explanation: a normal law truncated at +-90 degrees.
-
-    Examples
-    --------
-    >>> AzimuthPrior(0.0, np.inf).log_prior(np.zeros(2)).round(2)
-    array([-0.69, -0.69])
-    """
+    """Prior of a source's azimuth under one explanation: a normal law truncated at +-90 degrees."""
 
     azimuth_rad: float  # Centre, left positive, and standard deviation; infinite for any azimuth alike
     std_rad: float

@@ -9,13 +9,7 @@ from worldstate.ground.values import NotUsable
 
 @dataclass(frozen=True, slots=True)
 class Observable:
-    """A number with its standard deviation, which comes from a bound or from the estimator itself.
-
-    Examples
-    --------
-    >>> Observable(85.0, 1.5).std
-    1.5
-    """
+    """A number with its standard deviation, which comes from a bound or from the estimator itself."""
 
     value: float  # In the unit that the name says
     std: float  # Of the estimate, >= 0

@@ -45,11 +45,6 @@ def entropy_bits(probabilities: ArrayLike) -> float:
     References
     ----------
     C. E. Shannon, "A mathematical theory of communication", Bell Syst. Tech. J. 27, 1948.
-
-    Examples
-    --------
-    >>> entropy_bits([0.5, 0.25, 0.25])
-    1.5
     """
     p = _distribution("probabilities", finite_array("probabilities", probabilities, (None,)))
     positive = p[p > 0.0]

@@ -25,13 +25,7 @@ _ITERATIONS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """View and ridge penalty of one expert.
-
-    Examples
-    --------
-    >>> Recipe("mean", 1e-3).view
-    'mean'
-    """
+    """View and ridge penalty of one expert."""
 
     view: str  # See `Expert`
     ridge: float  # Weight of half the squared norm of the coefficients beside the mean log loss, > 0

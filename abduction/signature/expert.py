@@ -62,11 +62,6 @@ def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatAr
     with phi by `shape_features`.
 
     Shapes: levels (n, features), reference (n, 3 * features).
-
-    Examples
-    --------
-    >>> expert_views(["median"], np.full((1, 2), 3.0), np.array([[0.0, 0.0, 1.0, 2.0, 0.0, 0.0]]))
-    {'median': array([[2., 1.]])}
     """
     summaries = dict(zip(KINDS, np.split(reference, len(KINDS), axis=1), strict=True))
     views = {kind: levels - summary for kind, summary in summaries.items() if kind in wanted}
@@ -83,11 +78,6 @@ def log_softmax(sums: FloatArray) -> FloatArray:
     .. math:: \ell_c = a_c - \log \sum_{c'} e^{a_{c'}}
 
     Shapes: sums (n, classes).
-
-    Examples
-    --------
-    >>> log_softmax(np.zeros((1, 4))).round(3)
-    array([[-1.386, -1.386, -1.386, -1.386]])
     """
     below = sums - sums.max(axis=1, keepdims=True)
     return np.asarray(below - np.log(total(np.exp(below))))

@@ -11,11 +11,5 @@ def mirror_features(X: FloatArray, segments: int = SEGMENTS) -> FloatArray:
     .. math:: \bar x_{s,a} = x_{s, A - 1 - a}
 
     Shapes: X (n, segments * azimuths).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> mirror_features(np.array([[1, 2, 3, 4, 5, 6]]))
-    array([[3, 2, 1, 6, 5, 4]])
     """
     return X.reshape(len(X), segments, -1)[:, :, ::-1].reshape(X.shape)

@@ -21,13 +21,7 @@ SMALLEST_PROBABILITY = 1e-7
 
 
 def class_pairs(n_classes: int) -> list[tuple[int, int]]:
-    """Return all pairs i < j in the order of a one-against-one machine.
-
-    Examples
-    --------
-    >>> class_pairs(3)
-    [(0, 1), (0, 2), (1, 2)]
-    """
+    """Return all pairs i < j in the order of a one-against-one machine."""
     return list(combinations(range(n_classes), 2))
 
 
@@ -35,11 +29,6 @@ def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
     r"""Return class probabilities, shape (n, classes), positive and summing to one.
 
     .. math:: \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2, \qquad \sum_i p_i = 1
-
-    Examples
-    --------
-    >>> couple(np.array([[0.5 / 0.8, 0.5 / 0.7, 0.3 / 0.5]]), 3).round(3)
-    array([[0.5, 0.3, 0.2]])
     """
     bounded = np.clip(pairwise, SMALLEST_PROBABILITY, 1.0 - SMALLEST_PROBABILITY)
     right_side = np.zeros((n_classes + 1, 1))

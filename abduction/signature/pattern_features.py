@@ -14,14 +14,6 @@ def shape_features(levels: FloatArray, segments: int = 2) -> FloatArray:
               w_a \propto e^{4 (x_a - \max x)}, \quad \sum_a w_a = 1
 
     Shapes: levels (n, segments * directions).
-
-    Examples
-    --------
-    >>> rising = np.log([[1.0, 2.0, 1.0, 1.0, 4.0, 1.0]])
-    >>> shape_features(rising).shape
-    (1, 31)
-    >>> shape_features(rising)[:, -2].round(2)  # the peak rises by a factor of two
-    array([0.69])
     """
     # are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
     #

@@ -197,11 +197,6 @@ def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatA
     .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
 
     Shapes: probabilities (n, 4).
-
-    Examples
-    --------
-    >>> [hazard_statistic([[0.5, 0.3, 0.1, 0.1]], beta).round(3).item() for beta in (1.0, 0.0)]
-    [0.4, 0.8]
     """
     posteriors = finite_array("probabilities", probabilities, (None, len(CLASSES)))
     hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]

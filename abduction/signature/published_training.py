@@ -159,11 +159,6 @@ def mirror_hazards(X: FloatArray, y: TextArray) -> tuple[FloatArray, TextArray]:
               \bar x_{s,a} = x_{s, A - 1 - a}
 
     Shapes: X (n, 2 * azimuths), y (n,).
-
-    Examples
-    --------
-    >>> mirror_hazards(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array(["left", "none"]))[1]
-    array(['left', 'none', 'right'], dtype='<U5')
     """
     # Only these two classes are mirrored, as published: hazards become more frequent than they were.
     hazard = np.isin(y, (CLASSES[LEFT], CLASSES[RIGHT]))

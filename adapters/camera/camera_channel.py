@@ -146,11 +146,5 @@ def _scale(rates: MissRates) -> CameraHealth:
 
 
 def any_motion(label: str = "car") -> DetectionFilter:
-    """Return the filter that keeps all boxes of a motion detector, whose score is no confidence.
-
-    Examples
-    --------
-    >>> any_motion().min_score
-    0.0
-    """
+    """Return the filter that keeps all boxes of a motion detector, whose score is no confidence."""
     return DetectionFilter(frozenset({label}), 0.0, 0.0)

@@ -41,15 +41,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth:
-    """Brightness, sharpness and noise of a camera's images, clean and at every staged level: the scale of d.
-
-    Examples
-    --------
-    >>> health = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
-    >>> seen = health.estimate(ImageQuality(brightness=25.0, noise=1.0, sharpness=2.6))
-    >>> seen.blur, seen.darkness, seen.noise
-    (0.25, 0.5, 0.0)
-    """
+    """Brightness, sharpness, noise of a camera's images, clean and at every staged level: the scale of d."""
 
     brightness: float  # Mean grey level of clean images, > 0
     sharpness: tuple[float, ...]  # At the five levels of blur, not rising
@@ -93,17 +85,7 @@ def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> Camer
 
 
 class HealthMonitor:
-    """Track a camera's degradation against a clean reference that follows the daylight.
-
-    Examples
-    --------
-    >>> health = CameraHealth(100.0, (5.0, 2.6, 1.6, 1.2, 1.0), (2.0, 10.0, 25.0, 50.0, 90.0))
-    >>> monitor = HealthMonitor(health, follow_s=60.0)
-    >>> for second in range(600):
-    ...     seen = monitor.update(second * 10**9, ImageQuality(90.0, 2.0, 5.0))
-    >>> round(seen.darkness, 3), round(monitor.reference.brightness)
-    (0.0, 90)
-    """
+    """Track a camera's degradation against a clean reference that follows the daylight."""
 
     # While an image is clean (every d at most `clean`) the brightness and sharpness of reference follow it
     # with time constant `follow_s`, but never by more than a factor `most_drift` from the learned values:
@@ -145,14 +127,7 @@ class HealthMonitor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DegradationLog:
-    """Degradation over time, as the function of the stamp that `VisionQuery` takes.
-
-    Examples
-    --------
-    >>> log = DegradationLog(np.array([0, 10**9]), np.array([0.0, 0.5]))
-    >>> log(-5), log(999_999_999), log(10**12)
-    (0.0, 0.0, 0.5)
-    """
+    """Degradation over time, as the function of the stamp that `VisionQuery` takes."""
 
     stamps_ns: IntArray  # shape (n,): Increasing
     degradation: FloatArray  # shape (n,): d in [0, 1]

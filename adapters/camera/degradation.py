@@ -37,13 +37,7 @@ _QUANTILES = 1 << 16
 
 
 def strength(family: str, degradation: float) -> float:
-    """Return the strength of one of the three families at a degradation d in [0, 1].
-
-    Examples
-    --------
-    >>> strength("blur", 0.5), round(strength("darkness", 0.125), 3), strength("noise", 1.0)
-    (4.0, 0.707, 100.0)
-    """
+    """Return the strength of one of the three families at a degradation d in [0, 1]."""
     # Linear between the levels, darkness in the logarithm.
     level = in_range("degradation", degradation, 0.0, 1.0)
     if family not in STRENGTHS:
@@ -55,13 +49,7 @@ def strength(family: str, degradation: float) -> float:
 
 
 def level_of(family: str, staged: float) -> float:
-    """Return the d in [0, 1] of a strength, the inverse of `strength`; beyond the last level it is 1.
-
-    Examples
-    --------
-    >>> level_of("blur", 4.0), level_of("darkness", 0.5), level_of("noise", 300.0)
-    (0.5, 0.25, 1.0)
-    """
+    """Return the d in [0, 1] of a strength, the inverse of `strength`; beyond the last level it is 1."""
     knots = np.array(STRENGTHS[family])
     if family == "darkness":
         return float(np.interp(-np.log(max(staged, 1e-6)), -np.log(knots), LEVELS))
@@ -77,12 +65,6 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
     exposure next, the sensor last.
 
     Shapes: frame (height, width).
-
-    Examples
-    --------
-    >>> grey = np.full((4, 4), 100, dtype=np.uint8)
-    >>> degrade(grey, "darkness", 0.5, np.random.default_rng(0))[0, 0]
-    np.uint8(25)
     """
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")

@@ -92,18 +92,7 @@ def read_coco_results(
     first_image: int = 0,
     frames: int | None = None,
 ) -> DetectionLog:
-    """Read a COCO results file: ``[{"image_id", "category_id", "bbox": [x, y, w, h], "score"}, ...]``.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     name = Path(folder) / "results.json"
-    ...     _ = name.write_text('[{"image_id": 2, "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}]')
-    ...     log = read_coco_results(name, frames=4)
-    >>> [(frame.labels, frame.boxes_px.tolist()) for frame in log.frames[2:]]
-    [(('car',), [[1.0, 2.0, 4.0, 6.0]]), ((), [])]
-    """
+    """Read a COCO results file: ``[{"image_id", "category_id", "bbox": [x, y, w, h], "score"}, ...]``."""
     name = Path(path)
     found = read_json(name, "a detections file", MAX_BYTES)
     if not isinstance(found, list) or len(found) > MAX_FRAMES * 10:
@@ -126,16 +115,7 @@ def read_yolo_text(
     first_image: int = 0,
     frames: int | None = None,
 ) -> DetectionLog:
-    """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     _ = (Path(folder) / "street_0.txt").write_text("2 0.5 0.5 0.2 0.4 0.9")
-    ...     read_yolo_text(folder, (100, 50)).frames[0].boxes_px.tolist()
-    [[40.0, 15.0, 60.0, 35.0]]
-    """
+    """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
     folder = Path(path)
     numbered = [(file, match) for file in folder.glob("*.txt") if (match := _FRAME_NUMBER.search(file.name))]
     if not numbered or len(numbered) > MAX_FRAMES:

@@ -45,11 +45,6 @@ def overlaps(boxes_px: FloatArray, others_px: FloatArray) -> FloatArray:
     .. math:: IoU = |A \cap B| / |A \cup B|
 
     Shapes: boxes_px, others_px (n, 4).
-
-    Examples
-    --------
-    >>> overlaps(np.array([[0.0, 0.0, 2.0, 2.0]]), np.array([[1.0, 0.0, 3.0, 2.0]])).round(3)
-    array([[0.333]])
     """
     low = np.maximum(boxes_px[:, None, :2], others_px[None, :, :2])
     high = np.minimum(boxes_px[:, None, 2:], others_px[None, :, 2:])
@@ -59,14 +54,7 @@ def overlaps(boxes_px: FloatArray, others_px: FloatArray) -> FloatArray:
 
 
 def suppress(boxes_px: FloatArray, scores: FloatArray, most_overlap: float) -> IntArray:
-    """Return the indices after non-maximum suppression of boxes (n, 4) by scores (n,), the best first.
-
-    Examples
-    --------
-    >>> boxes = np.array([[0.0, 0.0, 2.0, 2.0], [0.1, 0.0, 2.0, 2.0], [5.0, 5.0, 6.0, 6.0]])
-    >>> suppress(boxes, np.array([0.5, 0.9, 0.4]), most_overlap=0.5)
-    array([1, 2])
-    """
+    """Return the indices after non-maximum suppression of boxes (n, 4) by scores (n,), the best first."""
     left = np.argsort(-scores, kind="stable")
     kept = []
     while left.size:

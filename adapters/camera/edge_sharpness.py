@@ -15,13 +15,7 @@ _CONTRAST_PERCENTILE = 75.0
 
 
 def difference(frame: ImageArray, background: ImageArray) -> Float32Array:
-    """Return the largest difference over the colours between a frame and its background, (height, width).
-
-    Examples
-    --------
-    >>> difference(np.full((4, 4), 9, np.uint8), np.full((4, 4), 2, np.uint8))[0, 0]
-    np.float32(7.0)
-    """
+    """Return the largest difference over the colours between a frame and its background, (height, width)."""
     if frame.shape != background.shape:
         raise InvalidArgumentError(f"background: expected the shape {frame.shape}, got {background.shape}")
     cv2 = opencv()
@@ -42,14 +36,6 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
     change many pixels, but by less from each to the next.
 
     Shapes: apart (height, width), region (height, width).
-
-    Examples
-    --------
-    >>> sharp, region = np.zeros((60, 80), np.float32), np.zeros((60, 80), bool)
-    >>> sharp[20:40, 20:60], region[20:40, 20:60] = 100.0, True
-    >>> soft = opencv().GaussianBlur(sharp, (0, 0), 8.0)
-    >>> [round(outlined_share(image, region, width_px=6.0), 1) for image in (sharp, soft)]
-    [1.0, 0.0]
     """
     # A pixel of the outline is an edge if within `width_px` of it the change rises by its whole contrast over
     # at most that width: regions without a gradient at their boundary are changes of the light (Javed,

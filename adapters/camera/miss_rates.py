@@ -31,14 +31,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True, slots=True)
 class FamilyCounts:
-    """Counts of one family of degradations.
-
-    Examples
-    --------
-    >>> counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
-    >>> counts.miss_rates().round(2).tolist(), round(counts.clutter_rates[0].item(), 3)
-    ([[0.05, 0.14, 0.23, 0.5, 0.95]], 0.005)
-    """
+    """Counts of one family of degradations."""
 
     # Number of reference objects, and of those not detected; rows are azimuth bins, columns levels of
     # degradation.

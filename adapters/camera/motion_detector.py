@@ -24,13 +24,7 @@ Background = Literal["mog2", "knn"]
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
-    """Settings of the motion detector.
-
-    Examples
-    --------
-    >>> MotionSettings(label="road user").background
-    'mog2'
-    """
+    """Settings of the motion detector."""
 
     # Model of the background: Gaussian mixtures or nearest neighbours, both OpenCV's.
     background: Background = "mog2"

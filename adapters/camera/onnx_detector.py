@@ -36,13 +36,7 @@ class Session(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class OnnxSettings:
-    """Classes, thresholds and input size of a model.
-
-    Examples
-    --------
-    >>> OnnxSettings(labels=("car", "bicycle")).min_score
-    0.25
-    """
+    """Classes, thresholds and input size of a model."""
 
     labels: tuple[str, ...]  # Names of the classes in the order of the model
     min_score: float = 0.25  # Lowest score that is reported
@@ -197,13 +191,6 @@ def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, 
     r"""Turn the raw output of a YOLO model into boxes.
 
     Shapes: returns (n, 4).
-
-    Examples
-    --------
-    >>> one = np.array([[[50.0], [40.0], [20.0], [10.0], [0.1], [0.9]]])
-    >>> boxes, scores, labels = decode_yolo(one, classes=2)
-    >>> boxes.tolist(), scores.tolist(), labels.tolist()
-    ([[40.0, 35.0, 60.0, 45.0]], [0.9], [1])
     """
     # Three forms are told apart by their shape, with C classes and n candidates: (1, 4 + C, n), centre and
     # size with a score a class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6),

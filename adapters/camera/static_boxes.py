@@ -14,13 +14,7 @@ from .detections import STAMP_SLACK_NS, DetectionFilter, DetectionLog
 
 @dataclass(frozen=True, slots=True)
 class ParkedRule:
-    """A box is parked when a box stood at its place in `share` of the frames of the last `span_s` seconds.
-
-    Examples
-    --------
-    >>> ParkedRule().tolerance_px
-    5.0
-    """
+    """A box is parked when a box stood at its place in `share` of the frames of the last `span_s` seconds."""
 
     # For a standing camera: from a moving one every box moves, and none is parked.
 
@@ -36,16 +30,7 @@ class ParkedRule:
 
 
 def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule) -> BoolArray:
-    """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,).
-
-    Examples
-    --------
-    >>> from worldstate.adapters.camera.detections import DetectionFrame
-    >>> still = DetectionFrame(np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9]), ("car",))
-    >>> log = DetectionLog.at_rate([still] * 20, frame_rate_hz=10.0)
-    >>> [parked(log, i, still.boxes_px, ParkedRule()).tolist() for i in (9, 10)]
-    [[False], [True]]
-    """
+    """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,)."""
     since_ns = int(log.stamps_ns[frame]) - nanoseconds(rule.span_s)
     first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
     past = log.frames[first:frame]

@@ -173,16 +173,7 @@ class OvadDataset:
 
 
 def read_id_list(path: str | Path) -> frozenset[str]:
-    r"""Read the IDs of an official list: a CSV file with a column ID.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     _ = (Path(folder) / "test.csv").write_text("ID\n1_00_0002\n1_00_0003\n")
-    ...     sorted(read_id_list(Path(folder) / "test.csv"))
-    ['1_00_0002', '1_00_0003']
-    """
+    r"""Read the IDs of an official list: a CSV file with a column ID."""
     name = Path(path)
     ids = [_identifier(name, line, row["ID"]) for line, row in read_rows(name, ("ID",))]
     _refuse_duplicates(name, ids)
@@ -190,13 +181,7 @@ def read_id_list(path: str | Path) -> frozenset[str]:
 
 
 def to_base_link(ovad_azimuth_rad: FloatArray) -> FloatArray:
-    """Turn azimuths that grow to the right, as OVAD counts them, into left-positive ones.
-
-    Examples
-    --------
-    >>> np.degrees(to_base_link(np.radians([-90.0, 0.0, 30.0]))).round(6)
-    array([ 90.,   0., -30.])
-    """
+    """Turn azimuths that grow to the right, as OVAD counts them, into left-positive ones."""
     return wrap_angle(-np.asarray(ovad_azimuth_rad, dtype=np.float64)) + 0.0
 
 

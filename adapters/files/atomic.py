@@ -16,17 +16,7 @@ from worldstate.ground.errors import InputFileError
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Lend a temporary sibling of `path`; it takes the name on success and disappears on error.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     with atomic_path(Path(folder) / "states.jsonl") as temporary:
-    ...         _ = temporary.write_text("{}")
-    ...     [p.name for p in Path(folder).iterdir()]
-    ['states.jsonl']
-    """
+    """Lend a temporary sibling of `path`; it takes the name on success and disappears on error."""
     # The sibling keeps the suffix, because writers such as ``numpy.savez`` and ``soundfile`` look at it.
     target = check_target(path)
     temporary = target.with_name(f".{target.stem[:100]}-{uuid.uuid4().hex[:12]}{target.suffix}")
@@ -66,16 +56,7 @@ def check_target(path: str | Path) -> Path:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 with plain newlines, whole or not at all.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     write_text(Path(folder) / "note.txt", "hidden")
-    ...     (Path(folder) / "note.txt").read_text()
-    'hidden'
-    """
+    """Write `text` as UTF-8 with plain newlines, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 

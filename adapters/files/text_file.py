@@ -6,16 +6,7 @@ from worldstate.ground.errors import InputFileError
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
-    """Return what a file in UTF-8 of at most so many bytes holds.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     _ = (Path(folder) / "a.txt").write_text("hidden")
-    ...     read_text(Path(folder) / "a.txt", "a note", 1 << 10)
-    'hidden'
-    """
+    """Return what a file in UTF-8 of at most so many bytes holds."""
     try:
         with Path(path).open("rb") as file:
             data = file.read(max_bytes + 1)

@@ -33,13 +33,7 @@ LEAST_SWING_DB = 3.0
 
 @dataclass(frozen=True, slots=True)
 class DopplerSettings:
-    """Conditions under which a Doppler shift is accepted.
-
-    Examples
-    --------
-    >>> DopplerSettings(min_partials=3).min_partials
-    3
-    """
+    """Conditions under which a Doppler shift is accepted."""
 
     min_windows: int = 12  # Fewest windows in the track: three for each parameter of the S-curve
     min_share: float = 0.6  # Least share of windows in which the line was found

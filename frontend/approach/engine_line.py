@@ -29,14 +29,7 @@ MAX_SAMPLES = 200_000_000
 
 @dataclass(frozen=True, slots=True)
 class HarmonicTrack:
-    """Fundamental over time; windows without a usable partial are left out.
-
-    Examples
-    --------
-    >>> one = np.ones(1)
-    >>> HarmonicTrack(one, 60.0 * one, 0.01 * one, one.astype(int), 0.0 * one, 0.0 * one, windows=3).windows
-    3
-    """
+    """Fundamental over time; windows without a usable partial are left out."""
 
     time_s: FloatArray  # Centre of each window from the first sample, on the receiver's clock
     frequency_hz: FloatArray  # Fundamental

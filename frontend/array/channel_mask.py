@@ -15,14 +15,7 @@ from worldstate.ground.typing import BoolArray, Complex64Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelMask:
-    """Microphones that are used.
-
-    Examples
-    --------
-    >>> mask = ChannelMask(np.array([True, False, True, True]))
-    >>> mask.n_kept, round(mask.power_scale, 3), mask.pair_scale
-    (3, 1.778, 2.0)
-    """
+    """Microphones that are used."""
 
     keep: BoolArray  # shape (M,): False for those left out
 

@@ -21,12 +21,6 @@ def default_band_hz(array: MicrophoneArray, sample_rate_hz: float) -> tuple[floa
               n = \Big\lfloor \log_2 \frac{f_{alias}}{1800\,\mathrm{Hz}} \Big\rfloor \in [0, 2]
 
     Shapes: returns (2,).
-
-    Examples
-    --------
-    >>> board = MicrophoneArray([[0.02 * i, 0.02 * j, 0] for i in range(4) for j in range(4)])
-    >>> default_band_hz(board, 48_000.0)
-    (1200.0, 7200.0)
     """
     # Whole octaves, so that arrays of about the paper's spacing keep the paper's band exactly.
     low, high = BAND_HZ

@@ -58,13 +58,7 @@ class PairDelays:
 
 
 def all_pairs(microphones: int) -> IndexArray:
-    """Return every pair i < j, shape (M (M - 1) / 2, 2).
-
-    Examples
-    --------
-    >>> all_pairs(3).tolist()
-    [[0, 1], [0, 2], [1, 2]]
-    """
+    """Return every pair i < j, shape (M (M - 1) / 2, 2)."""
     if microphones < 2:
         raise InvalidArgumentError(f"microphones: expected at least 2, got {microphones}")
     return np.column_stack(np.triu_indices(microphones, k=1))

@@ -32,11 +32,6 @@ def covariance(spectra: ArrayLike) -> ComplexArray:
     r"""Average the spatial covariance over frames: :math:`R_b = \langle x_b x_b^H \rangle`.
 
     Shapes: spectra (frames, bins, M).
-
-    Examples
-    --------
-    >>> covariance([[[1, 1j]], [[1, 1j]]]).tolist()
-    [[[(1+0j), -1j], [1j, (1+0j)]]]
     """
     X = _checked_spectra(spectra)
     by_bin = np.ascontiguousarray(X.transpose(1, 2, 0))
@@ -51,12 +46,6 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
     T)^3 cheaper.
 
     Shapes: spectra (frames, bins, M).
-
-    Examples
-    --------
-    >>> subspace = signal_subspace([[[2, 2j]], [[2, 2j]]], sources=1)
-    >>> float(subspace.eigenvalues[0, 0].round(6))
-    8.0
     """
     X = _checked_spectra(spectra)
     frames, _, microphones = X.shape
@@ -81,11 +70,6 @@ def covariance_subspace(covariance_matrix: ArrayLike, sources: int) -> Subspace:
     .. math:: R\, e_i = \lambda_i e_i, \quad \lambda_i \le \lambda_{i+1}, \qquad E_s = [e_{M-k+1} \dots e_M]
 
     Shapes: covariance_matrix (bins, M, M).
-
-    Examples
-    --------
-    >>> covariance_subspace([np.diag([1.0, 5.0])], 1).eigenvalues.tolist()
-    [[5.0]]
     """
     R = finite_complex("covariance", covariance_matrix, (None, None, None))
     if R.shape[1] != R.shape[2]:

@@ -7,14 +7,7 @@ Item = TypeVar("Item")
 
 
 class GuardDelay(Generic[Item]):
-    r"""Queue of hops with the weight :math:`w'_n = \min(w_n, \dots, w_{n + hops})` over the guard interval.
-
-    Examples
-    --------
-    >>> guard: GuardDelay[str] = GuardDelay(1)
-    >>> [guard.push(item, weight) for item, weight in (("a", 1.0), ("b", 0.4), ("c", 0.9))]
-    [None, ('a', 0.4), ('b', 0.4)]
-    """
+    r"""Queue of hops, weighted :math:`w'_n = \min(w_n, \dots, w_{n + hops})` over the guard interval."""
 
     # Without it a source is learned as noise in the moments before it is detected.
 

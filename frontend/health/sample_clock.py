@@ -55,11 +55,6 @@ def rate_from_duration(
     r"""Estimate the sample rate from the duration of a recording by another clock, such as a camera's.
 
     .. math:: \hat f_s = n / T, \qquad \sigma_{\hat f} = \hat f_s\, \sigma_T / T
-
-    Examples
-    --------
-    >>> rate_from_duration(28_798_800, 600.0, 0.001, 48_000.0)
-    RateEstimate(rate_hz=47998.0, std_hz=0.0799..., nominal_hz=48000.0)
     """
     in_range("duration_s", duration_s, 0.0, math.inf, open_low=True, open_high=True)
     in_range("duration_std_s", duration_std_s, 0.0, math.inf, open_low=True, open_high=True)

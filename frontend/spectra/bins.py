@@ -6,13 +6,7 @@ from worldstate.ground.errors import InvalidArgumentError
 
 
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
-    """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded.
-
-    Examples
-    --------
-    >>> band_bins((50, 1500), 47_998, 512), band_bins((300, 1800), 47_998, 512)
-    (range(1, 16), range(3, 19))
-    """
+    """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded."""
     low, high = (int(np.round(frequency / sample_rate_hz * nfft)) for frequency in band_hz)
     if not 0 <= low < high:
         raise InvalidArgumentError(
@@ -26,11 +20,5 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
 
 
 def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
-    """Centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,).
-
-    Examples
-    --------
-    >>> bin_frequencies_hz(range(1, 4), 48_000, 512)
-    array([ 93.75, 187.5 , 281.25])
-    """
+    """Centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,)."""
     return np.arange(bins.start, bins.stop) * (sample_rate_hz / nfft)

@@ -22,13 +22,7 @@ def power(spectra: Complex64Array) -> Float32Array:
 
 
 def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Complex64Array:
-    r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
-
-    Examples
-    --------
-    >>> whiten(np.array([3 + 4j, 0], np.complex64))
-    array([0.6+0.8j, 0. +0.j ], dtype=complex64)
-    """
+    r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero."""
     squared = power(spectra) if powers is None else powers
     weights = np.maximum(squared, _POWER_FLOOR)
     np.sqrt(weights, out=weights)

@@ -8,11 +8,6 @@ def after_empty_look(existence: float, miss_rate: float) -> float:
 
     .. math:: r \leftarrow \frac{r \beta}{r \beta + 1 - r} = \frac{r (1 - p_D)}{1 - r\, p_D},
         \qquad p_D = 1 - \beta
-
-    Examples
-    --------
-    >>> round(after_empty_look(0.788, 0.1), 3)
-    0.271
     """
     # At r = 1 and beta = 0 the ratio is 0/0; what certainly exists stays.
     missed = existence * miss_rate
@@ -23,11 +18,6 @@ def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> f
     r"""Return the existence after a detection.
 
     .. math:: r \leftarrow \frac{r\, (1 - \beta (1 - c))}{r\, (1 - \beta (1 - c)) + (1 - r)\, c}
-
-    Examples
-    --------
-    >>> round(after_sighting(0.5, 0.04, 0.01), 3)
-    0.99
     """
     # A look finds something where the entity is detected or, if it is missed, where there is clutter.
     found = existence * (1.0 - miss_rate * (1.0 - clutter_rate))

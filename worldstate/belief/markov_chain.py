@@ -22,16 +22,7 @@ LONGEST_STEP_S = 1000.0
 
 @lru_cache(maxsize=64)
 def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
-    r"""Return Q, shape (2K + 2, 2K + 2), 1/s: row i holds the rates out of state i and sums to zero.
-
-    Examples
-    --------
-    >>> generator((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 1)
-    array([[-0.4 ,  0.3 ,  0.  ,  0.1 ],
-           [ 0.05, -0.35,  0.  ,  0.3 ],
-           [ 0.05,  0.  , -0.35,  0.3 ],
-           [ 0.05,  0.  ,  0.05, -0.1 ]])
-    """
+    r"""Return Q, shape (2K + 2, 2K + 2), 1/s: row i holds the rates out of state i and sums to zero."""
     arrival, emergence, departure, reocclusion, visible_arrival, visible_departure = rates_hz
     hidden, emerged = np.arange(directions), np.arange(directions, 2 * directions)
     elsewhere, none = 2 * directions, 2 * directions + 1
@@ -49,13 +40,7 @@ def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
-    r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only.
-
-    Examples
-    --------
-    >>> transition((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2, 100_000_000).sum(axis=1).round(12)
-    array([1., 1., 1., 1., 1., 1.])
-    """
+    r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only."""
     # Imported where it is needed: scipy.linalg takes as long to import as numpy.
     from scipy.linalg import expm
 
@@ -68,12 +53,6 @@ def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
-    """Return the distribution that the chain reaches from "none" after a long time, shape (2K + 2,).
-
-    Examples
-    --------
-    >>> equilibrium((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 2).round(3)
-    array([0.088, 0.088, 0.076, 0.076, 0.084, 0.588])
-    """
+    """Return the distribution that the chain reaches from "none" after a long time, shape (2K + 2,)."""
     settled: FloatArray = transition(rates_hz, directions, 10**12)[-1]
     return settled

@@ -31,15 +31,7 @@ def _covariance(row: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionBelief:
-    """Gaussian over (theta, theta_dot, rho, log r), the modified polar coordinates of `polar`.
-
-    Examples
-    --------
-    >>> belief = MotionBelief.around((0.9, 0.0, -0.2, 3.2), (0.35, 0.1, 0.2, 0.6))
-    >>> belief = update_azimuth(belief, 0.6, 0.2, weight=1.0)
-    >>> round(belief.azimuth_rad, 3), round(belief.azimuth_std_rad, 3)
-    (0.674, 0.174)
-    """
+    """Gaussian over (theta, theta_dot, rho, log r), the modified polar coordinates of `polar`."""
 
     # shape (4,): theta wrapped into (-pi, pi]
     mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]

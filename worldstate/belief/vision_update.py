@@ -36,13 +36,7 @@ class VisionUpdate:
 
 
 def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
-    """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats.
-
-    Examples
-    --------
-    >>> log_co_evidence(Absent(miss_rate=0.04), 2).round(2)
-    array([ 0.  ,  0.  , -3.22,  0.  ])
-    """
+    """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
     hidden, visible, none = answer.log_likelihoods().tolist()
     return np.array([*[hidden] * directions, visible, none])
 

@@ -8,15 +8,7 @@ from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Keep BLAS on the calling thread while inside; afterwards as it was.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> with one_blas_thread():
-    ...     np.ones((2, 2)) @ np.ones(2)
-    array([2., 2.])
-    """
+    """Keep BLAS on the calling thread while inside; afterwards as it was."""
     # The front-end multiplies thousands of small matrices a second. A second BLAS thread gains nothing there,
     # and where other programs keep the processor busy every product would wait for it to be scheduled
     # (measured on two busy cores: four times the processor time). It also keeps results the same bit for bit

@@ -39,14 +39,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A pinhole camera with a few rays a pixel.
-
-    Examples
-    --------
-    >>> view = View(PinholeCamera(width_px=64, height_px=40))
-    >>> view.shape, view.rays(Patch(0, 80, 0, 128)).shape
-    ((80, 128), (80, 128, 3))
-    """
+    """A pinhole camera with a few rays a pixel."""
 
     camera: PinholeCamera  # Size of the image, angle of view, place and direction
 
@@ -139,14 +132,6 @@ def cast_solid(
     r"""Meet a convex solid :math:`\{p : n_k \cdot p \le o_k\}`.
 
     Shapes: rays (rows, columns, 3), eye_m (3,), normals, offsets (K, 3), returns (rows, columns).
-
-    Examples
-    --------
-    >>> rays = np.array([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]], np.float32)
-    >>> normals = np.concatenate([np.eye(3), -np.eye(3)])
-    >>> reach, face = cast_solid(rays, np.array([-5.0, 0.0, 0.0]), normals, np.ones(6))
-    >>> reach.tolist(), int(face[0, 0])
-    ([[4.0, inf]], 3)
     """
     enter, leave = np.full(rays.shape[:2], -np.inf, np.float32), np.full(rays.shape[:2], np.inf, np.float32)
     face = np.zeros(rays.shape[:2], np.intp)

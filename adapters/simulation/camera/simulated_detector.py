@@ -93,13 +93,7 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
 
 
 def to_json(frames: list[Frame]) -> dict[str, Any]:
-    """Return the detections under the keys of OVAD's `camera_baseline_results.json`.
-
-    Examples
-    --------
-    >>> to_json([()])
-    {'detections_per_frame': [{'boxes': [], 'scores': [], 'classes_str': []}]}
-    """
+    """Return the detections under the keys of OVAD's `camera_baseline_results.json`."""
     rows = [
         {
             "boxes": [list(seen.box_px) for seen in frame],

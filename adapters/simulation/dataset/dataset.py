@@ -208,17 +208,7 @@ def write_recording(
 
 
 def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
-    """Write `DataLog.csv`, which lists the recordings of a data set.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as root:
-    ...     write_log(root, [LogRow("1_00_0002", "SA1", "left", 70)])
-    ...     print(Path(root, "DataLog.csv").read_text(), end="")
-    ID,Environment,Class,T0
-    1_00_0002,SA1,left,70
-    """
+    """Write `DataLog.csv`, which lists the recordings of a data set."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)

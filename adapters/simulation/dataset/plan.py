@@ -110,11 +110,5 @@ class DatasetSettings:
 
 
 def plan_static(n_static: int, seed: int) -> list[Plan]:
-    """Plan recordings at junctions: every other one an approach, left and right in turn, site after site.
-
-    Examples
-    --------
-    >>> [(p.environment, p.approach) for p in plan_static(4, 1)]
-    [('SA1', 'left'), ('SA1', 'none'), ('SA2', 'right'), ('SA2', 'none')]
-    """
+    """Plan recordings at junctions: every other one an approach, left and right in turn, site after site."""
     return DatasetSettings(n_static=n_static, seed=seed).plans()

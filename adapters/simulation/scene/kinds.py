@@ -121,13 +121,7 @@ KINDS = {kind.name: kind for kind in (LIGHT, MEDIUM, HEAVY, ELECTRIC, BICYCLE, T
 
 
 def vehicle_kind(name: str) -> VehicleKind:
-    """Return a kind by its name.
-
-    Examples
-    --------
-    >>> vehicle_kind("tram").label
-    'train'
-    """
+    """Return a kind by its name."""
     if name not in KINDS:
         raise InvalidArgumentError(f"kind: expected one of {', '.join(KINDS)}, got {name!r}")
     return KINDS[name]

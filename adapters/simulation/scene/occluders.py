@@ -19,13 +19,7 @@ MAX_CORNERS = 16
 
 @dataclass(frozen=True, slots=True)
 class OccludingBody:
-    """A convex outline on the ground.
-
-    Examples
-    --------
-    >>> box(6.0, 12.0, -1.25, 1.25).corners_m[0]
-    (6.0, -1.25)
-    """
+    """A convex outline on the ground."""
 
     corners_m: tuple[tuple[float, float], ...]  # x ahead and y left of every corner, 2 (a thin screen) to 16
 
@@ -46,14 +40,7 @@ def hidden_by(
     y_m: FloatArray,
     eye_m: tuple[float | FloatArray, float],
 ) -> BoolArray:
-    """Tell when a body stands between an eye and a point that moves, shape (T,).
-
-    Examples
-    --------
-    >>> x, y = np.array([20.0, 20.0]), np.array([0.0, 6.0])
-    >>> hidden_by([box(6, 12, -1, 1)], x, y, (0.0, 0.0))
-    array([ True, False])
-    """
+    """Tell when a body stands between an eye and a point that moves, shape (T,)."""
     hidden = np.zeros(np.shape(y_m), np.bool_)
     for occluder in occluders:
         hidden |= _crosses(*_offsets(occluder, x_m, y_m, eye_m))
@@ -63,14 +50,7 @@ def hidden_by(
 def detours(
     occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
 ) -> tuple[FloatArray, NDArray[np.int_]]:
-    """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each.
-
-    Examples
-    --------
-    >>> x, y = np.full(3, 20.0), np.array([0.0, 1.7, 6.0])
-    >>> detours(box(6, 12, -1, 1), x, y, (0.0, 0.0))[0].round(2)
-    array([ 0.12,  0.03, -0.07])
-    """
+    """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each."""
     # The detour is negative where the line is clear; it passes through 0 where the line touches the body.
     offset, along = _offsets(occluder, x_m, y_m, end_m)
     via = np.array([_via(x, y, x_m, y_m, end_m) for x, y in occluder.corners_m])

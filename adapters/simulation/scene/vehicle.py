@@ -86,12 +86,6 @@ def drive(
     """Pass `entry_y_m` at `entry_s`, braking at a constant rate during the two seconds before.
 
     Shapes: time_s (T,).
-
-    Examples
-    --------
-    >>> path = drive(np.linspace(0, 8, 801), entry_s=7, entry_y_m=4, lane_x_m=6, speed_mps=10)
-    >>> round(float(np.interp(6, path.time_s, path.front_y_m)), 2)
-    14.0
     """
     heading = -1 if entry_y_m > 0 else 1
     slowed = braking_mps2 * np.clip(time_s - (entry_s - 2.0), 0.0, 2.0)
@@ -103,17 +97,7 @@ def drive(
 
 
 def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = np.inf) -> Trajectory:
-    """Drive along another route as `passing` drives along its lane, slowly where the route has an end.
-
-    Examples
-    --------
-    >>> from worldstate.adapters.simulation.scene.route import along
-    >>> time = np.linspace(0, 20, 2001)
-    >>> passing = drive(time, entry_s=5, entry_y_m=4, lane_x_m=6, speed_mps=8)
-    >>> path = follow(passing, 4.0, along([[6, 8], [6, 2]], 4.0), 2.0)
-    >>> round(float(path.driven_m[-1]), 1), round(float(path.speed_mps[-1]), 1)
-    (2.0, 0.0)
-    """
+    """Drive along another route as `passing` drives along its lane, slowly where the route has an end."""
     step = passing.time_s[1] - passing.time_s[0]
     driven = (passing.front_y_m - entry_y_m) * passing.heading
     speed = passing.speed_mps.copy()
@@ -136,25 +120,13 @@ def _turn_speed(driven_m: float, end_m: float) -> float:
 
 
 def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
-    """Sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T).
-
-    Examples
-    --------
-    >>> rolling_level_db(np.array([70 / 3.6]))[4].round(1)
-    array([100.1])
-    """
+    """Sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T)."""
     speed_kmh = np.maximum(3.6 * speed_mps, SLOWEST_KMH)
     return _octaves(kind.rolling_a_db) + _octaves(kind.rolling_b_db) * np.log10(speed_kmh / REFERENCE_KMH)
 
 
 def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
-    """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T).
-
-    Examples
-    --------
-    >>> propulsion_level_db(np.array([70 / 3.6]))[0].round(1)
-    array([97.9])
-    """
+    """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T)."""
     relative = 3.6 * speed_mps / REFERENCE_KMH - 1.0
     return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative
 

@@ -32,11 +32,6 @@ def emission_times(
     """Solve t = t_e + r(t_e) / c for the emission times t_e of given receive times.
 
     Shapes: receive_s (K,), emit_s, travel_m (T,).
-
-    Examples
-    --------
-    >>> emission_times(np.array([1.0]), np.array([0.0, 2.0]), np.array([34.3, 34.3]), 343.0)
-    array([0.9])
     """
     return np.interp(receive_s, emit_s + travel_m / speed_mps, emit_s, left=np.nan, right=np.nan)
 

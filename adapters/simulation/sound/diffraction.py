@@ -16,11 +16,6 @@ def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: 
     References
     ----------
     U. J. Kurze and G. S. Anderson, "Sound attenuation by barriers", Applied Acoustics 4 (1971), eq. (13).
-
-    Examples
-    --------
-    >>> screen_attenuation_db(np.array([0.0, 1.0, -1.0]), np.array(1000.0)).round(1)
-    array([ 5. , 20.6,  0. ])
     """
     # In the light (N < 0) tanh turns into tan and the attenuation falls to 0 dB at N about -0.2, so it is
     # continuous through the shadow boundary, where it is 5 dB.

@@ -18,13 +18,7 @@ TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
 
 
 def sphere(count: int) -> FloatArray:
-    """Evenly spread unit vectors on a Fibonacci spiral, shape (count, 3).
-
-    Examples
-    --------
-    >>> sphere(100).mean(axis=0).round(3) + 0.0
-    array([0., 0., 0.])
-    """
+    """Evenly spread unit vectors on a Fibonacci spiral, shape (count, 3)."""
     index = np.arange(count) + 0.5
     z = 1.0 - 2.0 * index / count
     turn = np.pi * (1.0 + np.sqrt(5.0)) * index

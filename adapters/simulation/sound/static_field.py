@@ -24,28 +24,12 @@ def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArr
     """Delay of plane waves at every microphone against the array's centre, shape (Q, M), s.
 
     Shapes: directions (Q, 3), offsets_m (M, 3).
-
-    Examples
-    --------
-    >>> plane_wave_delays(np.array([[1.0, 0, 0]]), np.array([[0.343, 0, 0]]))
-    array([[-0.001]])
     """
     return -(directions @ offsets_m.T) / SPEED_OF_SOUND_MPS
 
 
 class StaticSources:
-    """Sources that wait to be rendered together.
-
-    Examples
-    --------
-    >>> out, click = np.zeros((2, 8000), np.float32), np.zeros((1, 8000), np.float32)
-    >>> click[0, 5000] = 1.0
-    >>> waiting = StaticSources(out, 8000.0)
-    >>> waiting.add(click, np.array([[0.0, 0.005]]))
-    >>> waiting.render()
-    >>> out.argmax(axis=1)
-    array([5000, 5040])
-    """
+    """Sources that wait to be rendered together."""
 
     def __init__(self, out: Float32Array, sample_rate_hz: float) -> None:
         self._out, self._rate = out, sample_rate_hz

@@ -37,13 +37,7 @@ def progress_bar(description: str, total: float | None, *, quiet: bool = False) 
 
 
 def track(items: Iterable[Item], description: str, total: float) -> Iterator[Item]:
-    """Yield the items, a step of a progress bar for each.
-
-    Examples
-    --------
-    >>> list(track(range(3), "counting", 3))
-    [0, 1, 2]
-    """
+    """Yield the items, a step of a progress bar for each."""
     with progress_bar(description, total) as bar:
         for item in items:
             yield item

@@ -49,12 +49,6 @@ def false_alarm_rate(
     .. math:: [\chi^2_{.025}(2n),\ \chi^2_{.975}(2n + 2)] / 2T.
 
     Shapes: hazard_free (windows,).
-
-    Examples
-    --------
-    >>> rate = false_alarm_rate([[0.1, 0.9, 0.9, 0.1] * 900], gamma=0.5)
-    >>> rate.onsets, rate.hours, rate.window_rate
-    (900, 0.1, 0.5)
     """
     # With n onsets in T hours the interval is Garwood's,
     from scipy.stats import chi2

@@ -9,14 +9,7 @@ from worldstate.ground.typing import IntArray
 
 
 def recording_folds(labels: Sequence[str], folds: int, rng: np.random.Generator) -> IntArray:
-    """Deal recordings to folds at random, each label in its turn.
-
-    Examples
-    --------
-    >>> dealt = recording_folds(["left", "none", "left", "none"], 2, np.random.default_rng(0))
-    >>> sorted(dealt[[0, 2]].tolist()), sorted(dealt[[1, 3]].tolist())
-    ([0, 1], [0, 1])
-    """
+    """Deal recordings to folds at random, each label in its turn."""
     in_range("folds", folds, 1, 100_000)
     order = rng.permutation(len(labels))
     order = order[np.argsort([labels[i] for i in order], kind="stable")]

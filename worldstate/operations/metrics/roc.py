@@ -46,11 +46,6 @@ def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) ->
     """Return the area of each group that has both labels, in the order of their names.
 
     Shapes: scores, positive (n,), groups (n,).
-
-    Examples
-    --------
-    >>> auroc_by_group([0.1, 0.9, 0.8, 0.2], [False, True, False, True], ["SA1", "SA1", "SB1", "SB1"])
-    {'SA1': 1.0, 'SB1': 0.0}
     """
     values, labels, names = np.asarray(scores), np.asarray(positive), np.asarray(groups)
     areas = {str(name): auroc(values[names == name], labels[names == name]) for name in np.unique(names)}

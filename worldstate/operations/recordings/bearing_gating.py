@@ -33,14 +33,6 @@ def check_bearings(hops: HopTable, moving_rad: Sequence[Sequence[float]]) -> Hop
     """Compare the bearings of a run with the boxes that moved when they were heard.
 
     `error_rad` is the bearing minus the azimuth of the nearest of them, NaN where none was in view.
-
-    Examples
-    --------
-    >>> hops = {"time_s": [0.1, 0.2, 0.3], "bearing_age_s": [0.1] * 3, "bearing_rad": [0.3, 0.31, 0.18]}
-    >>> run = HopTable({name: np.array(values) for name, values in hops.items()})
-    >>> run = run.replace(prominence=np.array([1.5, 1.5, 2.0]))
-    >>> check_bearings(run, [[0.3], [0.2], [0.1, -1.0]]).error_rad.round(2)
-    array([ 0.  ,  0.01, -0.02])
     """
     check_shape("moving_rad", (len(moving_rad),), (len(hops),))
     at = [int(np.abs(hops.time_s - moment).argmin()) for moment in hops.time_s - hops.bearing_age_s]
@@ -57,15 +49,7 @@ def bearing_curve(checks: HopTable) -> GatingCurve | NotUsable:
 
 
 def bearing_figures(checks: HopTable) -> dict[str, float | None]:
-    """Return counts and medians; None where there is nothing to count.
-
-    Examples
-    --------
-    >>> error = np.array([np.nan, 0.3, 0.02, 0.01])
-    >>> checks = HopTable({"prominence": np.array([1.1, 1.2, 2.0, 3.0]), "error_rad": error})
-    >>> bearing_figures(checks)["bearings_in_view"], bearing_curve(checks).coverage.round(2)
-    (3, array([1.  , 0.67, 0.33]))
-    """
+    """Return counts and medians; None where there is nothing to count."""
     curve, seen = bearing_curve(checks), np.isfinite(checks.error_rad)
     error = threshold = gated = None
     if not isinstance(curve, NotUsable):

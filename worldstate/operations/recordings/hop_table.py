@@ -118,20 +118,7 @@ def load_tables(
     origin: str = "",
     check: Callable[[HopTable], None] = lambda table: None,
 ) -> list[HopTable]:
-    """Read what `save_tables` wrote; nothing if it is of another origin. `check` refuses what does not fit.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> table = HopTable({"risk": np.array([0.5, 0.7])}, name="a", about={"site": "SA1"})
-    >>> with TemporaryDirectory() as folder:
-    ...     save_tables(Path(folder) / "a.npz", [table, table.replace(name="b")], origin="seed 1")
-    ...     back = load_tables(Path(folder) / "a.npz", "risks", origin="seed 1")
-    ...     load_tables(Path(folder) / "a.npz", "risks", origin="seed 2")
-    []
-    >>> back[1].name, back[1].about["site"], back[1].risk
-    ('b', 'SA1', array([0.5, 0.7]))
-    """
+    """Read what `save_tables` wrote; nothing if of another origin. `check` refuses what does not fit."""
 
     def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
         tables = _tables(arrays, origin)

@@ -17,13 +17,7 @@ LARGEST_SCORE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class StatisticSwitches:
-    """What of eq. (6) the statistic uses.
-
-    Examples
-    --------
-    >>> StatisticSwitches(approach_weight=0.5).use_absence
-    True
-    """
+    """What of eq. (6) the statistic uses."""
 
     # False drops the answer of the channel that was asked: the signature alone, beta = 1.
     use_absence: bool = True
@@ -52,15 +46,6 @@ def stream_statistic(
     `abduction.posterior.statistic`.
 
     Shapes: reference_prior (K + 2,).
-
-    Examples
-    --------
-    >>> stream = HopTable({"log_likelihoods": np.log([[0.3, 0.1, 0.5, 0.1]])})
-    >>> for beta in (1.0, 0.0):
-    ...     switches = StatisticSwitches(fixed_miss_rate=beta)
-    ...     stream_statistic(stream, (0.25,) * 4, switches).round(3).item()
-    0.4
-    0.8
     """
     chosen = switches or StatisticSwitches()
     joint = _log_joint(stream, reference_prior, chosen)
@@ -74,14 +59,7 @@ def stream_statistic(
 def presence_statistic(
     stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches | None = None
 ) -> FloatArray:
-    """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,).
-
-    Examples
-    --------
-    >>> stream = HopTable({"log_likelihoods": np.zeros((1, 4))})
-    >>> presence_statistic(stream, (0.25,) * 4, StatisticSwitches(use_absence=False))
-    array([0.75])
-    """
+    """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,)."""
     # Parameters and errors are those of `stream_statistic`; the approach term has no part in it.
     joint = _log_joint(stream, reference_prior, switches or StatisticSwitches())
     something = np.logaddexp.reduce(joint[:, :-1], axis=1)

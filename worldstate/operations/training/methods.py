@@ -130,11 +130,5 @@ OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "
 
 
 def row_of(method: str, protocol: Protocol) -> str:
-    """Return the name in `ROWS` of what a method is under a protocol.
-
-    Examples
-    --------
-    >>> row_of("worldstate", "lojo"), row_of("worldstate", "transfer"), row_of("baseline", "cv")
-    ('ensemble', 'distant_site', 'baseline')
-    """
+    """Return the name in `ROWS` of what a method is under a protocol."""
     return OURS[protocol] if method == "worldstate" else method

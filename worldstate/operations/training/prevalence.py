@@ -23,13 +23,6 @@ def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> Floa
     the windows is taken to be what it was in training: true of a curated set, false of a street by the hour.
 
     Shapes: risk (n,).
-
-    Examples
-    --------
-    >>> words, here = np.array(["none"] * 4), np.array(["DA1"] * 4)
-    >>> table = FeatureTable(np.ones((4, 60)), words, words, here, np.array(list("0123")), (None,) * 4)
-    >>> matched_risk([0.1, 0.1, 0.1, 0.1], table, 0.5).round(3)
-    array([0.5, 0.5, 0.5, 0.5])
     """
     values = finite_array("risk", risk, (len(table),))
     mean = in_range("mean_risk", mean_risk, 0.0, 1.0, open_low=True, open_high=True)

@@ -14,13 +14,6 @@ def with_site_references(table: FeatureTable, chosen: BoolArray | None = None) -
     """Append to each window the reference of its junction.
 
     Shapes: table (n, 60), chosen (n,), returns (n, 240).
-
-    Examples
-    --------
-    >>> words, here = np.array(["none"] * 3), np.array(["SA1"] * 3)
-    >>> table = FeatureTable(np.ones((3, 60)), words, words, here, np.array(["0", "1", "2"]), (None,) * 3)
-    >>> with_site_references(table).features.shape
-    (3, 240)
     """
     # No label is looked at, unless the caller chooses windows by their label: a commissioning drive is
     # ``chosen=table.hazard_free``.

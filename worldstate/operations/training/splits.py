@@ -17,16 +17,7 @@ Split = Callable[[FeatureTable, np.random.Generator], TextArray]
 
 
 def recording_labels(table: FeatureTable) -> dict[str, str]:
-    """Return the label of each recording: that of its hazard window where it has one besides ``front``.
-
-    Examples
-    --------
-    >>> words = np.array(["front", "left", "none"])
-    >>> here = np.array(["SA1"] * 3)
-    >>> table = FeatureTable(np.zeros((3, 60)), words, words, here, np.array(["34", "34", "0"]), (None,) * 3)
-    >>> recording_labels(table)
-    {'SA1/34': 'left', 'SA1/0': 'none'}
-    """
+    """Return the label of each recording: that of its hazard window where it has one besides ``front``."""
     labels: dict[str, str] = {}
     for key, label in zip(table.recording_keys.tolist(), table.labels.tolist(), strict=True):
         if key not in labels or label != "front":
@@ -56,11 +47,5 @@ def junction_folds(table: FeatureTable, rng: np.random.Generator | None = None) 
 
 
 def split_for(protocol: Protocol) -> Split:
-    """Return the way a protocol splits; ``transfer`` splits its training set by junction.
-
-    Examples
-    --------
-    >>> split_for("lojo") is junction_folds
-    True
-    """
+    """Return the way a protocol splits; ``transfer`` splits its training set by junction."""
     return folds_by_recording if protocol == "cv" else junction_folds

@@ -71,17 +71,7 @@ def calibrate_windows(
 
 
 def between(levels: Sequence[WindowCalibration]) -> WindowCalibration:
-    """Return one calibration of several of the same statistic, from the most careful to the boldest.
-
-    Examples
-    --------
-    >>> from worldstate.abduction.cueing.risk_map import PlattMap
-    >>> careful = WindowCalibration(0.0, 0.9, PlattMap(-2.0, 1.0))
-    >>> bold = WindowCalibration(0.0, 0.5, PlattMap(-1.0, 0.0))
-    >>> middle = between([careful, bold])
-    >>> round(middle.gamma, 3), middle.risk_map
-    (0.75, PlattMap(slope=-1.0, offset=0.0))
-    """
+    """Return one calibration of several of the same statistic, from the most careful to the boldest."""
     # A classifier at a junction that it never saw stands between two that can be measured on its training
     # set: one that saw fewer junctions and not this one (leave one junction out), and one that saw this one
     # too (leave recordings out). The first is too careful, the second too bold, so the threshold is taken

@@ -20,13 +20,7 @@ CLEAN, OFF = "clean", "off"
 
 @dataclass(frozen=True, slots=True)
 class CameraState:
-    """One staged state of the camera.
-
-    Examples
-    --------
-    >>> str(CameraState("blur", 0.5)), str(CameraState("all", 0.0))
-    ('blur 0.5', 'clean')
-    """
+    """One staged state of the camera."""
 
     family: Family  # What is staged
     degradation: float  # d in [0, 1]; 0 is the clean camera, whatever the family
@@ -36,13 +30,7 @@ class CameraState:
 
 
 def camera_states(families: Sequence[Family] = ("blur", "darkness", "noise")) -> tuple[CameraState, ...]:
-    """Return the clean camera and every level of every family.
-
-    Examples
-    --------
-    >>> len(camera_states()), [str(state) for state in camera_states(("noise",))][:3]
-    (13, ['clean', 'noise 0.25', 'noise 0.5'])
-    """
+    """Return the clean camera and every level of every family."""
     staged = (CameraState(family, d) for family in families for d in LEVELS if d > 0.0)
     return CameraState("all", 0.0), *staged
 

@@ -75,15 +75,7 @@ def score_rules(recordings: Sequence[HopTable], rng: np.random.Generator) -> Rul
 
 
 def deal(recordings: Sequence[HopTable], rng: np.random.Generator, folds: int = FOLDS) -> IndexArray:
-    """Deal recordings to folds so that each holds its share of every approach at every site, shape (R,).
-
-    Examples
-    --------
-    >>> quiet = [HopTable({}, name=str(i), about={"site": "SA1"}) for i in range(2)]
-    >>> folds = deal(quiet + [one.replace(label="left") for one in quiet], np.random.default_rng(0))
-    >>> sorted(folds[:2]), sorted(folds[2:])
-    ([np.int64(0), np.int64(1)], [np.int64(0), np.int64(1)])
-    """
+    """Deal recordings to folds so that each holds its share of every approach at every site, shape (R,)."""
     free = np.array([recording.hazard_free for recording in recordings])
     most = min(int(free.sum()), int((~free).sum()), folds)
     if most < 2:

@@ -95,14 +95,7 @@ class Realism:
 
 
 def describe_windows(features: FloatArray) -> dict[str, FloatArray]:
-    """Return level and shape of windows, raw features (n, 60) -> (n,) for each of `DESCRIPTORS`.
-
-    Examples
-    --------
-    >>> flat = describe_windows(np.full((1, 60), 0.2))
-    >>> [round(float(flat[name][0]), 3) for name in DESCRIPTORS]
-    [0.2, 0.2, 0.0, 1.0, 0.0]
-    """
+    """Return level and shape of windows, raw features (n, 60) -> (n,) for each of `DESCRIPTORS`."""
     # level is the mean, peak the largest value, prominence the ratio of each segment's peak to its median
     # (mean over segments), width_deg the azimuths above half way from median to peak, change the Euclidean
     # distance of the segments.

@@ -73,15 +73,7 @@ TARGETS: Mapping[str, Target] = {
 def comparison_report(
     figures: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, object]:
-    """Return the figures beside the published ones as JSON-able values; unknown is None.
-
-    Examples
-    --------
-    >>> values = dict.fromkeys(TARGETS, 0.9)
-    >>> report = comparison_report(values, {name: (0.8, 1.0) for name in TARGETS})
-    >>> report["figures"]["auroc_1s"]["agrees"], report["judged"]
-    (True, 13)
-    """
+    """Return the figures beside the published ones as JSON-able values; unknown is None."""
     rows: dict[str, dict[str, object]] = {}
     for name, target in TARGETS.items():
         value, (low, high) = figures[name], intervals[name]
@@ -105,15 +97,7 @@ def comparison_report(
 
 
 def comparison_table(report: Mapping[str, object]) -> str:
-    """Return the table for people, one line a figure.
-
-    Examples
-    --------
-    >>> values = dict.fromkeys(TARGETS, 0.9)
-    >>> report = comparison_report(values, {name: (0.8, 1.0) for name in TARGETS})
-    >>> comparison_table(report).splitlines()[3]
-    'window AUROC, <= 1 s to T0       0.9  [0.8, 1]              0.92  yes'
-    """
+    """Return the table for people, one line a figure."""
     rows = report["figures"]
     assert isinstance(rows, dict)
     lines = [f"{'':<30} {'twin':>6}  {'95 % over recordings':<18} {'paper':>7}  near"]
