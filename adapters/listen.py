@@ -147,6 +147,8 @@ class Source:
         How it is listened to.
     t0_s : float or None
         Line-of-sight entry where the recording knows it, seconds from its start.
+    hazard_free : bool
+        Whether the recording is labelled as one without a vehicle; False where nothing is known.
     camera : PinholeCamera
         That took the images.
     miss_rates : MissRates or None
@@ -178,6 +180,7 @@ class Source:
     context: Context
     settings: ListenSettings = field(default_factory=ListenSettings)
     t0_s: float | None = None
+    hazard_free: bool = False
     camera: PinholeCamera = field(default_factory=PinholeCamera)
     miss_rates: MissRates | None = None
     degradation: float | Callable[[int], float] = 0.0
@@ -332,7 +335,8 @@ def open_source(
         policy=policy,
         context=context,
         settings=settings,
-        t0_s=recording.t0_s if recording and recording.label != "none" else None,
+        t0_s=recording.t0_s if recording else None,
+        hazard_free=recording is not None and recording.label == "none",
         camera=lens,
         miss_rates=rates,
         degradation=_degradation(recording, rates),

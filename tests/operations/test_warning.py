@@ -13,8 +13,8 @@ def state(time_s: float, advisory: bool, entity_id: str = "a", *entities: Entity
     return WorldState(nanoseconds(time_s), 0, entities=entities, relations=(), context=Context(), cues=(cue,))
 
 
-def summary(t0_s: float | None, onsets: dict[float, str], *entities: Entity):
-    meter = WarningMeter(t0_s)
+def summary(t0_s: float | None, onsets: dict[float, str], *entities: Entity, hazard_free: bool = False):
+    meter = WarningMeter(t0_s, hazard_free)
     for hop in range(100):
         time_s = hop / 10
         on = next((i for start, i in onsets.items() if start <= time_s < start + 0.3), None)
@@ -39,10 +39,16 @@ def test_an_advisory_after_line_of_sight_leads_nothing():
 
 
 def test_every_onset_is_false_where_nothing_approaches():
-    got = summary(None, {2.0: "a", 5.0: "b"})
+    got = summary(None, {2.0: "a", 5.0: "b"}, hazard_free=True)
     assert got.lead_time_s is None
     assert got.false_advisories_before == 2
     assert got.advisories_after_t0 is None
+
+
+def test_no_onset_is_called_false_where_nobody_knows_what_was_there():
+    got = summary(None, {2.0: "a", 5.0: "b"})
+    assert got.false_advisories_before is None
+    assert got.advisory_onsets_s == (2.0, 5.0)
 
 
 def test_parked_cars_are_no_hand_over():

@@ -133,6 +133,7 @@ def _stage(
 
 
 def _origin(arguments: argparse.Namespace, recordings: "list[StagedHops]") -> dict[str, object]:
+    from worldstate.operations.recordings.advisories import caution
     from worldstate.operations.recordings.hop_stream import HOP_S
     from worldstate.studies.degradation.degraded_detections import CLEAN
 
@@ -143,6 +144,7 @@ def _origin(arguments: argparse.Namespace, recordings: "list[StagedHops]") -> di
         "data": arguments.dataset.name,
         "detector": detector_name(arguments),
         "model": "default" if arguments.model is None else arguments.model.name,
+        "caution": caution(len(recordings)),
         "approaches": len(recordings) - len(free),
         "hops_in_view": int(sum(one.after_sight().sum() for one in clean)),
         "hazard_free": len(free),

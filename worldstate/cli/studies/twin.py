@@ -186,6 +186,7 @@ def _realism(arguments: argparse.Namespace) -> "dict[int, Realism]":
 
 
 def _origin(arguments: argparse.Namespace, score: "RuleScores") -> dict[str, object]:
+    from worldstate.operations.recordings.advisories import caution
     from worldstate.operations.recordings.hop_stream import HOP_S
 
     levels = _levels(arguments)
@@ -193,6 +194,7 @@ def _origin(arguments: argparse.Namespace, score: "RuleScores") -> dict[str, obj
     return {
         "out": str(arguments.out),
         "recordings": len(score.recordings),
+        "caution": caution(len(score.recordings)),
         "approaches": len(score.recordings) - len(calm),
         "hazard_free_hours": sum(len(recording.time_s) for recording in calm) * HOP_S / 3600.0,
         "seed": arguments.seed,

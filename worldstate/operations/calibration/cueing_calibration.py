@@ -15,6 +15,7 @@ from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
+from worldstate.operations.recordings.advisories import caution
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
@@ -316,6 +317,8 @@ def _warnings(
     budgets: list[BudgetReport], settings: CueingSettings, blocks: int, correlation_s: float
 ) -> Iterator[str]:
     conformal = settings.method == "conformal"
+    if few := caution(blocks, f"pieces of {settings.block_s:g} s"):
+        yield few
     for alpha in settings.alphas:
         need = recordings_needed(alpha, settings.confidence)
         if conformal and blocks < need:

@@ -15,6 +15,21 @@ from worldstate.ground.typing import IndexArray
 
 LONGEST_LEAD_S = 5.0
 SECONDS_PER_HOUR = 3600.0
+# With fewer, one recording moves a rate by more than 5 % and most intervals span what is of interest.
+FEWEST_RECORDINGS = 20
+
+
+def caution(count: int, what: str = "recordings") -> str | None:
+    """Return what to say of figures from so few; None from 20 on.
+
+    Examples
+    --------
+    >>> caution(6), caution(20)
+    ('6 recordings: figures from fewer than 20 cannot be read', None)
+    """
+    if count >= FEWEST_RECORDINGS:
+        return None
+    return f"{count} {what}: figures from fewer than {FEWEST_RECORDINGS} cannot be read"
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,7 +125,7 @@ def run_recording(
     >>> report.hops, report.warning.first_advisory_s
     (3, None)
     """
-    log = _HopLog(WarningMeter(source.t0_s))
+    log = _HopLog(WarningMeter(source.t0_s, source.hazard_free))
     started = time.perf_counter()
     with _states_writer(states_path) as write_state:
         for step in listen_steps(source):

@@ -17,7 +17,8 @@ class WarningSummary:
     # First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
     first_advisory_s: float | None
     lead_time_s: float | None  # ``t0_s - first_advisory_s`` where that onset came before line-of-sight entry
-    false_advisories_before: int  # Onsets more than 5 s before `t0_s`; without a `t0_s` every onset
+    # Onsets more than 5 s before `t0_s`, every onset of a hazard-free recording; None where neither is known.
+    false_advisories_before: int | None
     # Onsets at or after `t0_s`: of a vehicle that can be seen, or that has just left the view. None without.
     advisories_after_t0: int | None
     advisory_onsets_s: tuple[float, ...]  # All rising edges of the advisory
@@ -32,6 +33,7 @@ class WarningMeter:
     """Counts advisories while states go by, and keeps none of them."""
 
     t0_s: float | None  # Line-of-sight entry on the clock of the states, seconds
+    hazard_free: bool = False  # Whether the recording is known to hold no vehicle
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
@@ -53,12 +55,13 @@ class WarningMeter:
         onsets_s = tuple(time_s for time_s, _ in self._onsets)
         found = None if self.t0_s is None else detection(onsets_s, self.t0_s)
         counted = list(filter(self._speaks_of_vehicle, self._onsets))
+        false = found.false_advisories_before if found else len(onsets_s) if self.hazard_free else None
         first_s, hidden_id = next(iter(counted), (None, None))
         return WarningSummary(
             t0_s=self.t0_s,
             first_advisory_s=first_s,
             lead_time_s=found.lead_time_s if found else None,
-            false_advisories_before=found.false_advisories_before if found else len(onsets_s),
+            false_advisories_before=false,
             advisories_after_t0=None
             if self.t0_s is None
             else sum(time_s >= self.t0_s for time_s in onsets_s),
