@@ -7,7 +7,7 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test slow lint docs clean
+.PHONY: demo test slow lint docs matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -44,6 +44,14 @@ docs: $(VENV)/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html -d out/doctrees docs out/docs
 	@! grep -rnE '(src|srcset)="https?:|<link[^>]*href="https?:|url\(.?https?:|@import' out/docs --include='*.html' --include='*.css'
 	@echo out/docs/index.html
+
+# Oldest and newest releases of what the library needs, on every Python from 3.11 to 3.13 that is here.
+matrix:
+	.ci/matrix
+
+# Wheel and sdist, tried in an empty environment.
+dist:
+	.ci/dist $(PYTHON)
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
-import acoular
 import numpy as np
+import pytest
 from scipy.optimize import brentq
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+
+acoular = pytest.importorskip("acoular")
 
 RATE = 47_998
 SPEED_OF_SOUND_M_S = 343.0

@@ -1,6 +1,5 @@
 """Engine line and Doppler: acoular's moving source as the oracle, and engines that wander instead."""
 
-import acoular
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,6 +17,8 @@ from worldstate.frontend.approach.engine_line import HarmonicSettings, HarmonicT
 from worldstate.frontend.approach.pass_by import radial_speed_m_s
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
+
+acoular = pytest.importorskip("acoular")
 
 SOUND_M_S, RATE = 343.0, 4000.0
 
