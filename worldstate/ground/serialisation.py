@@ -23,6 +23,7 @@ from typing import (
 )
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import InvalidArgumentError, SchemaVersionError
 
@@ -227,6 +228,8 @@ def _plan(hint: Hint) -> Plan:
         return _sequence(args[0]) if args[-1] is Ellipsis else _fixed(args)
     if origin is np.ndarray:
         return np.ndarray.tolist, _array(get_args(args[1])[0])
+    if origin is NDArray:  # from numpy 2.5 and Python 3.12 on a named type, which get_origin does not enter
+        return np.ndarray.tolist, _array(args[0])
     if origin in (dict, Mapping):
         return _mapping(args[1])
     raise TypeError(f"{hint} has no place in JSON")
