@@ -26,9 +26,8 @@ class FilterSettings:
     rearm_s : float
         No birth on a side that long after a hand-over: the window still holds the sound from before it.
     relaxation_s : float
-        Time in which what is not measured returns to what is known beforehand: the azimuth of a hidden
-        entity to where hidden vehicles are, the approach rate of any to its prior. A vehicle that is still
-        hidden has not arrived, whatever its approach rate said.
+        Time constant with which unmeasured components return to their priors: the azimuth of a hidden entity
+        to the azimuth of hidden vehicles, the approach rate of any entity to its prior.
     acceleration_psd : float
         White acceleration of a moving vehicle, m^2/s^3.
     hidden_std : tuple of float
@@ -40,8 +39,8 @@ class FilterSettings:
         windows 21 % of the peaks stand near the corner and 36 % anywhere on the vehicle's side; the rest
         are images in the walls of the ego's own street.
     hidden_bearing_std_rad, hidden_bias_std_rad : float
-        Spread of such peaks about the apparent azimuth, and how far that one may be off for as long as it
-        hides: published with the azimuth, as no averaging removes it.
+        Standard deviation of such peaks about the apparent azimuth, and of the bias of the apparent azimuth
+        itself, which averaging does not remove; the published deviation includes it.
     line_of_sight_path_probability : float
         P(a peak belongs to the direct path) in line of sight.
     gate_sigma, gate_rad : float
@@ -49,10 +48,9 @@ class FilterSettings:
     handover_gate_rad : float
         A new sighting may be a hidden entity come into view within this of its occluder's edge.
     side_confusion : float
-        P(the signature names the wrong side). On junctions that a signature model does not know it is
-        anything from rare to the rule.
+        P(the signature names the wrong side).
     unheard_probability : float
-        P(a vehicle comes into view just then that nobody heard): the rival account of a new sighting.
+        P(a new sighting is a vehicle that was not heard before), the alternative to a hand-over.
     handover_residual : float
         Share of P(hidden) that a hand-over leaves: the sighting may have been of another vehicle.
     sighting_existence : float
@@ -60,7 +58,7 @@ class FilterSettings:
     clutter_rate : float
         Probability of a spurious sighting where the co-evidence states none.
     visible_life_s : float
-        Mean time for which an entity that nobody looks at still exists in its place.
+        Mean life of a seen entity without looks.
     delete_existence, lost_std_rad : float
         A visible entity is dropped below this existence, or once its azimuth is this uncertain.
     reocclusion_s : float
@@ -93,25 +91,26 @@ class FilterSettings:
     hidden_inverse_tta_hz: float = 0.2
     hidden_range_m: float = 25.0
     hidden_path_probability: float = 0.25  # 21 % of the peaks in real hidden windows, rounded up
-    hidden_bearing_std_rad: float = 0.25
-    hidden_bias_std_rad: float = 0.17
-    line_of_sight_path_probability: float = 0.8
+    hidden_bearing_std_rad: float = 0.25  # 14 deg: peaks spread from the edge to the vehicle itself
+    hidden_bias_std_rad: float = 0.17  # 10 deg, half the spread of hidden vehicles behind a default corner
+    line_of_sight_path_probability: float = 0.8  # The rest are images in walls, other sources
     # The second bounds the first: four deviations of an entity unseen for a second are most of the view.
     gate_sigma: float = 4.0
     gate_rad: float = 0.35
     handover_gate_rad: float = 0.8  # Less than the 64 deg between the edges of a default junction
+    # Rarely wrong on junctions that the signature model was trained on, often on others.
     side_confusion: float = 0.2
-    unheard_probability: float = 0.05
-    handover_residual: float = (
-        0.02  # Above zero, or a second vehicle behind the same corner could not be heard
-    )
-    sighting_existence: float = 0.5
+    unheard_probability: float = 0.05  # One in twenty: most vehicles from a side street are heard before
+    # Above zero: a second vehicle behind the same corner would have to be found anew.
+    handover_residual: float = 0.02
+    sighting_existence: float = 0.5  # Indifferent: the first sighting decides
     clutter_rate: float = 0.01
     visible_life_s: float = 10.0
+    # Three full looks that find nothing take .99 below it, at a miss rate of .04.
     delete_existence: float = 0.05
     lost_std_rad: float = 0.8  # Beyond, the azimuth says no more than which half of the view
     reocclusion_after_s: float = 0.15  # More than one image at 10 Hz: a single miss is no occlusion
-    reocclusion_s: float = 3.0
+    reocclusion_s: float = 3.0  # Longer, and a following vehicle would get the id of the one ahead
     stream: str = "worldstate"
 
     def __post_init__(self) -> None:
