@@ -8,6 +8,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import Check
 
 SECONDS_PER_HOUR = 3600.0
+# Odds of half a billion to one: beyond them a shift of the threshold means nothing.
 _EXTREME_LOGIT = 20.0
 
 

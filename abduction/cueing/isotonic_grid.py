@@ -7,6 +7,7 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
+# Far below the resolution of any miss rate that is counted.
 _SWEEPS = 2000
 _TOLERANCE = 1e-10
 

@@ -12,6 +12,7 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
+# As in the note's pseudocode; the tolerance is finer, for values are scaled to one first.
 _ITERATIONS = 100
 _SMALLEST_STEP = 1e-10
 _GRADIENT_TOLERANCE = 1e-6

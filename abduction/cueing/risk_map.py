@@ -13,6 +13,7 @@ from worldstate.ground.typing import BoolArray, FloatArray
 
 from .platt import fit_sigmoid, sigmoid
 
+# Where isotonic regression stops losing to two numbers: see `fit_risk_map`.
 SMALL_SAMPLE = 200
 
 

@@ -10,7 +10,9 @@ from worldstate.ground.checks import check_shape, finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
 
+# Estimators count in nats, the paper and the report in bits.
 _BITS = 1.0 / math.log(2.0)
+# One posterior of exactly zero at the true state would make the mean of all windows infinite.
 _SMALLEST = 1e-12
 
 

@@ -11,6 +11,7 @@ from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
+# The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
 JUNCTION = "junction"
 

@@ -23,6 +23,7 @@ from .recording import SimulatedRecording
 
 CODEC = "mp4v"
 SENSOR_NOISE = 1.5  # grey levels
+# Ten standard deviations of a parked car's box, less than a moving one passes in a frame.
 STILL_PX = 4.0
 STEP_M = 0.01
 

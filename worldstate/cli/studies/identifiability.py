@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from worldstate.studies.paper.fisher_profile import BandProfile
     from worldstate.studies.paper.identifiability import ReachOfArray, ReachOnData
 
+# Both ways to endfire of an array across the vehicle, where the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
 
 DESCRIPTION = """\

@@ -30,6 +30,7 @@ from .bench_stages import AZIMUTHS_RAD, GOAL, NFFT, RATE_HZ, SRP_BINS, srp_beams
 from .stopwatch import Milliseconds, elapsed_ms
 
 SECONDS = 6
+# Running seconds are full after ten hops, and caches warm.
 WARM_UP_HOPS = 11
 EVERYTHING = FrontEndSettings(music_sources=1, tone_band_hz=ENGINE_BAND_HZ)
 SETTINGS = {

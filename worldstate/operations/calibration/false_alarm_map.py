@@ -37,7 +37,7 @@ class FalseAlarmRate:
 
     @property
     def quantum_per_hour(self) -> float:
-        """What one onset more or less comes to: no rate finer than this can be told from these hours."""
+        """One onset as a rate: the resolution of these hours."""
         return 1.0 / self.hours
 
 
@@ -50,7 +50,7 @@ def false_alarm_rate(
 
     Shapes: hazard_free (windows,).
     """
-    # With n onsets in T hours the interval is Garwood's,
+    # Garwood's exact interval of a Poisson rate, with n onsets in T hours.
     from scipy.stats import chi2
 
     period_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True)

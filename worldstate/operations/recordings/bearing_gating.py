@@ -30,7 +30,7 @@ FEWEST = 10
 
 
 def check_bearings(hops: HopTable, moving_rad: Sequence[Sequence[float]]) -> HopTable:
-    """Compare the bearings of a run with the boxes that moved when they were heard.
+    """Compare the bearings of a run with the boxes that moved at the time of the bearing.
 
     `error_rad` is the bearing minus the azimuth of the nearest of them, NaN where none was in view.
     """
@@ -67,7 +67,7 @@ def bearing_figures(checks: HopTable) -> dict[str, float | None]:
 
 
 def write_gating_figure(checks: HopTable, path: Path, title: str = "") -> None:
-    """Draw the curve and what prominence says of presence, and write both by the ending of `path`."""
+    """Draw the curve and the prominence with and without a box in view, and write them."""
     with figure_file(path, 8.0, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         draw_gating(left, checks)

@@ -48,7 +48,7 @@ class RecordingHealth:
     verdicts: tuple[ChannelVerdict, ...]  # By channel; empty where nothing was wrong
     dropouts: tuple[Dropout, ...]  # The first hundred
     n_dropouts: int  # All of them
-    n_hops: int  # Hops listened to
+    n_hops: int  # Hops processed
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
     sample_rate: RateEstimate | NotUsable  # By another clock
 

@@ -49,7 +49,7 @@ def detect_in_states(
     video: Video, staging: Staging, states: Sequence[CameraState], rng: np.random.Generator
 ) -> dict[str, Watched]:
     """Decode once, degrade and detect in every state."""
-    # The degradation is staged on the frames and nobody is told: the detector sees degraded frames, and d is
+    # The degradation is staged on the frames and not passed on: the detector sees degraded frames, and d is
     # estimated from them.
     watchers = [Watcher(staging.make_detector(), staging.rates) for _ in states]
     for number, frame in enumerate(video.frames()):

@@ -1,7 +1,6 @@
 """Stage the camera of every recording of a data set, keep its detections, and run the filter."""
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +15,7 @@ from worldstate.adapters.datasets.ovad import OvadDataset, Recording
 from worldstate.adapters.listen import open_source
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
+from worldstate.studies.origin import origin_of
 
 from .degraded_detections import CameraState, Staging, detect_in_states
 from .detections_file import load_staged_detections, save_staged_detections
@@ -47,7 +47,7 @@ class StagedDataset:
             "states": [str(state) for state in self.states],
             "seed": self.seed,
         }
-        return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:32]
+        return origin_of(made_of)
 
 
 def filmed_recordings(root: Path, most: int | None = None) -> list[Recording]:

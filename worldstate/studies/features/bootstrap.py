@@ -12,6 +12,7 @@ from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.training.feature_evaluation import Predictions
 from worldstate.operations.training.splits import recording_labels
 
+# Twelve samples lie beyond each end of the interval.
 DRAWS = 500
 COVERAGE = 0.95
 FIGURES = ("accuracy", "auroc_macro", "auroc_pooled", "worst_group_auroc", "tpr", "fpr", "ece", "brier")

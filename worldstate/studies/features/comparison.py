@@ -17,6 +17,7 @@ from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from .bootstrap import DRAWS, FigureDraws, draw_figures, recording_draws
 from .feature_report import group_figures, mean_figures, report_groups, window_figures
 
+# The same samples for every method and run: the differences between methods are paired.
 BOOTSTRAP_SEED = 0
 COMPARED = ("baseline", "baseline_absent", "loudest_direction", "commissioning_drive")
 # Where the ego drives and did not in training, the ensemble is one of those to beat.

@@ -17,6 +17,7 @@ from worldstate.adapters.files.atomic import atomic_path
 from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate
 from worldstate.operations.training.feature_evaluation import Predictions
 
+# The floor belongs to the risks: another seed in every run would only add noise to it.
 FLOOR_SEED = 0
 Figures = dict[str, float | None]
 COLUMNS = (

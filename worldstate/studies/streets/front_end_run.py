@@ -42,7 +42,7 @@ class _Silent:
 
 
 def run_front_end(recording: SimulatedRecording, name: str = "") -> HopTable:
-    """Return one row a hop of a recording, heard with its own array; `classified` comes after.
+    """Return one row a hop of a recording, by its own array; `classified` comes after.
 
     `reference_rad`, `srp_rad` and `music_rad` are the azimuth of the camera's moving box and the two acoustic
     bearings, NaN where no box is there; `doppler` says why the tone of the pass-by cannot be used, if so.

@@ -1,4 +1,4 @@
-"""The published figures, counted on the recordings of the twin, with intervals over recordings."""
+"""The published figures, counted on simulated recordings, with intervals over recordings."""
 
 from collections.abc import Sequence
 
@@ -16,9 +16,11 @@ from .decision_rules import ALPHA, ALPHA_LOOSE, RuleOutcome, RuleScores, labelle
 
 Interval = tuple[float, float]
 
+# Twelve samples lie beyond each end of the interval.
 DRAWS = 500
 COVERAGE = 0.95
 HORIZONS = {"all": np.inf, "2s": 2.0, "1s": 1.0}
+# The paper's figure of looming is of the last three seconds before the pass.
 IMMINENT_S = 3.0
 # A slope read as a time: beyond this there is nothing that approaches.
 LONGEST_TTA_S = 30.0

@@ -1,4 +1,4 @@
-"""The twin's figures beside the paper's: one table, one JSON object."""
+"""Figures of simulated recordings beside the paper's: one table, one JSON object."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ RELATIVE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A published figure and how near the twin should come to it.
+    """A published figure and how near the simulated one should come to it.
 
     Examples
     --------

@@ -1,7 +1,5 @@
-"""Simulate the recordings of the twin one by one, on any number of processes, and remember those done."""
+"""Simulate recordings on any number of processes, and keep what the front-end made of those done."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -16,16 +14,17 @@ from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.settings import draw_settings
 from worldstate.ground.parallel import in_processes
 from worldstate.operations.recordings.hop_table import HopTable, load_tables, save_tables
+from worldstate.studies.origin import origin_of
 
 from .front_end_run import run_front_end
 
-# What is heard of a recording depends on this code: a change of it is another number.
+# The kept hops depend on the code that made them: a change of it is another number.
 VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)
 class StreetSettings:
-    """What the twin is made of."""
+    """How the streets are simulated."""
 
     preset: Preset  # Levels of the simulation, the rate of distant vehicles among them
     duration_s: float = 10.0  # Length of each recording
@@ -41,13 +40,13 @@ class StreetSettings:
         }
         if self.keep is not None:
             made_of["keep"] = str(self.keep)
-        return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:32]
+        return origin_of(made_of)
 
 
 def simulated_hops(
     folder: Path, plans: Sequence[Plan], settings: StreetSettings, jobs: int = 1
 ) -> Iterator[HopTable]:
-    """Yield the recordings of the twin in the order of the plans; those in `folder` are not made again."""
+    """Yield the recordings in the order of the plans; those in `folder` are not made again."""
     work = partial(_kept_or_simulated, folder, settings)
     yield from in_processes(work, plans, jobs)
 
@@ -63,7 +62,7 @@ def _kept_or_simulated(folder: Path, settings: StreetSettings, plan: Plan) -> Ho
 
 
 def simulate_hops(plan: Plan, settings: StreetSettings) -> HopTable:
-    """Simulate one recording, the same that `simulate` writes for this plan and preset, and listen to it."""
+    """Simulate the recording that `simulate` writes for this plan and preset, and run the front-end."""
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, settings.duration_s)
     recording = simulate_recording(replace(drawn, preset=settings.preset), rng)

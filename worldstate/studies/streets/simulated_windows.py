@@ -42,6 +42,8 @@ RATE_HZ = 47_998.0 / DECIMATION
 NFFT = FEATURE_NFFT // DECIMATION
 # Changes whenever a window of the same seed would be another one.
 LAYOUT = 3
+# The first window is a second long and ends at T0 at the earliest; the last ends a frame (.1 s), a moving
+# ego's delay (.5 s) and the front window's (1.5 s) after it.
 ENTRY_S, DURATION_S = 1.65, 3.8
 FRAME_S = 1.0 / FRAME_RATE_HZ
 MAX_PER_CLASS = 1000

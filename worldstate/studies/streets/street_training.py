@@ -1,11 +1,9 @@
-"""A classifier trained on the twin's own junctions, as the paper's was on its own.
+"""Train a classifier on windows of the simulated junctions, as the paper's was on its own.
 
-The paper's classifier has heard other recordings of the very sites that it is tested at. One that was trained
-on the real sites meets the simulated ones as strangers, which is the leave-one-junction-out case instead.
+The paper's classifier is trained on other recordings of the very sites that it is tested at. A classifier
+trained on the real sites is at the simulated ones in the leave-one-junction-out case instead.
 """
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +15,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, read_featur
 from worldstate.adapters.simulation.scene.junction import SITES
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.operations.training.training import TrainingMethod, fit_signature, seen_by
+from worldstate.studies.origin import origin_of
 
 from .simulated_streets import VERSION
 from .simulated_windows import LAYOUT, simulated_windows
@@ -37,9 +36,8 @@ def train_on_simulation(
     per_approach: int = PER_APPROACH,
     progress: Callable[[], None] = lambda: None,
 ) -> AnySignature:
-    """Simulate training windows at the twin's sites and fit a classifier to them."""
-    made_of = [VERSION, LAYOUT, asdict(levels), seed, per_approach]
-    origin = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:16]
+    """Simulate training windows at the same sites and fit a classifier to them."""
+    origin = origin_of([VERSION, LAYOUT, asdict(levels), seed, per_approach])
     path = folder / f"training-{origin}.csv"
     if path.is_file():
         table = read_features(path)
