@@ -70,11 +70,13 @@ class MissRateTable:
     def __call__(self, azimuth_rad: float, degradation: float = 0.0, label: str | None = None) -> float:
         """Return beta at one azimuth (radians, any sign) and degradation in [0, 1]."""
         magnitude_deg = abs(float(np.degrees(azimuth_rad)))
-        level = in_range("degradation", degradation, 0.0, 1.0)
-        if magnitude_deg > self.azimuth_deg[-1] or level > self.degradation[-1]:
+        # Asked many times a hop: a comparison, which NaN fails too.
+        if not 0.0 <= degradation <= 1.0:
+            raise InvalidArgumentError(f"degradation: expected a number in [0, 1], got {degradation}")
+        if magnitude_deg > self.azimuth_deg[-1] or degradation > self.degradation[-1]:
             return 1.0
         rows = self.beta if label is None else self.per_class.get(label, self.beta)
-        along = [float(np.interp(level, self.degradation, row)) for row in rows]
+        along = [float(np.interp(degradation, self.degradation, row)) for row in rows]
         return float(np.interp(magnitude_deg, self.azimuth_deg, along))
 
 

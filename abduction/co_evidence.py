@@ -32,8 +32,9 @@ class Absent:
     clutter_rate: float = 0.0
 
     def __post_init__(self) -> None:
-        in_range("miss_rate", self.miss_rate, 0.0, 1.0)
-        in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_high=True)
+        object.__setattr__(self, "miss_rate", in_range("miss_rate", self.miss_rate, 0.0, 1.0))
+        clutter = in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_high=True)
+        object.__setattr__(self, "clutter_rate", clutter)
 
     def log_likelihoods(self) -> np.ndarray:
         r"""Log p(absent | hidden, visible, none), shape (3,), nats; -inf where impossible.
@@ -79,8 +80,9 @@ class Present:
     clutter_rate: float = 0.01
 
     def __post_init__(self) -> None:
-        in_range("miss_rate", self.miss_rate, 0.0, 1.0)
-        in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
+        object.__setattr__(self, "miss_rate", in_range("miss_rate", self.miss_rate, 0.0, 1.0))
+        clutter = in_range("clutter_rate", self.clutter_rate, 0.0, 1.0, open_low=True, open_high=True)
+        object.__setattr__(self, "clutter_rate", clutter)
 
     def log_likelihoods(self) -> np.ndarray:
         r"""Log p(present | hidden, visible, none), shape (3,), nats.

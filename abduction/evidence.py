@@ -48,9 +48,14 @@ class SignatureEvidence:
     def __post_init__(self) -> None:
         if not self.directions or len(set(self.directions)) != len(self.directions):
             raise InvalidArgumentError(f"directions: expected different labels, got {self.directions!r}")
-        finite_array("hidden", self.hidden, (len(self.directions),))
-        finite_array("visible", self.visible, ())
-        finite_array("none", self.none, ())
+        if np.size(self.hidden) != len(self.directions):
+            raise InvalidArgumentError(f"hidden: expected one of each direction, got {self.hidden!r:.80}")
+        every = (*self.hidden, self.visible, self.none)
+        *hidden, visible, none = finite_array("hidden, visible, none", every, (len(every),)).tolist()
+        # Whole numbers among them would make arrays that no likelihood can be added to.
+        object.__setattr__(self, "hidden", tuple(hidden))
+        object.__setattr__(self, "visible", visible)
+        object.__setattr__(self, "none", none)
 
     @property
     def log_likelihoods(self) -> np.ndarray:

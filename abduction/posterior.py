@@ -111,7 +111,11 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
     >>> round(seen.hidden_total, 3), round(seen.visible, 3)
     (0.742, 0.128)
     """
-    prior = _checked_log_prior(log_prior, len(evidence.directions))
+    return posterior_of(_checked_log_prior(log_prior, len(evidence.directions)), evidence, co_evidence)
+
+
+def posterior_of(prior: FloatArray, evidence: SignatureEvidence, co_evidence: CoEvidence) -> Posterior:
+    """Return what `abduce` does for the log prior of a belief, shape (K + 2,), which is not checked."""
     log_likelihood = _log_likelihood(evidence, co_evidence)
     joint = prior + log_likelihood
     log_evidence = _log_sum(joint)

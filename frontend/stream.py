@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.approach.looming import Looming, looming
+from worldstate.frontend.approach.looming import Looming, fitted_looming
 from worldstate.frontend.approach.tone_stage import ToneReading, ToneStage
 from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, segment_feature
 from worldstate.frontend.direction.music_stage import MusicReading
-from worldstate.frontend.direction.peaks import find_peaks
+from worldstate.frontend.direction.peaks import highest_peaks
 from worldstate.frontend.direction.srp import normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
 from worldstate.frontend.spectra.bands import SILENCE
@@ -253,7 +253,7 @@ class FrontEnd:
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         settings = self.settings
         recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
-        peaks = find_peaks(recent.max(axis=0), self._azimuths, max_peaks=settings.max_peaks)
+        peaks = highest_peaks(recent.max(axis=0), self._azimuths, settings.max_peaks)
         bearing = bearing_of(peaks, self._azimuths, settings.bearing_std_rad)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
@@ -299,7 +299,7 @@ class FrontEnd:
         column = spectrum[:, np.abs(self._azimuths - azimuth_rad).argmin()]
         if len(column) < 3 or not column.any():
             return float(self._elevations[column.argmax()])
-        return find_peaks(column, self._elevations, max_peaks=1)[0].azimuth_rad
+        return highest_peaks(column, self._elevations, 1)[0].azimuth_rad
 
     def _music(self) -> MusicReading | NotUsable:
         if self._spectra.music is None:
@@ -346,4 +346,4 @@ class FrontEnd:
             return NotUsable("silence within the window")
         times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz
         low, high = settings.looming_band_hz
-        return looming(times, np.log(energies), floor_std=((high - low) / settings.hop_rate_hz) ** -0.5)
+        return fitted_looming(times, np.log(energies), ((high - low) / settings.hop_rate_hz) ** -0.5)

@@ -88,6 +88,7 @@ class EnsembleModel:
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
+        finite_array("home", self.home.row, (len(KINDS) * self.n_features,))
         views = expert_views(VIEWS, self.home.mean[None], self.home.row[None])
         for expert in self.experts:
             inputs = views[expert.view].shape[1]
@@ -150,7 +151,10 @@ class EnsembleModel:
         C. Genest and J. V. Zidek, "Combining probability distributions: a critique and an annotated
         bibliography", Statist. Sci. 1, 1986 (the logarithmic pool).
         """
-        levels, reference = self._split(X)
+        return self.posteriors(*self._split(X))
+
+    def posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:
+        """Return what `predict_proba` does for log-levels, shape (n, features), and rows of references."""
         posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
         return np.asarray(posteriors / total(posteriors))
 

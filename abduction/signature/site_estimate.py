@@ -15,12 +15,14 @@ hits at junctions new to a standing ego; a quarter of the level costs none, and 
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, freeze_arrays, in_range
+from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import Check
 from worldstate.ground.typing import FloatArray
 
 from .ensemble import EnsembleModel
@@ -82,11 +84,7 @@ class SiteEstimate:
     """
 
     level: FloatArray
-    heard_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, level=(None,))
-        in_range("heard_s", self.heard_s, 0.0, math.inf, open_high=True)
+    heard_s: Annotated[float, Check("a time that is not negative", lambda heard_s: heard_s >= 0.0)] = 0.0
 
     @classmethod
     def start(cls, n_features: int) -> "SiteEstimate":
@@ -108,25 +106,16 @@ class SiteEstimate:
         Parameters
         ----------
         feature : array_like, shape (features,)
-            Levels, not logarithms.
+            Levels, not logarithms; `SiteSignature` has checked them.
         dt_s : float
             Seconds, > 0.
         settings : SiteEstimateSettings
             Forgetting time.
 
-        Raises
-        ------
-        InvalidArgumentError
-            On another shape, NaN or infinity, or time that stands still.
-
-        References
-        ----------
-        An exponential mean, from the definition.
         """
-        levels = log_levels(finite_array("feature", feature, self.level.shape))
-        passed_s = in_range("dt_s", dt_s, 0.0, math.inf, open_low=True, open_high=True)
-        heard_s = self.heard_s * math.exp(-passed_s / settings.forgetting_s) + passed_s
-        return SiteEstimate(self.level + passed_s / heard_s * (levels - self.level), heard_s)
+        levels = log_levels(feature)
+        heard_s = self.heard_s * math.exp(-dt_s / settings.forgetting_s) + dt_s
+        return SiteEstimate(self.level + dt_s / heard_s * (levels - self.level), heard_s)
 
     def reference(self, model: EnsembleModel, settings: SiteEstimateSettings) -> SiteReference:
         r"""Return what windows are to be compared with; that of the training sites before anything was heard.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.checks import finite_array, freeze_arrays
+from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
@@ -33,9 +33,6 @@ class SiteReference:
     # shape (features,): Mean over the 35 % of the windows whose loudest feature is the least: close to what
     # the site is like while nobody comes, whatever share of the windows that is.
     quiet: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, **dict.fromkeys(KINDS, (np.size(self.mean),)))
 
     @property
     def row(self) -> FloatArray:

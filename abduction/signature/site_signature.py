@@ -4,11 +4,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import check_shape, finite_array, in_range
+from worldstate.ground.checks import finite_array, in_range
 
 from .ensemble import EnsembleModel
 from .model_domain import ModelDomain
+from .published_signature import evidence_of, explanation_ratios
 from .site_estimate import SiteEstimate, SiteEstimateSettings
+from .site_reference import log_levels
 
 HOP_S = 0.1
 
@@ -35,7 +37,7 @@ class SiteSignature:
     Attributes
     ----------
     estimate : SiteEstimate
-        All that is carried from window to window; `SiteEstimate.to_dict` writes it into a checkpoint.
+        All that is carried from window to window; `Checkpoint` writes it to disk.
 
     Examples
     --------
@@ -60,7 +62,7 @@ class SiteSignature:
         self._settings = settings or SiteEstimateSettings()
         self._hop_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True, open_high=True)
         self.estimate = estimate or SiteEstimate.start(model.n_features)
-        check_shape("estimate", self.estimate.level.shape, (model.n_features,))
+        finite_array("estimate", self.estimate.level, (model.n_features,))
 
     @property
     def reference_prior(self) -> tuple[float, ...]:
@@ -82,6 +84,6 @@ class SiteSignature:
         """
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model, self._settings)
-        evidence = self._model.evidence(np.concatenate([window, reference.row]))
+        posteriors = self._model.posteriors(log_levels(window)[None], reference.row[None])
         self.estimate = self.estimate.updated(window, self._hop_s, self._settings)
-        return evidence
+        return evidence_of(explanation_ratios(posteriors, self._model.class_prior)[0])

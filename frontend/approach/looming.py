@@ -122,6 +122,14 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
     floor = in_range("floor_std", floor_std, 0.0, np.inf, open_low=True, open_high=True)
     if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0):
         raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, got {times}")
+    return fitted_looming(times, energies, floor)
+
+
+def fitted_looming(times: FloatArray, energies: FloatArray, floor: float) -> Looming | NotUsable:
+    """Return what `looming` does for arrays that are finite and fit each other.
+
+    Shapes: times (n,), energies (n,).
+    """
     centred = energies - energies.mean()
     exponential = _fit_line(times, centred, np.ones_like(times))
     # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.

@@ -86,6 +86,16 @@ def find_peaks(
     values = finite_array("spectrum", spectrum, azimuths.shape)
     if len(values) < 3:
         raise InvalidArgumentError(f"azimuths_rad: expected at least three points, got {len(values)}")
+    return highest_peaks(values, azimuths, max_peaks, min_prominence)
+
+
+def highest_peaks(
+    values: FloatArray, azimuths: FloatArray, max_peaks: int, min_prominence: float = 1.0
+) -> tuple[Peak, ...]:
+    """Return what `find_peaks` finds in arrays that are finite and fit each other.
+
+    Shapes: values (A,), azimuths (A,).
+    """
     if values.max() <= 0.0:
         return ()
     median = max(float(np.median(values)), np.finfo(np.float64).tiny)

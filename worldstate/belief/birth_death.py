@@ -49,12 +49,13 @@ def birth_death(
                 explanation = explanation.forget_origin(k)
                 begun.append(k)
                 returning = _returning(kept, k, measurement.stamp_ns, site)
+                existence = min(explanation.hidden[k], 1.0)
                 if returning is None:
-                    kept.append(_born(k, counts[k], explanation.hidden[k], measurement, site))
+                    kept.append(_born(k, counts[k], existence, measurement, site))
                     counts[k] += 1
                 else:
                     kept.remove(returning)
-                    kept.append(_hidden_again(returning, k, explanation.hidden[k], measurement, site))
+                    kept.append(_hidden_again(returning, k, existence, measurement, site))
         else:
             kept.remove(current)
             # The sum of two exponentials exceeds one by rounding where nothing else is possible.

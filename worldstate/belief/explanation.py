@@ -6,7 +6,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import Posterior, abduce
+from worldstate.abduction.posterior import Posterior, posterior_of
 from worldstate.ground.typing import FloatArray
 
 from .markov_chain import RatesHz, equilibrium, transition
@@ -98,7 +98,7 @@ class ExplanationBelief:
         parts = np.array(self.log_probabilities[k:-1])
         visible = np.logaddexp.reduce(parts)
         prior = np.array([*self.log_probabilities[:k], visible, self.log_probabilities[-1]])
-        seen: Posterior = abduce(prior + log_co_evidence, evidence, _IN_PRIOR)
+        seen: Posterior = posterior_of(prior + log_co_evidence, evidence, _IN_PRIOR)
         posterior = np.array(seen.log_probabilities)
         spread = np.concatenate([posterior[:k], parts + (posterior[-2] - visible), posterior[-1:]])
         return replace(self, log_probabilities=tuple(np.clip(spread, LOG_FLOOR, 0.0).tolist()))

@@ -1,20 +1,25 @@
 """The filter: predict and update of the whole world-state."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Integral
 from typing import Any
 
+import numpy as np
+
+from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import PlattMap
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.state import Context, WorldState
 
 from .checkpoint import FilterRecord, memory_of, memory_record
@@ -34,6 +39,13 @@ from .step import (
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
+_ABOVE_ZERO = math.ulp(0.0)
+_KINDS: dict[str, Any] = {
+    "signature": SignatureEvidence,
+    "co_evidence": CoEvidence,
+    "bearing": Bearing | NotUsable,
+    "approach": Approach | NotUsable,
+}
 
 
 def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
@@ -198,11 +210,8 @@ class WorldFilter:
             If the time stamp is no integer or is earlier than the belief's or than the source's last one, the
             directions are not those of the context, or a number is not finite.
         """
-        stamp_ns = _integer_ns("stamp_ns", measurement.stamp_ns)
-        if stamp_ns is not measurement.stamp_ns:  # numpy's integers cannot be written as JSON
-            measurement = replace(measurement, stamp_ns=stamp_ns)
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
-        _check(measurement, self.context, dict(self._memory.last_ns))
+        measurement = _checked(measurement, self.context, dict(self._memory.last_ns))
         world = self.predict_to(measurement.stamp_ns)
         memory, model = world._memory, world._model
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
@@ -258,27 +267,39 @@ def _integer_ns(name: str, value: object) -> int:
     return int(value)
 
 
-def _check(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> None:
-    """Refuse measurements that do not fit the context or hold numbers out of range."""
+def _checked(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> Measurement:
+    """Return the measurement in plain numbers; refuse what would poison the belief: it takes NaN as it is."""
+    for name, kind in _KINDS.items():
+        if not isinstance(getattr(measurement, name), kind):
+            expected = getattr(kind, "__name__", str(kind))
+            raise InvalidArgumentError(f"{name}: expected {expected}, got {getattr(measurement, name)!r:.40}")
     if measurement.signature.directions != context.directions:
         raise InvalidArgumentError(
             f"signature: expected the directions {context.directions}, got {measurement.signature.directions}"
         )
-    before_ns = last_ns.get(measurement.source)
-    if before_ns is not None and measurement.stamp_ns < before_ns:
+    stamp_ns, before_ns = _integer_ns("stamp_ns", measurement.stamp_ns), last_ns.get(measurement.source)
+    if before_ns is not None and stamp_ns < before_ns:
         raise InvalidArgumentError(
-            f"stamp_ns: expected time stamps in order, got {measurement.stamp_ns} ns after {before_ns} ns"
+            f"stamp_ns: expected time stamps in order, got {stamp_ns} ns after {before_ns} ns"
         )
-    if not isinstance(measurement.bearing, NotUsable):
-        _check_angle("bearing", measurement.bearing.azimuth_rad, measurement.bearing.std_rad)
-    if not isinstance(measurement.approach, NotUsable):
-        in_range("inverse_tta_hz", measurement.approach.inverse_tta_hz, -1e3, 1e3)
-        in_range("std_hz", measurement.approach.std_hz, 0.0, 1e6, open_low=True)
+    for name, value, low, high in _numbers(measurement):
+        # NaN compares false, and what is no number does not compare.
+        if not isinstance(value, int | float | np.number) or not low <= value <= high:
+            raise InvalidArgumentError(f"{name}: expected a number in [{low}, {high}], got {value!r:.40}")
+    sightings = tuple(replace(sighting, score=float(sighting.score)) for sighting in measurement.sightings)
+    return replace(measurement, stamp_ns=stamp_ns, sightings=sightings)
+
+
+def _numbers(measurement: Measurement) -> Iterator[tuple[str, float, float, float]]:
+    """Yield the name, value and range of every number that nothing has checked so far."""
+    bearing, approach = measurement.bearing, measurement.approach
+    if isinstance(bearing, Bearing):
+        yield "bearing.azimuth_rad", bearing.azimuth_rad, -math.pi, math.pi
+        yield "bearing.std_rad", bearing.std_rad, _ABOVE_ZERO, 1e3
+    if isinstance(approach, Approach):
+        yield "approach.inverse_tta_hz", approach.inverse_tta_hz, -1e3, 1e3
+        yield "approach.std_hz", approach.std_hz, _ABOVE_ZERO, 1e6
     for i, sighting in enumerate(measurement.sightings):
-        _check_angle(f"sightings[{i}]", sighting.azimuth_rad, sighting.std_rad)
-        in_range(f"sightings[{i}].score", sighting.score, 0.0, 1.0)
-
-
-def _check_angle(name: str, azimuth_rad: float, std_rad: float) -> None:
-    in_range(f"{name}.azimuth_rad", azimuth_rad, -math.pi, math.pi)
-    in_range(f"{name}.std_rad", std_rad, 0.0, 1e3, open_low=True)
+        yield f"sightings[{i}].azimuth_rad", sighting.azimuth_rad, -math.pi, math.pi
+        yield f"sightings[{i}].std_rad", sighting.std_rad, _ABOVE_ZERO, 1e3
+        yield f"sightings[{i}].score", sighting.score, 0.0, 1.0

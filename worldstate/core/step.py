@@ -8,7 +8,7 @@ import numpy as np
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.posterior import abduce
+from worldstate.abduction.posterior import posterior_of
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death
@@ -107,7 +107,7 @@ def _with_hand_overs(
     # that sound would give birth to a second hidden entity.
     pairs = zip(signature.hidden, handover_ns, strict=True)
     before = [hidden for hidden, stamp_ns in pairs if stamp_ns is not None and stamp_ns > begin_ns]
-    return replace(signature, visible=max([signature.visible, *before]))
+    return replace(signature, visible=max([signature.visible, *before])) if before else signature
 
 
 def update_sightings(
@@ -144,7 +144,7 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     """Return the memory after the sustained rule has seen this window's statistic."""
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
     log_prior = np.log(model.policy.reference_prior)
-    instant = abduce(log_prior, measurement.signature, measurement.co_evidence)
+    instant = posterior_of(log_prior, measurement.signature, measurement.co_evidence)
     held = instant.hidden_total >= model.policy.gamma_at(memory.threshold.shift_nats)
     alerted = replace(memory, instant=instant, rule=memory.rule.advance(held))
     return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, model.policy))

@@ -3,6 +3,7 @@
 Every check names the argument, what came and what was expected.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,7 +26,8 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(f"{name}: expected numbers, got {type(value).__name__}") from error
-    check_shape(name, array.shape, shape)
+    if array.shape != shape:
+        check_shape(name, array.shape, shape)
     if not np.isfinite(array).all():
         raise InvalidArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
     return array
@@ -80,7 +82,12 @@ def in_range(
     >>> in_range("alpha", 0.02, 0, 1, open_low=True)
     0.02
     """
-    number = float(finite_array(name, value, ()))
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(f"{name}: expected a number, got {type(value).__name__}") from error
+    if not math.isfinite(number):
+        raise InvalidArgumentError(f"{name}: expected a finite number, got {number}")
     below = number <= low if open_low else number < low
     above = number >= high if open_high else number > high
     if below or above:

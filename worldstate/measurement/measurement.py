@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import in_range
 from worldstate.ground.values import NotUsable
 
 
@@ -51,9 +50,6 @@ class Approach:
 
     inverse_tta_hz: float
     std_hz: float
-
-    def __post_init__(self) -> None:
-        in_range("std_hz", self.std_hz, 0.0, float("inf"), open_low=True)
 
 
 @dataclass(frozen=True, slots=True)
