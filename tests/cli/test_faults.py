@@ -1,5 +1,6 @@
 """Faults of files, disks and users: one line and exit code 2, nothing destroyed, nothing left behind."""
 
+import json
 import os
 import resource
 import signal
@@ -12,9 +13,14 @@ import numpy as np
 import pytest
 import soundfile
 
+from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.datasets.ovad import OvadDataset
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.adapters.simulation.dataset.dataset import LogRow, write_log
 from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.operations.recordings.hop_table import HopTable, save_tables
 
 COMMAND = (sys.executable, "-m", "worldstate.cli.main")
 RECORDING = "set/SA1/left/1_00_0000"
@@ -80,6 +86,8 @@ def files(tmp_path, monkeypatch) -> Path:
         ("run a.wav --gating a.wav", "expected a figure name"),
         ("run a.wav --figure folder.png", "found a folder"),
         ("run a.wav --figure f.png --gating f.png", "--gating than for --figure"),
+        ("bearings a.wav --out a.wav", "a.wav: expected another file"),
+        ("identifiability --array mics.xml --figure mics.xml", "expected a figure name"),
         ("doctor a.wav --figure a.wav", "expected a figure name"),
         ("calibrate a.wav m.json --out m.json", "m.json"),
         ("calibrate a.wav --out m2.json --save-streams m2.json", "save_streams"),
@@ -145,6 +153,84 @@ def test_bytes_that_are_no_sound_are_one_line(command, suffix, tmp_path, capsys)
     sound.write_bytes(np.random.default_rng(1).bytes(5000))
     out = ["--out", str(tmp_path / "m.json")] if command == "calibrate" else []
     assert str(sound) in refusal([command, str(sound), *out], tmp_path, capsys)
+
+
+def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return bytes as a bad disk or a bad hand leaves them: changed, cut, doubled or filled with zeros."""
+    at, end = sorted(rng.integers(0, len(data) + 1, 2).tolist())
+    kind = rng.integers(4)
+    if kind == 0:
+        changed = bytearray(data)
+        for place in rng.integers(0, len(data), 4):
+            changed[place] = rng.integers(256)
+        return bytes(changed)
+    return (data[:at], data[:end] + data[at:], data[:at] + bytes(end - at) + data[end:])[kind - 1]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """Small inputs of every kind, each of which its command reads."""
+    folder = tmp_path_factory.mktemp("whole")
+    rng = np.random.default_rng(1)
+    soundfile.write(folder / "sound.wav", rng.normal(0, 0.1, (9000, 4)), 8000, "PCM_16")
+    array = MicrophoneArray(np.array([[0.0, y, 0.0] for y in (-0.3, -0.1, 0.1, 0.3)]))
+    write_array_xml(folder / "array.xml", array)
+    (folder / "array.csv").write_text("x,y,z\n0,0.1,0\n0,-0.1,0\n0.1,0,0\n")
+    (folder / "array.json").write_text("[[0, 0.1, 0], [0, -0.1, 0], [0.1, 0, 0]]")
+    save_model(folder / "model.json", read_model())
+    columns = {
+        "time_s": 1.0 + 0.1 * np.arange(30), "log_likelihoods": np.zeros((30, 4)),
+        "answer": np.zeros(30, np.int64), "miss_rate": np.ones(30), "clutter_rate": np.zeros(30),
+        "approach": np.full(30, np.nan),
+        "seen": np.zeros(30, bool), "there": np.zeros(30, bool),
+    }  # fmt: skip
+    save_tables(folder / "streams.npz", [HopTable(columns, name="a")])
+    labels = np.array(["none", "left", "front", "right"])
+    table = FeatureTable(rng.random((4, 60)), labels, labels, np.repeat("SA1", 4), labels, (None, 7, 7, 7))
+    write_features(folder / "table.csv", table)
+    (folder / "ids.csv").write_text("ID\nnone\n")
+    frame = {"boxes": [[0, 0, 10, 20]], "scores": [0.9], "classes_str": ["car"]}
+    (folder / "boxes.json").write_text(json.dumps({"detections_per_frame": [frame, frame]}))
+    result = {"image_id": 0, "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}
+    (folder / "coco.json").write_text(json.dumps([result]))
+    write_log(folder, [LogRow("1_00_0002", "SA1", "left", 70)])
+    return folder
+
+
+READERS = {
+    "sound.wav": "doctor {} --array {whole}/array.xml",
+    "array.xml": "bounds --array {}",
+    "array.csv": "bounds --array {}",
+    "array.json": "bounds --array {}",
+    "model.json": "model {}",
+    "streams.npz": "calibrate {} --out {new}",
+    "table.csv": "train {} --out {new}",
+    "ids.csv": "train {whole}/table.csv --exclude {} --out {new}",
+    "boxes.json": "run {whole}/array.xml --detections {}",
+    "coco.json": "run {whole}/array.xml --detections {}",
+    "DataLog.csv": "extract-features {folder} --out {new}",
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_damaged_file_is_read_or_refused_in_one_line(name, whole, tmp_path, capsys):
+    rng = np.random.default_rng(len(name))
+    data, file, new = (whole / name).read_bytes(), tmp_path / name, tmp_path / "new"
+    refused = 0
+    for _ in range(16):
+        spoilt = damaged(data, rng)
+        file.write_bytes(spoilt)
+        line = READERS[name].format(file, whole=whole, folder=tmp_path, new=new)
+        code = main(line.split())
+        said = capsys.readouterr().err.strip().splitlines()
+        assert code in (0, 1, 2)
+        # Before the refusal a command may have said what it takes the array to be.
+        assert code != 2 or (said[-1].startswith("worldstate: ") and not new.exists()), said
+        assert file.read_bytes() == spoilt
+        assert {path.name for path in tmp_path.iterdir()} <= {name, "new"}
+        new.unlink(missing_ok=True)
+        refused += code == 2
+    assert refused >= 2
 
 
 # --- disks -----------------------------------------------------------------------------------------------

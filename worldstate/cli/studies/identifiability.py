@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
@@ -61,11 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from dataclasses import asdict
 
-    from worldstate.operations.figure_style import check_suffix
     from worldstate.studies.paper.identifiability_figure import write_identifiability_figure
 
-    if arguments.figure is not None:
-        check_suffix(arguments.figure)
+    check_outputs(arguments, figures=("figure",))
     array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
     if arguments.figure is not None:
         write_identifiability_figure(arguments.figure, array, data, bands)

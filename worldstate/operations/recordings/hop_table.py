@@ -16,6 +16,7 @@ from worldstate.ground.typing import AnyArray, BoolArray
 # An hour of hops with a feature of 60 values each takes 20 MB.
 MAX_BYTES = 512 << 20
 MAX_RECORDINGS = 100_000
+MAX_HEAD_BYTES = 64 << 20
 # Files of other versions are caches of other code: they are refused, and made again where they can be.
 VERSION = 3
 # Stamps are whole nanoseconds, T0 a camera frame: a hop that ends at T0 may miss it by round-off.
@@ -130,7 +131,10 @@ def load_tables(
 
 
 def _tables(arrays: dict[str, AnyArray], origin: str) -> list[HopTable]:
-    head = json.loads(str(arrays.pop("")))
+    about = arrays.pop("")
+    if about.nbytes > MAX_HEAD_BYTES:
+        raise InvalidArgumentError(f"expected a head of at most {MAX_HEAD_BYTES >> 20} MiB")
+    head = json.loads(str(about))
     if head["version"] != VERSION:
         raise InvalidArgumentError(f"version: expected {VERSION}, got {head['version']}")
     if head["origin"] != origin:
