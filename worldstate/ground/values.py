@@ -22,6 +22,11 @@ class NotUsable:
 
     It is neither zero nor missing: whoever fuses it must marginalise the quantity.
 
+    Parameters
+    ----------
+    reason : str
+        Why it cannot be given.
+
     Examples
     --------
     >>> NotUsable("no stable tone")

@@ -128,6 +128,16 @@ def site(name: str) -> Site:
     seeded with its name, so that a site keeps its face from one recording to the next. DA1 is the place of
     SA1, and so on: there the ego moves.
 
+    Parameters
+    ----------
+    name : str
+        One of `SITES` or `MOVING_SITES`.
+
+    Returns
+    -------
+    Site
+        Walls, corners and occluders, metres.
+
     Raises
     ------
     InvalidArgumentError

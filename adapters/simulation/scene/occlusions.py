@@ -49,6 +49,16 @@ OCCLUSIONS = {"lead-vehicle": lead_vehicle, "bridge-pier": bridge_pier, "merge":
 def occluded_scene(name: str) -> OccludedScene:
     """Return a scene by its name.
 
+    Parameters
+    ----------
+    name : str
+        One of `OCCLUSIONS`.
+
+    Returns
+    -------
+    OccludedScene
+        Site, approach and route of the vehicle.
+
     Raises
     ------
     InvalidArgumentError

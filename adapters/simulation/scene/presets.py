@@ -144,6 +144,16 @@ DEFAULT_PRESET = "street-5"
 def preset(name: str = DEFAULT_PRESET) -> Preset:
     """Return a preset by its name.
 
+    Parameters
+    ----------
+    name : str
+        One of `PRESETS`.
+
+    Returns
+    -------
+    Preset
+        Levels of everything that is not geometry.
+
     Raises
     ------
     InvalidArgumentError

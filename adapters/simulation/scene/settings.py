@@ -192,6 +192,11 @@ def draw_settings(
     kind : str
         One of `KINDS`.
 
+    Returns
+    -------
+    SimulationSettings
+        Of one recording.
+
     Raises
     ------
     InvalidArgumentError

@@ -188,6 +188,11 @@ def calibrate_cueing(
     settings : CueingSettings, optional
         Budgets and method.
 
+    Returns
+    -------
+    CueingCalibration
+        Policies, with what was achieved on other folds.
+
     Raises
     ------
     InvalidArgumentError

@@ -124,6 +124,11 @@ def measure_absence(
     on_frame : callable
         Called after each frame of each video, all levels of all families done.
 
+    Returns
+    -------
+    MissRates
+        Counts for each family, azimuth bin and level.
+
     Raises
     ------
     InvalidArgumentError

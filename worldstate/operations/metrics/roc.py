@@ -23,6 +23,11 @@ def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
     positive : array_like of bool, shape (n,)
         Labels.
 
+    Returns
+    -------
+    float or None
+        In [0, 1].
+
     Raises
     ------
     InvalidArgumentError

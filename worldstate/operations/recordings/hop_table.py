@@ -27,6 +27,24 @@ _SLACK_S = 1e-6
 class HopTable:
     """Columns of equal length, and what holds for the whole recording; a column is read as an attribute.
 
+    Parameters
+    ----------
+    columns : mapping of str to ndarray, shape (n, ...)
+        One row a hop.
+    name : str
+        Of the recording.
+    label : str
+        Side that a vehicle comes from, or "none" for a hazard-free recording.
+    t0_s : float
+        Line-of-sight entry, seconds; NaN where there is none or it is not known.
+    about : mapping
+        Whatever else, ready for JSON.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the columns differ in length.
+
     Examples
     --------
     >>> table = HopTable({"time_s": np.array([1.0, 1.1, 1.2])}, name="a", label="left", t0_s=1.1)
@@ -34,11 +52,11 @@ class HopTable:
     (3, np.float64(1.0), [True, True, False], array([0., 0., 0.]))
     """
 
-    columns: Mapping[str, AnyArray]  # shape (n, ...) each
-    name: str = ""  # Of the recording
-    label: str = "none"  # Side that a vehicle comes from, or "none" for a hazard-free recording
-    t0_s: float = float("nan")  # Line-of-sight entry; NaN where there is none or it is not known
-    about: Mapping[str, Any] = field(default_factory=dict)  # Whatever else, ready for JSON
+    columns: Mapping[str, AnyArray]
+    name: str = ""
+    label: str = "none"
+    t0_s: float = float("nan")
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, column in self.columns.items():

@@ -103,6 +103,11 @@ def run_recording(
     on_hop : callable
         Called after each hop, for progress.
 
+    Returns
+    -------
+    RecordingReport
+        Warnings, timeline, health and bearings.
+
     Raises
     ------
     InputFileError

@@ -97,6 +97,11 @@ def train_model(
     on_step : callable
         Called after each cross-validation and after the last fit.
 
+    Returns
+    -------
+    Model
+        Signature, policies and provenance.
+
     Raises
     ------
     InvalidArgumentError

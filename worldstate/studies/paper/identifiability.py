@@ -78,6 +78,11 @@ def reach_on_data(
     groups : array_like, shape (n,), optional
         Recording of each window; windows stand alone where not given.
 
+    Returns
+    -------
+    ReachOnData
+        Information in bits, the two bounds, and the classifier's own error.
+
     Raises
     ------
     InvalidArgumentError
@@ -164,6 +169,11 @@ def reach_of_array(
         Independent snapshots.
     vision_std_rad : float
         Of the camera; inf without one.
+
+    Returns
+    -------
+    ReachOfArray
+        Standard deviations, shape (n,), and the share of the best direction's information.
 
     Raises
     ------
