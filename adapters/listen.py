@@ -22,6 +22,8 @@ from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
+from worldstate.adapters.files.engine_file import EngineSpeed, read_engine
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.default_band import default_band_hz
@@ -31,6 +33,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
@@ -157,6 +160,12 @@ class Source:
         d of the camera, or a function from the stamp to it.
     site : SiteEstimate or None
         What is known of the site beforehand, from a checkpoint.
+    resume : WorldFilter or None
+        Belief to go on from; hops up to its time are heard, which fills the windows, and not measured.
+    start_ns : int
+        Time of the first sample on the clock of that belief.
+    engine : EngineSpeed or None
+        Of the own vehicle, whose lines are then cancelled together with its learned noise.
 
     Examples
     --------
@@ -185,6 +194,15 @@ class Source:
     miss_rates: MissRates | None = None
     degradation: float | Callable[[int], float] = 0.0
     site: SiteEstimate | None = None
+    resume: WorldFilter | None = None
+    start_ns: int = 0
+    engine: EngineSpeed | None = None
+
+    def world(self) -> WorldFilter:
+        """Return the belief before the first hop."""
+        if self.resume is None:
+            return WorldFilter(context=self.context, policy=self.policy)
+        return replace(self.resume, policy=self.policy)
 
     @property
     def audio_path(self) -> Path:
@@ -222,8 +240,10 @@ class Step:
         What the front-end read from the sound.
     measurement : Measurement
         What the adapter made of it.
-    state : WorldState
-        The snapshot after it.
+    world : WorldFilter
+        The belief after it; `state` is its snapshot.
+    site : SiteEstimate or None
+        What is known of the site after it; None where no site is learned.
 
     Examples
     --------
@@ -241,7 +261,13 @@ class Step:
 
     frame: AcousticFrame
     measurement: Measurement
-    state: WorldState
+    world: WorldFilter
+    site: SiteEstimate | None = None
+
+    @property
+    def state(self) -> WorldState:
+        """The snapshot after the hop."""
+        return self.world.state
 
 
 def open_source(
@@ -254,7 +280,9 @@ def open_source(
     miss_rates: Path | str | MissRates | None = None,
     model: Path | str | Model | None = None,
     context: Context | None = None,
-    site: SiteEstimate | None = None,
+    resume: Path | str | Checkpoint | None = None,
+    start_s: float = 0.0,
+    engine: Path | str | EngineSpeed | None = None,
     settings: ListenSettings | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
@@ -281,8 +309,13 @@ def open_source(
         Model; the one that ships where not given.
     context : Context, optional
         Rates, occluders and ego motion; defaults where not given.
-    site : SiteEstimate, optional
-        What is known of the site beforehand, from a checkpoint.
+    resume : path or Checkpoint, optional
+        Belief and site to go on from. Hops up to its time are heard, which fills the windows, and not
+        measured: the same recording again goes on where the other run ended.
+    start_s : float
+        Time of the first sample on the clock of that belief, for a recording that follows another.
+    engine : path or EngineSpeed, optional
+        Speed of the own engine, as `read_engine` reads it; its lines are cancelled, with `ego_noise` only.
     settings : ListenSettings, optional
         How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
 
@@ -296,7 +329,8 @@ def open_source(
     InputFileError
         If a file is missing or damaged; the message names it.
     InvalidArgumentError
-        If the model holds no threshold for the budget, or both detections and a detector are given.
+        If the model holds no threshold for the budget, both detections and a detector are given, or an engine
+        without `ego_noise`.
     OutOfDomainError
         If the array is not that of the data set, or not the model's.
 
@@ -327,6 +361,10 @@ def open_source(
     moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
     if settings.uncalibrated or not states_budget(chosen.domain, heard_by, moves):
         policy = replace(policy, alpha=0.0)
+    if engine is not None and not settings.ego_noise:
+        raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
+    before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
+    start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
     return Source(
         sound=recording.audio_path if recording else sound,
         array=heard_by,
@@ -340,7 +378,10 @@ def open_source(
         camera=lens,
         miss_rates=rates,
         degradation=_degradation(recording, rates),
-        site=site,
+        site=None if before is None else before.site,
+        resume=None if before is None else before.world,
+        start_ns=start_ns,
+        engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
     )
 
 
@@ -464,15 +505,18 @@ def listen_steps(source: Source) -> Iterator[Step]:
     ...     [step.frame.feature.shape for step in listen_steps(open_source(path))]
     [(60,), (60,), (60,)]
     """
-    world = WorldFilter(context=source.context, policy=source.policy)
-    measured = measure_steps(source, lambda: world.explanation.none)
+    world, signature = source.world(), source.signature()
+    measured = measure_steps(source, lambda: world.explanation.none, signature)
     for frame, measurement in measured:
         world = world.predict_to(measurement.stamp_ns).update(measurement)
-        yield Step(frame, measurement, world.state)
+        site = signature.estimate if isinstance(signature, SiteSignature) else None
+        yield Step(frame, measurement, world, site)
 
 
 def measure_steps(
-    source: Source, none_probability: Callable[[], float] | None = None
+    source: Source,
+    none_probability: Callable[[], float] | None = None,
+    signature: Signature | None = None,
 ) -> Iterator[tuple[AcousticFrame, Measurement]]:
     """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
 
@@ -483,6 +527,8 @@ def measure_steps(
     none_probability : callable, optional
         Asked after every hop for the belief that nothing is there, which gates the learning of ego-noise;
         without it none is learned.
+    signature : Signature, optional
+        `source.signature()`, for those who want to know what it has learned.
 
     Yields
     ------
@@ -511,14 +557,23 @@ def measure_steps(
         adapter = AcousticAdapter(
             source.array,
             audio.sample_rate_hz,
-            source.signature(),
+            signature or source.signature(),
+            start_ns=source.start_ns,
             vision=source.camera_channel(),
             grounding=source.settings.grounding,
             front_end_settings=source.settings.front_end(source.array, audio.sample_rate_hz),
             uncalibrated=source.settings.uncalibrated,
         )
-        for block in audio.blocks(max(int(audio.sample_rate_hz / BLOCKS_PER_SECOND), 1)):
-            for frame in adapter.front_end.process(block):
+        front_end, since_ns = adapter.front_end, -1 if source.resume is None else source.resume.stamp_ns
+        rate_hz, taken = audio.sample_rate_hz, 0
+        for block in audio.blocks(max(int(rate_hz / BLOCKS_PER_SECOND), 1)):
+            if source.engine is not None:
+                front_end.follow_engine(source.engine.at(seconds(source.start_ns) + taken / rate_hz))
+                taken += len(block)
+            for frame in front_end.process(block):
+                # What the belief to go on from has taken in already only fills the windows.
+                if frame.stamp_ns <= since_ns:
+                    continue
                 yield frame, adapter.interpret(frame)
                 if none_probability is not None:
                     adapter.set_no_source_probability(none_probability())

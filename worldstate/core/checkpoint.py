@@ -14,6 +14,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
+from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Priors
 
 from .memory import Memory
@@ -52,6 +53,7 @@ class _Memory:
     predicted: Priors | None
     instant: _Posterior | None
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
+    bearing: Bearing | None = None
 
 
 @dataclass(frozen=True, slots=True)

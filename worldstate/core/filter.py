@@ -172,6 +172,7 @@ class WorldFilter:
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
             cues=cues_of(memory, self._model, self.risk, alarmed(memory)),
             calibrated=self.policy.alpha > 0.0,
+            bearing=memory.bearing,
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":

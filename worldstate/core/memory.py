@@ -8,6 +8,7 @@ from worldstate.abduction.posterior import Posterior
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.track import Track
+from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Priors
 
 
@@ -30,6 +31,7 @@ class Memory:
     instant: Posterior | None = None
     # How far the threshold has moved, where the policy lets it.
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
+    bearing: Bearing | None = None  # Of the last measurement
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

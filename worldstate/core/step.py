@@ -17,7 +17,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import predict_track
 from worldstate.belief.vision_update import log_co_evidence, surviving, vision_update
-from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, seconds
+from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.state import Context
 
@@ -194,5 +194,6 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
         lag=lag,
         births=hidden.births,
         seq=memory.seq + 1,
+        bearing=None if isinstance(measurement.bearing, NotUsable) else measurement.bearing,
         last_ns=tuple(sorted(last_ns.items())),
     )

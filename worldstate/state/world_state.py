@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
+from worldstate.measurement.measurement import Bearing
 
 from .context import Context
 from .cue import RiskCue
@@ -42,6 +43,8 @@ class WorldState:
     calibrated : bool
         Whether the cues hold to a false-alarm budget, of a model that is used for what it was made for. Where
         not, no cue states an alpha.
+    bearing : Bearing or None
+        Loudest source of the last measurement, with its standard deviation; None where it had no bearing.
 
     Examples
     --------
@@ -50,7 +53,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.1.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.2.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -61,6 +64,7 @@ class WorldState:
     frame_id: str = "base_link"
     clock: str = "media"
     calibrated: bool = field(default=False, metadata=ADDED)
+    bearing: Bearing | None = None
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.

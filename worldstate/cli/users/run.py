@@ -18,13 +18,16 @@ from worldstate.cli.common.sound_options import add_sound_options, sound_of
 from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
+    from worldstate.adapters.files.engine_file import EngineSpeed
     from worldstate.adapters.listen import Source
 
 DESCRIPTION = """\
 Listen to a recording and keep the world-state.
 
-Without detections the camera counts as
-not asked, which is neither presence nor absence.
+Without detections the camera counts as not asked, which is neither presence nor absence.
+
+--save-state keeps belief and site, --resume goes on from them: with the same recording after what was heard
+before, with the recording that follows it by --start, its first sample's time on the state's clock.
 
 --gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
 coverage, where only prominent peaks are kept."""
@@ -32,7 +35,9 @@ coverage, where only prominent peaks are kept."""
 EXAMPLE = """\
 examples:
   worldstate run some.wav --array mics.csv --detections d.json --camera camera.json --out states.jsonl
-  worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png"""
+  worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
+  worldstate run second.wav --resume state.json --start 60 --save-state state2.json
+  worldstate run drive.wav --ego-noise --engine-rpm rpm.csv"""
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -80,11 +85,22 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
         "--ego-noise", action="store_true",
         help="learn the own vehicle's noise while nothing is there and hear past it (default: off)",
     )  # fmt: skip
+    parser.add_argument(
+        "--engine-rpm", type=Path, metavar="CSV",
+        help="columns time_s, rpm of the own engine: cancel its lines, with --ego-noise",
+    )  # fmt: skip
+    parser.add_argument(
+        "--engine-lines", type=float, default=2.0, metavar="N",
+        help="firings a turn: half the cylinders (default: %(default)g)",
+    )  # fmt: skip
+    parser.add_argument("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("output")
     group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    group.add_argument("--save-state", type=Path, metavar="STATE", help="keep belief and site for --resume")
     group.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
     group.add_argument(
         "--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence"
@@ -95,11 +111,12 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command; return its exit code."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
+    from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.cli.common.listening import listen_with_progress
     from worldstate.operations.recordings.bearing_gating import bearing_figures, write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
-    check_outputs(arguments, "out", figures=("figure", "gating"))
+    check_outputs(arguments, "out", "save_state", figures=("figure", "gating"))
     source = _source(arguments)
     try:
         report = listen_with_progress(source, title=str(source.audio_path), states_path=arguments.out)
@@ -107,6 +124,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.mask_dead:
             raise
         raise InputFileError(error.path, f"{error.problem}; --mask-dead leaves them out") from error
+    if arguments.save_state is not None and report.end is not None:
+        save_checkpoint(arguments.save_state, report.end)
     if arguments.figure is not None:
         write_timeline(report.timeline, arguments.figure)
     summary = report.to_dict() | {
@@ -144,5 +163,17 @@ def _source(arguments: argparse.Namespace) -> "Source":
         camera=arguments.camera,
         miss_rates=arguments.miss_rates,
         model=arguments.model,
+        resume=arguments.resume,
+        start_s=arguments.start,
+        engine=_engine(arguments),
         settings=settings,
     )
+
+
+def _engine(arguments: argparse.Namespace) -> "EngineSpeed | None":
+    from worldstate.adapters.files.engine_file import read_engine
+    from worldstate.ground.checks import in_range
+
+    if arguments.engine_rpm is None:
+        return None
+    return read_engine(arguments.engine_rpm, in_range("--engine-lines", arguments.engine_lines, 0.1, 100.0))

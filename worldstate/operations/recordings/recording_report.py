@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.files.atomic import atomic_path
+from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.adapters.listen import Source, Step, listen_steps
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.values import seconds
@@ -51,6 +52,8 @@ class RecordingReport:
         What was wrong with the microphones.
     bearings : HopTable
         Bearings and their prominence, beside the moving boxes of the camera: see `check_bearings`.
+    end : Checkpoint or None
+        Belief and site after the last hop, to go on from; None where there was none.
 
     Examples
     --------
@@ -75,6 +78,7 @@ class RecordingReport:
     realtime_factor: float
     health: RecordingHealth
     bearings: HopTable
+    end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
@@ -131,12 +135,13 @@ def run_recording(
     (3, None)
     """
     log = _HopLog(WarningMeter(source.t0_s, source.hazard_free))
-    started = time.perf_counter()
+    started, end = time.perf_counter(), None
     with _states_writer(states_path) as write_state:
         for step in listen_steps(source):
             write_state(step.state)
             log.add(step)
             on_hop(step)
+            end = Checkpoint(step.world, step.site)
     elapsed_s = time.perf_counter() - started
     hops = HopTable.of_rows(_COLUMNS, log.rows)
     return RecordingReport(
@@ -147,6 +152,7 @@ def run_recording(
         realtime_factor=float(hops.time_s.max(initial=0.0)) / elapsed_s,
         health=log.health.summary(),
         bearings=check_bearings(hops, log.moving_rad),
+        end=end,
     )
 
 

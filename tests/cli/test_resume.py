@@ -1,0 +1,58 @@
+"""A run that goes on where another ended, the engine's speed, and the bearing in the snapshot."""
+
+import json
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.listen import ListenSettings, open_source
+from worldstate.cli.main import main
+from worldstate.ground.errors import InvalidArgumentError
+
+
+@pytest.mark.xdist_group("approach")
+@pytest.mark.parametrize("follows", [False, True])
+def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path):
+    sound, rate = soundfile.read(approach.audio_path, dtype="float32")
+    sound, half = sound[: 8 * rate], 4 * rate
+    # What follows overlaps by the second that fills the windows.
+    first = half - rate if follows else 0
+    for name, part in (("whole", sound), ("half", sound[:half]), ("rest", sound[first:])):
+        soundfile.write(tmp_path / f"{name}.wav", part, rate, subtype="FLOAT")
+    given = ["--array", str(approach.array_path)]
+    state = str(tmp_path / "state.json")
+
+    def run(name, *options):
+        out = tmp_path / "s.jsonl"
+        assert main(["run", str(tmp_path / f"{name}.wav"), *given, *options, "--out", str(out)]) == 0
+        return [json.loads(line) for line in out.read_text().splitlines()]
+
+    whole = run("whole")
+    before = run("half", "--save-state", state)
+    after = run("rest", "--resume", state, "--start", str(first / rate))
+    assert len(before) + len(after) == len(whole)
+    if not follows:
+        assert before + after == whole
+    heard = [(s["stamp_ns"], s["cues"][0]["risk"], s["bearing"]["azimuth_rad"]) for s in before + after]
+    expected = [(s["stamp_ns"], s["cues"][0]["risk"], s["bearing"]["azimuth_rad"]) for s in whole]
+    # The frames of the transform lie elsewhere in a file that begins elsewhere.
+    np.testing.assert_allclose(heard, expected, rtol=1e-9, atol=0.05)
+    assert set(whole[0]["bearing"]) == {"azimuth_rad", "std_rad", "prominence"}
+
+
+@pytest.mark.xdist_group("approach")
+def test_the_engine_is_followed_with_ego_noise_only(approach, tmp_path, capsys):
+    speed = tmp_path / "rpm.csv"
+    speed.write_text("time_s,rpm\n0,1500\n60,1500\n")
+    with pytest.raises(InvalidArgumentError, match="ego_noise"):
+        open_source(approach.folder, engine=speed)
+    source = open_source(approach.folder, engine=speed, settings=ListenSettings(ego_noise=True))
+    assert source.engine is not None
+    assert source.engine.at(3.0) == 50.0
+    assert main(["run", str(approach.folder), "--ego-noise", "--engine-rpm", str(speed), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["hops"] > 50
+    for text in ("time_s,rpm\n", "time_s,rpm\n1,900\n1,900\n", "time_s,rpm\n0,fast\n", "time_s\n0\n"):
+        speed.write_text(text)
+        assert main(["run", str(approach.folder), "--ego-noise", "--engine-rpm", str(speed)]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
