@@ -17,6 +17,7 @@ from worldstate.adapters.simulation.dataset.plan import plan_static
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.operations.recordings.hop_stream import ABSENT
 from worldstate.operations.recordings.hop_table import load_tables, save_tables
 from worldstate.studies.streets.decision_rules import deal, score_rules
@@ -241,7 +242,7 @@ def test_training_on_simulation_is_kept_and_apart_from_the_test(tmp_path, monkey
 
     monkeypatch.setattr("worldstate.studies.streets.street_training.simulated_windows", simulated)
     first, again = (train_on_simulation(tmp_path, preset(), 1, per_approach=1) for _ in range(2))
-    assert first.to_dict() == again.to_dict()
+    assert encode(first) == encode(again)
     assert len(made) == 1
     assert made != [1]
     ensemble = train_on_simulation(tmp_path, preset(), 1, per_approach=1, method="worldstate")

@@ -22,7 +22,7 @@ ROOF = roof_array_56()
 @pytest.fixture(scope="module")
 def street() -> np.ndarray:
     rng = np.random.default_rng(11)
-    return simulate_recording(draw_settings("SA1", "left", rng, duration_s=2.5), rng).audio
+    return simulate_recording(draw_settings("SA1", "left", rng, duration_s=2.5), rng, ROOF).audio
 
 
 @pytest.fixture
@@ -108,13 +108,14 @@ def test_run_refuses_silent_channels_and_says_how_not_to(
     spoilt = street.copy()
     spoilt[:, [6, 9]] = 0.0
     path = write(spoilt)
-    assert main(["run", str(path)]) == 2
+    roof = ["--array", str(path.with_name("mics.xml")), "--uncalibrated"]
+    assert main(["run", str(path), *roof]) == 2
     captured = capsys.readouterr()
     assert "channel 7, 10; --mask-dead leaves them out" in captured.err
     assert captured.out == ""
-    assert main(["run", str(path), "--mask-dead", "--json"]) == 0
+    assert main(["run", str(path), *roof, "--mask-dead", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["masked_microphones"] == [7, 10]
-    assert main(["run", str(write(street)), "--json"]) == 0
+    assert main(["run", str(write(street)), *roof, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["masked_microphones"] == []
 
 
