@@ -70,7 +70,7 @@ class HopSpectra:
         whitened = whiten(spectra, powers)
         energies = self._frame_energies(powers)
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
-        health = self._check_channels(samples, energies, matrices)
+        health = self._unmonitored if self.monitor is None else self.monitor.push(samples, energies, matrices)
         prewhitened = self._whitened(spectra, health.mask)
         if self.music is not None:
             self._push_music(self.music, spectra, powers, prewhitened)
@@ -83,13 +83,6 @@ class HopSpectra:
         """Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`."""
         total = powers[:, self._looming].sum(axis=1, dtype=np.float64)
         return np.asarray(total * (2.0 / (0.375 * self._nfft**2)))
-
-    def _check_channels(
-        self, samples: Float32Array, energies: FloatArray, matrices: Complex64Array
-    ) -> ArrayHealth:
-        if self.monitor is None:
-            return self._unmonitored
-        return self.monitor.push(samples, energies, matrices)
 
     def _whitened(self, spectra: Complex64Array, mask: ChannelMask) -> list[Steered]:
         """Prewhitened spectra, phase transform included, and their beams; none without ego-noise settings."""

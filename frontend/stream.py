@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.approach.looming import Looming, fitted_looming
-from worldstate.frontend.approach.tone_stage import ToneReading, ToneStage
+from worldstate.frontend.approach.tone_stage import ToneStage
 from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, segment_feature
-from worldstate.frontend.direction.music_stage import MusicReading
 from worldstate.frontend.direction.peaks import highest_peaks
 from worldstate.frontend.direction.srp import normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
@@ -228,19 +227,14 @@ class FrontEnd:
         flat = samples.ravel()
         with np.errstate(over="ignore", invalid="ignore"):
             energy = float(flat @ flat)
-        if not energy <= _LOUDEST**2:
-            self._refuse_if_too_loud(samples)
-        return samples
-
-    @staticmethod
-    def _refuse_if_too_loud(samples: Float32Array) -> None:
+        if energy <= _LOUDEST**2:
+            return samples
         # Written so that NaN, for which every comparison is false, is refused.
-        loud = ~(np.abs(samples).max(axis=0) <= _LOUDEST)
-        if loud.any():
-            channels = np.flatnonzero(loud).tolist()
-            raise InvalidArgumentError(
-                f"block: expected finite numbers up to {_LOUDEST:g}, got others in channels {channels}"
-            )
+        loud = np.flatnonzero(~(np.abs(samples).max(axis=0) <= _LOUDEST)).tolist()
+        if loud:
+            problem = f"expected finite numbers up to {_LOUDEST:g}, got others in channels {loud}"
+            raise InvalidArgumentError(f"block: {problem}")
+        return samples
 
     def _process_hop(self, hop: Hop) -> AcousticFrame | None:
         with one_blas_thread():
@@ -251,7 +245,7 @@ class FrontEnd:
             return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        settings = self.settings
+        settings, health, music = self.settings, self._hops[-1].health, self._spectra.music
         recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
         peaks = highest_peaks(recent.max(axis=0), self._azimuths, settings.max_peaks)
         bearing = bearing_of(peaks, self._azimuths, settings.bearing_std_rad)
@@ -269,13 +263,13 @@ class FrontEnd:
             peaks=peaks,
             ambiguity=self._ambiguity,
             mirror_bearing_rad=mirror_azimuth_rad(self._mirror, bearing.azimuth_rad),
-            music=self._music(),
+            music=_MUSIC_IS_OFF if music is None else music.read(health.mask),
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),
             bearing_age_s=self._age_s(settings.bearing_hops, hop.end),
-            health=self._hops[-1].health,
-            tone=self._tone_reading(),
+            health=health,
+            tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
         )
 
     def _last(self, n_hops: int) -> list[HopSums]:
@@ -301,20 +295,12 @@ class FrontEnd:
             return float(self._elevations[column.argmax()])
         return highest_peaks(column, self._elevations, 1)[0].azimuth_rad
 
-    def _music(self) -> MusicReading | NotUsable:
-        if self._spectra.music is None:
-            return _MUSIC_IS_OFF
-        return self._spectra.music.read(self._hops[-1].health.mask)
-
     def _tone_stage(self) -> ToneStage | None:
         chosen = self.settings
         if chosen.tone_band_hz is None:
             return None
         window_s = chosen.tone_hops / chosen.hop_rate_hz
         return ToneStage(self.array, self.sample_rate_hz, chosen.tone_band_hz, window_s, chosen.tone_channels)
-
-    def _tone_reading(self) -> ToneReading | NotUsable:
-        return TONE_IS_OFF if self._tone is None else self._tone.read()
 
     def _age_s(self, n_hops: int, end: int) -> float:
         hops = self._last(n_hops)

@@ -41,7 +41,7 @@ class MotionSettings:
     edge_width: float = 0.01
     # In [0, 1]; 0 lets everything through. Below one half, as a car has no edge where it meets its shadow.
     outlined: float = 0.25
-    label: str = "car"  # Motion knows no classes: everything is called this
+    label: str = "car"  # The label of all boxes: background subtraction has no classes
 
     def __post_init__(self) -> None:
         if self.background not in get_args(Background):

@@ -41,7 +41,7 @@ class OnnxSettings:
     labels: tuple[str, ...]  # Names of the classes in the order of the model
     min_score: float = 0.25  # Lowest score that is reported
     most_overlap: float = 0.5  # Of two boxes that overlap by more, the better one is kept
-    size_px: int = 640  # Side of the square that the model takes, where it does not say
+    size_px: int = 640  # Side of the square that the model takes, where its input has no fixed size
 
     def __post_init__(self) -> None:
         if not self.labels:
@@ -192,7 +192,7 @@ def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, 
 
     Shapes: returns (n, 4).
     """
-    # Three forms are told apart by their shape, with C classes and n candidates: (1, 4 + C, n), centre and
+    # Three forms are distinguished by their shape, with C classes and n candidates: (1, 4 + C, n), centre and
     # size with a score a class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6),
     # corners, score and class, of a model that suppresses doubles itself. Six columns with one class are
     # read as the second.

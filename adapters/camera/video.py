@@ -24,8 +24,8 @@ class Video:
     path: Path  # The file
     width_px: int  # Size of a frame
     height_px: int
-    frame_rate_hz: float  # As the file says
-    count: int  # Frames, as the file says; the truth is what `frames` yields
+    frame_rate_hz: float  # From the header of the file
+    count: int  # From the header, which may be wrong: `frames` yields what can be decoded
 
     def frames(self) -> Iterator[ImageArray]:
         """Yield frames of shape (height, width, 3), uint8, blue first, from the beginning."""

@@ -91,7 +91,7 @@ def track_fundamental(
     """
     chosen = settings or HarmonicSettings()
     x, rate = _decimated(*_checked(samples, sample_rate_hz, chosen), chosen.band_high_hz)
-    size, step = round(chosen.window_s * rate), chosen.hop_s * rate
+    size, step = round(chosen.window_s * rate), chosen.step_s * rate
     starts = np.round(np.arange(0, len(x) - size + 1, step)).astype(np.intp)
     frames = x[starts[:, None] + np.arange(size)]
     shape = np.asarray(np.hanning(size + 2)[1:-1], dtype=np.float64)

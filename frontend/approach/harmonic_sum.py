@@ -41,7 +41,7 @@ class HarmonicSettings:
     max_harmonics: int = 20  # Largest number of partials used; 1 tracks a single tone
     # Analysis window (Hann) and its step. The fundamental must be resolved: low_hz > 4 / window_s.
     window_s: float = 0.25
-    hop_s: float = 0.1
+    step_s: float = 0.1
     max_rate_hz: float = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
     # q, nats per partial. An empty partial has 0.6 nats of evidence on average: a lower price lets f / 2 win,
     # a much higher one 2 f where upper harmonics are missing.
@@ -55,7 +55,7 @@ class HarmonicSettings:
         in_range("band_high_hz", self.band_high_hz, self.high_hz, np.inf)
         in_range("max_harmonics", self.max_harmonics, 1, 1000)
         in_range("window_s", self.window_s, 0.0, 10.0, open_low=True)
-        in_range("hop_s", self.hop_s, 0.0, self.window_s, open_low=True)
+        in_range("step_s", self.step_s, 0.0, self.window_s, open_low=True)
         in_range("max_rate_hz", self.max_rate_hz, 0.0, 10.0, open_low=True)
         in_range("partial_price", self.partial_price, 0.0, np.inf)
         in_range("floor_width_hz", self.floor_width_hz, 4.0 / self.window_s, np.inf)
@@ -100,7 +100,7 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
     count = int(np.log(settings.high_hz / settings.low_hz) / step) + 2
     grid = np.geomspace(settings.low_hz, settings.high_hz, count)
     evidence = _harmonic_evidence(ratio, grid, bin_hz, settings)
-    reach = max(1, int(np.ceil(settings.max_rate_hz * settings.hop_s / step)))
+    reach = max(1, int(np.ceil(settings.max_rate_hz * settings.step_s / step)))
     return np.asarray(grid[_viterbi(evidence, reach)])
 
 

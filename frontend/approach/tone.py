@@ -20,7 +20,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray
 from worldstate.ground.values import wrap_angle
 
-# Three parameters are fitted; with fewer samples the residual says little about the noise.
+# Three parameters are fitted; with fewer samples the residual gives no estimate of the noise.
 FEWEST_SAMPLES = 8
 # A grid of a quarter of the resolution puts the coarse peak within an eighth of it: well inside the main
 # lobe.

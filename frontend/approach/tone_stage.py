@@ -39,7 +39,7 @@ _EVIDENT = 18.0
 # Tolerance of the refinement as a share of a resolution, the bound for eta N of 80 dB. From the vertex of a
 # parabola two steps suffice; where three do not converge there is no tone.
 _TOLERANCE, _STEPS = 1e-4, 3
-# Lowest frequency, periods in the window: below, a tone cannot be told from an offset.
+# Lowest frequency, periods in the window: below, a tone is not distinguishable from an offset.
 _FEWEST_PERIODS = 4.0
 
 

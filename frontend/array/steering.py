@@ -58,12 +58,9 @@ class Steering:
         centred = MicrophoneArray(array.centred_m)
         weights = centred.steering(frequencies_hz, azimuths_rad, elevations_rad, speed_of_sound_m_s).conj()
         basis = _thin_basis(weights, max_rank=array.n_microphones // 2)
-        return cls._of(basis, weights if basis is None else basis.conj().transpose(0, 2, 1) @ weights)
-
-    @classmethod
-    def _of(cls, basis: Complex128Array | None, weights: Complex128Array) -> "Steering":
-        single = weights.astype(np.complex64)
         thin = None if basis is None else np.ascontiguousarray(basis, np.complex64)
+        weights = weights if basis is None else basis.conj().transpose(0, 2, 1) @ weights
+        single = weights.astype(np.complex64)
         return cls(thin, single, single.conj(), NodeBeams.of(weights))
 
     @property

@@ -36,7 +36,7 @@ FEATURE_AZIMUTHS_RAD.flags.writeable = False
 # the array file.
 FEATURE_BAND_HZ = (50.0, 1500.0)
 FEATURE_VERSION = "SRP-PHAT pairs 1"
-"""What a model says that it was trained with: another number wherever the feature of a window changes."""
+"""Version of the feature, kept in every model; another number whenever the values for a sound change."""
 FEATURE_NFFT = 512
 FEATURE_SEGMENTS = 2
 

@@ -129,13 +129,11 @@ def _spectrum(E: ComplexArray, A: ComplexArray, norm: RealArray, normalised: boo
     score = 1.0 / np.maximum(outside, floor).astype(np.float64)
     if normalised:
         score /= score.max(axis=1, keepdims=True)
-    mean: FloatArray = score.mean(axis=0)
-    return mean
+    return np.asarray(score.mean(axis=0))
 
 
 def _power(values: ComplexArray, axis: int) -> RealArray:
-    power: RealArray = (values.real**2 + values.imag**2).sum(axis=axis)
-    return power
+    return np.asarray((values.real**2 + values.imag**2).sum(axis=axis))
 
 
 def _leading(R: ComplexArray, count: int) -> Subspace:

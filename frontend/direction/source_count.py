@@ -92,10 +92,8 @@ def _likelihood_score(values: FloatArray, k: int, frames: int, criterion: Criter
     misfit = frames * (microphones - k) * (np.log(noise.mean(axis=1)) - np.log(noise).mean(axis=1))
     parameters = k * (2 * microphones - k)
     if criterion == "aic":
-        aic: FloatArray = 2.0 * misfit + 2.0 * parameters
-        return aic
-    mdl: FloatArray = misfit + 0.5 * parameters * np.log(frames)
-    return mdl
+        return np.asarray(2.0 * misfit + 2.0 * parameters)
+    return np.asarray(misfit + 0.5 * parameters * np.log(frames))
 
 
 def _moment_score(values: FloatArray, k: int, frames: int, _criterion: Criterion) -> FloatArray:
@@ -105,8 +103,7 @@ def _moment_score(values: FloatArray, k: int, frames: int, _criterion: Criterion
     total = np.maximum(noise.sum(axis=1), np.finfo(float).tiny)
     ratio = (microphones - k) * (noise**2).sum(axis=1) / total**2
     t = microphones * (ratio - 1.0 - microphones / frames)
-    score: FloatArray = 0.5 * (frames / microphones) ** 2 * t**2 + 2.0 * (k + 1)
-    return score
+    return np.asarray(0.5 * (frames / microphones) ** 2 * t**2 + 2.0 * (k + 1))
 
 
 def _checked_largest(values: FloatArray, frames: int, criterion: Criterion, max_sources: int | None) -> int:

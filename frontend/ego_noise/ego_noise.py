@@ -15,9 +15,9 @@ detector), so that a source is not learned in the moments before it is detected.
 Sound is learned, and what was learned is used, as far as it comes from below the horizon, where the own
 vehicle is and no street: see `elevation_split`. A wrong weight therefore changes nothing.
 
-Whitened noise that has changed since it was learned, with the speed say, has a level c above that of white
-noise. Its mean over all directions is learned with the same weight, and the steered power is divided by it:
-noise then reads 1/M at any speed.
+Whitened noise that has changed since it was learned, with the speed for example, has a level c above that of
+white noise. Its mean over all directions is learned with the same weight, and the steered power is divided by
+it: noise then reads 1/M at any speed.
 """
 
 import math

@@ -228,7 +228,7 @@ class _Fit:
         # Against the moments that the remembered amplitudes would give: nothing has to be solved.
         expected = self.gram[mine, mine] @ evident[theirs]
         turned = np.einsum("hm,hm->h", self.moment[mine], expected.conj()).astype(np.complex128)
-        # Lines of like strength say more than one loud one that has no neighbour.
+        # Pairs of lines of similar strength carry the phase; one loud line without a neighbour does not.
         turned /= np.sqrt(np.abs(turned) + _TINY) * np.einsum("hh->h", self.gram[mine, mine]).real + _TINY
         angle = 0.0
         for step in _ORDER_STEPS:
@@ -289,7 +289,7 @@ def _signed_kernel(place: FloatArray, bins: IntArray) -> Float32Array:
 
 
 def _inverse_power(spectra: Complex64Array) -> Float32Array:
-    """Return the weights that give every bin unit power, (bins,); silent bins get no say."""
+    """Return the weights that give every bin unit power, (bins,); zero for silent bins."""
     parts = spectra.view(np.float32)
     power = np.einsum("tbm,tbm->b", parts, parts) / np.float32(spectra.shape[0] * spectra.shape[2])
     return np.where(power > _TINY, 1.0 / np.maximum(power, _TINY), 0.0).astype(np.float32)

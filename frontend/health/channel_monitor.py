@@ -81,14 +81,12 @@ class ChannelMonitor:
         span = highest - lowest
         alive = span > 0.0
         self._clipping.push(samples, lowest, highest)
-        self._remember(self._dropout_finder.push(samples, alive))
+        dropouts = self._dropout_finder.push(samples, alive)
+        self._n_dropouts += len(dropouts)
+        self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
         bad = self._judge_hop(samples, energies, span)
         self._geometry_check.push(matrices, len(energies), ~self._activity.suspects)
         return self._report(bad)
-
-    def _remember(self, dropouts: list[Dropout]) -> None:
-        self._n_dropouts += len(dropouts)
-        self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
 
     def _judge_hop(self, samples: Float32Array, energies: FloatArray, span: Float32Array) -> BoolArray:
         """Flag the channels that are silent or crackle in this hop."""
