@@ -109,7 +109,7 @@ def test_same_class_over_sites_pass_bys_and_noise() -> None:
     for name in SITES:
         for side in ("left", "right", "none"):
             settings = draw_settings(name, side, rng, 6.0)
-            classes += compare(seconds_of(simulate_recording(settings, rng).audio, 0.5)).tolist()
+            classes += compare(seconds_of(simulate_recording(settings, rng, ROOF).audio, 0.5)).tolist()
     sound = render(ROOF, pass_by, 2.0, seed=1)
     sound += 0.02 * rng.standard_normal(sound.shape)
     classes += compare(seconds_of(sound, 0.2)).tolist()
@@ -125,7 +125,7 @@ def test_the_stream_gives_nearly_always_the_class_of_the_whole_window() -> None:
     rng, same = np.random.default_rng(4), []
     for name in SITES:
         for side in ("left", "right", "none"):
-            sound = simulate_recording(draw_settings(name, side, rng, 6.0), rng).audio
+            sound = simulate_recording(draw_settings(name, side, rng, 6.0), rng, ROOF).audio
             frames = FrontEnd(ROOF, RATE).process(sound)[::3]
             windows = [sound[frame.sample_index - RATE : frame.sample_index] for frame in frames]
             whole = [published_feature(window, ROOF, RATE) for window in windows]

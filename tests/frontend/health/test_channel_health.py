@@ -160,7 +160,7 @@ def test_a_clean_street_raises_no_alarm(seed: int) -> None:
 @pytest.mark.parametrize(("approach", "seed"), [("left", 5), ("none", 6)])
 def test_simulated_junctions_raise_no_alarm_and_show_a_swap(approach: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    recording = simulate_recording(draw_settings("SB1", approach, rng, duration_s=2.2), rng)
+    recording = simulate_recording(draw_settings("SB1", approach, rng, duration_s=2.2), rng, ROOF)
     found = healths(ROOF, recording.audio, recording.sample_rate_hz)
     assert all(health.is_healthy for health in found)
     assert isinstance(found[-1].coherence, float)
