@@ -57,5 +57,7 @@ def priors_of(explanation: ExplanationBelief) -> Priors:
 def _first_explanation(context: Context) -> ExplanationBelief:
     priors = context.priors
     if priors is None:
+        # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
+        # street.
         return ExplanationBelief.settled(context.directions, context.rates.values_hz)
     return ExplanationBelief.from_priors(context.directions, priors.hidden, priors.visible, priors.none)

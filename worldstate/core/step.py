@@ -107,6 +107,7 @@ def _with_hand_overs(
     # that sound would give birth to a second hidden entity.
     pairs = zip(signature.hidden, handover_ns, strict=True)
     before = [hidden for hidden, stamp_ns in pairs if stamp_ns is not None and stamp_ns > begin_ns]
+    # At least, not equal: what already sounds like a source in view stays that.
     return replace(signature, visible=max([signature.visible, *before])) if before else signature
 
 

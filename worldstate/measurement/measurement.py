@@ -28,7 +28,7 @@ class Bearing:
 
     azimuth_rad: float
     std_rad: float
-    prominence: float = 1.0
+    prominence: float = 1.0  # Of a flat spectrum: claims nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class Sighting:
     label: str
     score: float
     width_rad: float = 0.0
-    moving: bool = True
+    moving: bool = True  # A single image cannot tell
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,4 +120,6 @@ class Measurement:
     bearing: Bearing | NotUsable
     approach: Approach | NotUsable
     sightings: tuple[Sighting, ...] = ()
+    # Overlap is discounted within a source and evidence multiplied across sources: two with one name would
+    # count as one that repeats itself.
     source: str = "acoustic"

@@ -42,12 +42,12 @@ class Rates:
     0.3
     """
 
-    arrival_hz: float = 0.05
-    emergence_hz: float = 0.3
-    departure_hz: float = 0.1
-    reocclusion_hz: float = 0.05
-    visible_arrival_hz: float = 0.05
-    visible_departure_hz: float = 0.3
+    arrival_hz: float = 0.05  # Three vehicles a minute from each side
+    emergence_hz: float = 0.3  # Heard for some 3 s before it comes into view
+    departure_hz: float = 0.1  # One in four hidden vehicles never comes into view
+    reocclusion_hz: float = 0.05  # One in seven vehicles in view goes behind a corner again
+    visible_arrival_hz: float = 0.05  # Along the ego vehicle's own street, as from a side
+    visible_departure_hz: float = 0.3  # In view for 3 s
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -189,12 +189,13 @@ class Context:
     LAYOUT: ClassVar = Layout(order="site ego_speed_mps degradation priors")
 
     rates: Rates = Rates()
+    # Without a map the place is taken for a blind junction, the case that the library is for.
     occluders: tuple[Occluder, ...] = (blind_corner("left", 1), blind_corner("right", -1))
     priors: Priors | None = None
     ego_speed_mps: float | None = None
     degradation: Probability | None = None
     site: str | None = None
-    view_half_angle_rad: float = 0.6
+    view_half_angle_rad: float = 0.6  # Of OVAD's camera
 
     def __post_init__(self) -> None:
         for names in (self.directions, tuple(occluder.id for occluder in self.occluders)):

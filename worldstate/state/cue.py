@@ -62,6 +62,7 @@ class RiskCue:
     log_lambda: float | None
     hypotheses: Priors
     advisory: bool
+    # None, not 0: a threshold without calibration has no budget, while 0 would promise no false alarms.
     alpha: Probability | None = None
     entity_id: str | None = None
     horizon_s: float | None = None

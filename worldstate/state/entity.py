@@ -117,6 +117,7 @@ class Entity:
     classification: tuple[Classification, ...] = ()
     moving: bool = True
     direction: str | None = None
+    # None and not 0 from here on: a zero would read as a standing vehicle at the array.
     azimuth_rate_rad_s: float | None = None
     range_m: float | None = None
     position_m: Vector | None = None
