@@ -11,14 +11,14 @@ def add_command(
     run: Callable[[argparse.Namespace], int],
     name: str,
     summary: str,
-    description: str,
+    document: str | None,
     examples: str,
 ) -> argparse.ArgumentParser:
-    """Return the parser of a command that prints what it found, with --json as one object."""
+    """Return the parser of a command, with --json; its help is the module's document below the first line."""
     parser = subparsers.add_parser(
         name,
         help=summary,
-        description=description,
+        description=(document or "").partition("\n\n")[2].strip(),
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

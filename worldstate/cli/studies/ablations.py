@@ -1,4 +1,12 @@
-"""`worldstate ablations`: what absence, calibration and looming each contribute."""
+"""`worldstate ablations`: what absence, calibration and looming each contribute.
+
+Evaluate recordings with everything on ("full") and with one part changed at a time: the signature alone,
+whatever the camera answered; the raw statistic read as the risk; looming added. Thresholds, risk map and the
+weight of looming are set on other recordings, in five folds that are the same in every row.
+
+INPUT is a data set in the OVAD layout or hop streams that `worldstate calibrate --save-streams` wrote;
+approaches need a T0, and there have to be hazard-free recordings.
+"""
 
 import argparse
 from pathlib import Path
@@ -6,14 +14,6 @@ from pathlib import Path
 from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
-
-DESCRIPTION = """\
-Evaluate recordings with everything on ("full") and with one part changed at a time: the signature alone,
-whatever the camera answered; the raw statistic read as the risk; looming added. Thresholds, risk map and the
-weight of looming are set on other recordings, in five folds that are the same in every row.
-
-INPUT is a data set in the OVAD layout or hop streams that `worldstate calibrate --save-streams` wrote;
-approaches need a T0, and there have to be hazard-free recordings."""
 
 EXAMPLE = """\
 examples:
@@ -28,7 +28,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "ablations",
         "what absence, calibration and looming each contribute",
-        DESCRIPTION,
+        __doc__,
         EXAMPLE,
     )
     parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set or hop streams")

@@ -1,4 +1,21 @@
-"""`worldstate evaluate-degradation`: hazard awareness while the camera fails, beside vision alone."""
+"""`worldstate evaluate-degradation`: hazard awareness while the camera fails, beside vision alone.
+
+Stage blur, darkness and sensor noise, four levels each, on the video of every recording of a data set, and
+print for every state of the camera: hazard awareness, the share of hops after line-of-sight entry, vehicle in
+view, in which it is detected or P(hidden) + P(visible) is above its threshold; vision alone, one minus the
+share of misses: a detection of the vehicle and not of anything else; any detection at all; and false alarms
+per hour of the hazard-free recordings, whose camera is degraded alike. Nobody is told the degradation: d is
+read from the frames, and beta from the table that measure-absence wrote on other recordings.
+
+Thresholds are gamma(alpha) on the hazard-free recordings of other folds. A last row, "off", has no camera.
+
+DATASET is in the OVAD layout with video, as `worldstate simulate --video` writes it. What the camera saw of
+each recording lies in OUT/staged and is not staged again: an interrupted run goes on where it stopped, and
+another model costs a few seconds a recording. The model that ships has heard the real junctions only: at
+simulated ones listen with a model that was trained on other simulated recordings, as below.
+
+OUT/degradation.json is the report, OUT/degradation.png the figure.
+"""
 
 import argparse
 from pathlib import Path
@@ -20,23 +37,6 @@ if TYPE_CHECKING:
     from worldstate.studies.degradation.staged_dataset import StagedDataset
     from worldstate.studies.degradation.staged_degradation import StagedHops
 
-DESCRIPTION = """\
-Stage blur, darkness and sensor noise, four levels each, on the video of every recording of a data set, and
-print for every state of the camera: hazard awareness, the share of hops after line-of-sight entry, vehicle in
-view, in which it is detected or P(hidden) + P(visible) is above its threshold; vision alone, one minus the
-share of misses: a detection of the vehicle and not of anything else; any detection at all; and false alarms
-per hour of the hazard-free recordings, whose camera is degraded alike. Nobody is told the degradation: d is
-read from the frames, and beta from the table that measure-absence wrote on other recordings.
-
-Thresholds are gamma(alpha) on the hazard-free recordings of other folds. A last row, "off", has no camera.
-
-DATASET is in the OVAD layout with video, as `worldstate simulate --video` writes it. What the camera saw of
-each recording lies in OUT/staged and is not staged again: an interrupted run goes on where it stopped, and
-another model costs a few seconds a recording. The model that ships has heard the real junctions only: at
-simulated ones listen with a model that was trained on other simulated recordings, as below.
-
-OUT/degradation.json is the report, OUT/degradation.png the figure."""
-
 EXAMPLE = """\
 example:
   worldstate simulate --out others --static 40 --seed 1 --video --jobs 2
@@ -53,7 +53,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "evaluate-degradation",
         "hazard awareness while the camera fails, beside vision alone",
-        DESCRIPTION,
+        __doc__,
         EXAMPLE,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="recordings with video")

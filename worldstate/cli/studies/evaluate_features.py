@@ -1,4 +1,25 @@
-"""`worldstate evaluate-features`: how well signature and cueing do on labelled feature windows."""
+"""`worldstate evaluate-features`: how well signature and cueing do on labelled feature windows.
+
+Evaluate a signature classifier and its cueing on labelled feature windows.
+
+  --protocol cv        5 folds by recording, stratified by label and junction
+  --protocol lojo      leave one junction out
+  --protocol transfer  learn on windows of a standing ego, predict those of --group
+
+  --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
+                       Keys that end in _absent are of eq. (6) with the visible explanation removed
+  --method worldstate  windows compared with the unlabelled reference of their site, taken from its other
+                       recordings; mirror-symmetric ensemble; eq. (6) with the visible explanation removed.
+                       "rows" and "gains" compare it with the baseline, with the untrained loudest direction,
+                       and with itself given hazard-free windows of the site (a commissioning drive);
+                       Under transfer it is one expert of the pattern above the site's quiet windows, its
+                       risks shifted until hazards are as frequent as in training, and "ensemble" a row
+
+Thresholds and risk maps are set on inner out-of-fold scores. Figures are means over the seeds; intervals are
+the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
+
+With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
+"""
 
 import argparse
 from pathlib import Path
@@ -18,27 +39,6 @@ if TYPE_CHECKING:
 Figures = dict[str, Any]
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
 
-DESCRIPTION = """\
-Evaluate a signature classifier and its cueing on labelled feature windows.
-
-  --protocol cv        5 folds by recording, stratified by label and junction
-  --protocol lojo      leave one junction out
-  --protocol transfer  learn on windows of a standing ego, predict those of --group
-
-  --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
-                       Keys that end in _absent are of eq. (6) with the visible explanation removed
-  --method worldstate  windows compared with the unlabelled reference of their site, taken from its other
-                       recordings; mirror-symmetric ensemble; eq. (6) with the visible explanation removed.
-                       "rows" and "gains" compare it with the baseline, with the untrained loudest direction,
-                       and with itself given hazard-free windows of the site (a commissioning drive);
-                       Under transfer it is one expert of the pattern above the site's quiet windows, its
-                       risks shifted until hazards are as frequent as in training, and "ensemble" a row
-
-Thresholds and risk maps are set on inner out-of-fold scores. Figures are means over the seeds; intervals are
-the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
-
-With --model a finished model is evaluated instead; it is refused where it was trained on these recordings."""
-
 EXAMPLE = """\
 examples:
   worldstate evaluate-features features.csv --group static --protocol lojo --json
@@ -52,7 +52,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "evaluate-features",
         "evaluate signature and cueing on feature windows",
-        DESCRIPTION,
+        __doc__,
         EXAMPLE,
     )
     add_table_options(parser)

@@ -1,4 +1,19 @@
-"""`worldstate identifiability`: what any detector could reach with an array and on a data set."""
+"""`worldstate identifiability`: what any detector could reach with an array and on a data set.
+
+Print bounds that no method can beat ("Evidence of Absence", section VI).
+
+Of an array: the smallest standard deviation of a bearing, over azimuth, for a noise-like source in --band
+with --snr-db at each microphone and --snapshots independent snapshots, alone and with a camera of
+--camera-std; "share" is the bearing information relative to the best direction, which falls to nothing
+towards endfire, while presence and approach speed remain.
+
+Of --features, a table of labelled feature windows: the entropy of the class (front, left, none, right), what
+is known of the class from the features, by three estimates, and Fano's bound on the error of any classifier,
+beside the error that the classifier of --method makes on recordings that it was not trained on.
+
+Of --recordings, a data set in the OVAD layout: the Fisher ratio of each band between windows with a vehicle
+and without one, by level and by the shape of the spectrum alone, and the range in which shape tells most.
+"""
 
 import argparse
 from pathlib import Path
@@ -17,21 +32,6 @@ if TYPE_CHECKING:
 # Both ways to endfire of an array across the vehicle, where the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
 
-DESCRIPTION = """\
-Print bounds that no method can beat ("Evidence of Absence", section VI).
-
-Of an array: the smallest standard deviation of a bearing, over azimuth, for a noise-like source in --band
-with --snr-db at each microphone and --snapshots independent snapshots, alone and with a camera of
---camera-std; "share" is the bearing information relative to the best direction, which falls to nothing
-towards endfire, while presence and approach speed remain.
-
-Of --features, a table of labelled feature windows: the entropy of the class (front, left, none, right), what
-is known of the class from the features, by three estimates, and Fano's bound on the error of any classifier,
-beside the error that the classifier of --method makes on recordings that it was not trained on.
-
-Of --recordings, a data set in the OVAD layout: the Fisher ratio of each band between windows with a vehicle
-and without one, by level and by the shape of the spectrum alone, and the range in which shape tells most."""
-
 EXAMPLE = """\
 examples:
   worldstate identifiability --array mics.xml --snr-db -5 --figure bounds.png
@@ -42,7 +42,7 @@ examples:
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
     parser = add_command(
-        subparsers, run, "identifiability", "bounds on what any detector could reach", DESCRIPTION, EXAMPLE
+        subparsers, run, "identifiability", "bounds on what any detector could reach", __doc__, EXAMPLE
     )
     add = parser.add_argument
     add_array_options(parser, "the 56-microphone roof array")

@@ -1,4 +1,20 @@
-"""`worldstate twin`: the published figures on simulated recordings, beside the paper's."""
+"""`worldstate twin`: the published figures on simulated recordings, beside the paper's.
+
+Simulate occluded approaches and hazard-free recordings of a standing ego, listen to them with the published
+classifier, and print every published figure beside the paper's. As in the paper, the classifier is trained on
+other recordings of the same junctions, simulated too: OUT/training-*.csv holds their windows, and
+--method worldstate trains the ensemble on them instead. --model takes any model file, "default" the one that
+ships, which knows the real junctions only. The sound itself is not kept. Recordings already in OUT are not
+made again, so an interrupted run goes on where it stopped, and another classifier costs nothing.
+
+False alarms depend on a free knob, the rate of distant vehicles. It is part of the preset, set once so that
+the published rule comes to the paper's 350 an hour; --far-rate tries another.
+
+--realism compares simulated windows with the real ones of a feature table, over three seeds: medians,
+transfer both ways, and how well a classifier tells them apart.
+
+OUT/twin.json is the report, OUT/twin.png the figure: ROC, reliability, detection against false alarms.
+"""
 
 import argparse
 from pathlib import Path
@@ -21,22 +37,6 @@ WINDOWS = 10
 REALISM_SEEDS = (1, 2, 3)
 DEFAULT_MODEL = "default"
 
-DESCRIPTION = """\
-Simulate occluded approaches and hazard-free recordings of a standing ego, listen to them with the published
-classifier, and print every published figure beside the paper's. As in the paper, the classifier is trained on
-other recordings of the same junctions, simulated too: OUT/training-*.csv holds their windows, and
---method worldstate trains the ensemble on them instead. --model takes any model file, "default" the one that
-ships, which knows the real junctions only. The sound itself is not kept. Recordings already in OUT are not
-made again, so an interrupted run goes on where it stopped, and another classifier costs nothing.
-
-False alarms depend on a free knob, the rate of distant vehicles. It is part of the preset, set once so that
-the published rule comes to the paper's 350 an hour; --far-rate tries another.
-
---realism compares simulated windows with the real ones of a feature table, over three seeds: medians,
-transfer both ways, and how well a classifier tells them apart.
-
-OUT/twin.json is the report, OUT/twin.png the figure: ROC, reliability, detection against false alarms."""
-
 EXAMPLE = """\
 examples:
   worldstate twin --static 83 --jobs 2 --out twin
@@ -52,7 +52,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "twin",
         "published figures on simulated recordings, beside the paper's",
-        DESCRIPTION,
+        __doc__,
         EXAMPLE,
     )
     parser.add_argument("--static", type=int, default=83, metavar="N", help="recordings (default: 83)")

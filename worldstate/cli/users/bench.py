@@ -1,4 +1,8 @@
-"""`worldstate bench`: what the front-end costs on this machine, beside its peers."""
+"""`worldstate bench`: what the front-end costs on this machine, beside its peers.
+
+Time the acoustic front-end per 0.1-s hop, stage by stage: 56 channels at 47,998 Hz, one BLAS thread. Peers
+that are installed (pyroomacoustics, and the published chain built on it) are timed in the same run.
+"""
 
 import argparse
 import json
@@ -10,10 +14,6 @@ from worldstate.cli.common.progress import progress_bar
 if TYPE_CHECKING:
     from worldstate.operations.arrays.bench import BenchReport
 
-DESCRIPTION = """\
-Time the acoustic front-end per 0.1-s hop, stage by stage: 56 channels at 47,998 Hz, one BLAS thread. Peers
-that are installed (pyroomacoustics, and the published chain built on it) are timed in the same run."""
-
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
@@ -22,7 +22,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "bench",
         "milliseconds per hop, beside the peers",
-        DESCRIPTION,
+        __doc__,
         "example: worldstate bench --rounds 5",
     )
     parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")

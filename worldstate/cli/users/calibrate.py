@@ -1,4 +1,12 @@
-"""`worldstate calibrate`: thresholds of a model from a user's own hazard-free hours."""
+"""`worldstate calibrate`: thresholds of a model from a user's own hazard-free hours.
+
+Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
+
+INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
+that --save-streams wrote. Recordings labelled none and sound files count as hazard-free. Approaches with a
+T0, where there are some, give the risk map (Platt for few, isotonic for many); without them the model's own
+is kept. A budget that the hours do not suffice for is warned about, with the hours that it would take.
+"""
 
 import argparse
 import sys
@@ -13,14 +21,6 @@ from worldstate.cli.common.outputs import check_outputs
 if TYPE_CHECKING:
     from worldstate.operations.calibration.cueing_calibration import CueingCalibration
 
-DESCRIPTION = """\
-Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
-
-INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
-that --save-streams wrote. Recordings labelled none and sound files count as hazard-free. Approaches with a
-T0, where there are some, give the risk map (Platt for few, isotonic for many); without them the model's own
-is kept. A budget that the hours do not suffice for is warned about, with the hours that it would take."""
-
 EXAMPLE = """\
 examples:
   worldstate calibrate night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
@@ -30,7 +30,7 @@ examples:
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
     parser = add_command(
-        subparsers, run, "calibrate", "set thresholds on your own hazard-free hours", DESCRIPTION, EXAMPLE
+        subparsers, run, "calibrate", "set thresholds on your own hazard-free hours", __doc__, EXAMPLE
     )
     parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
     add_array_options(parser)

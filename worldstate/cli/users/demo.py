@@ -1,4 +1,8 @@
-"""`worldstate demo`: one occluded approach, simulated, heard and drawn."""
+"""`worldstate demo`: one occluded approach, simulated, heard and drawn.
+
+Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
+before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder.
+"""
 
 import argparse
 import json
@@ -17,10 +21,6 @@ if TYPE_CHECKING:
 
 VAN_OVER_CAR_DB = 6.0
 
-DESCRIPTION = """\
-Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
-before any camera can see it. Leaves timeline.png, states.jsonl and summary.json in the output folder."""
-
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
@@ -29,7 +29,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "demo",
         "hear one hidden vehicle, from simulation to figure",
-        DESCRIPTION,
+        __doc__,
         "example: worldstate demo --out out/demo --seed 7",
     )
     parser.add_argument(

@@ -1,4 +1,15 @@
-"""`worldstate extract-features`: labelled recordings in, a table of feature windows out."""
+"""`worldstate extract-features`: labelled recordings in, a table of feature windows out.
+
+Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
+array of one's own. The list of labels is CSV with the columns ID, Class (front, left, none, right),
+Environment (S.. standing ego, D.. moving ego, then the junction) and Recording ID; optional are File,
+relative to DATASET, End, the end of the window in seconds from the start of the file (default: its last
+second), and T0. Where no File is given, DATASET/Environment/Class/ID/out_multi.wav and DATASET/ID.wav are
+looked for.
+
+Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
+none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that.
+"""
 
 import argparse
 from pathlib import Path
@@ -12,17 +23,6 @@ from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_extraction import LabelledWindow
-
-DESCRIPTION = """\
-Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
-array of one's own. The list of labels is CSV with the columns ID, Class (front, left, none, right),
-Environment (S.. standing ego, D.. moving ego, then the junction) and Recording ID; optional are File,
-relative to DATASET, End, the end of the window in seconds from the start of the file (default: its last
-second), and T0. Where no File is given, DATASET/Environment/Class/ID/out_multi.wav and DATASET/ID.wav are
-looked for.
-
-Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
-none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that."""
 
 EXAMPLE = """\
 examples:
@@ -38,7 +38,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "extract-features",
         "compute feature windows from labelled recordings",
-        DESCRIPTION,
+        __doc__,
         EXAMPLE,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")

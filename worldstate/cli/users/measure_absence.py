@@ -1,4 +1,16 @@
-"""`worldstate measure-absence`: the miss rate of a camera's detector on staged-degraded frames."""
+"""`worldstate measure-absence`: the miss rate of a camera's detector on staged-degraded frames.
+
+Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
+blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
+detector has to find the reference boxes again (IoU >= 0.3). False detections are counted apart, as clutter.
+
+INPUT is a video, or a data set or recording folder in the OVAD layout with ueye_stereo_vid.mp4 beside the
+sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON or a folder of
+YOLO text. Without any, what the detector itself reports on clean frames is the reference, and its miss rate
+on those is zero by definition.
+
+The file also holds the scale by which d is read from this camera's own images.
+"""
 
 import argparse
 from pathlib import Path
@@ -14,18 +26,6 @@ if TYPE_CHECKING:
     from worldstate.adapters.camera.miss_rates import MissRates
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
 
-DESCRIPTION = """\
-Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
-blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
-detector has to find the reference boxes again (IoU >= 0.3). False detections are counted apart, as clutter.
-
-INPUT is a video, or a data set or recording folder in the OVAD layout with ueye_stereo_vid.mp4 beside the
-sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON or a folder of
-YOLO text. Without any, what the detector itself reports on clean frames is the reference, and its miss rate
-on those is zero by definition.
-
-The file also holds the scale by which d is read from this camera's own images."""
-
 EXAMPLE = """\
 examples:
   worldstate measure-absence sim --detector motion --out beta.json --figure beta.png
@@ -40,7 +40,7 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         run,
         "measure-absence",
         "measure how often a camera's detector misses what is there",
-        DESCRIPTION,
+        __doc__,
         EXAMPLE,
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="video, recording folder or data set")

@@ -1,4 +1,17 @@
-"""`worldstate simulate`: blind-junction recordings in the OVAD layout."""
+"""`worldstate simulate`: blind-junction recordings in the OVAD layout.
+
+Simulate recordings of a vehicle with a roof array at blind junctions, in the OVAD layout: D/DataLog.csv and
+D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json and truth.json: ways, line of
+sight and time to visible of every vehicle. D/array.xml names the microphones. The ego stands (--static, SA1
+to SB3) or drives up to the corner and is heard on its own roof (--dynamic, DA1 to DB3; no camera results
+there, as in OVAD). Every other recording is an approach, from the left and from the right in turn; the others
+are hazard-free.
+The same seed gives the same bytes, whatever the number of jobs. --video adds what the camera sees,
+ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same.
+
+--scene hides the vehicle in the open instead, behind a van ahead, a bridge pier at a ramp, or a barrier that
+ends at a merge; there the ego stands and every approach is from the left.
+"""
 
 import argparse
 from pathlib import Path
@@ -12,19 +25,6 @@ SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
 PRESETS = ("street-5", "street-5-calm")
 
-DESCRIPTION = """\
-Simulate recordings of a vehicle with a roof array at blind junctions, in the OVAD layout: D/DataLog.csv and
-D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json and truth.json: ways, line of
-sight and time to visible of every vehicle. D/array.xml names the microphones. The ego stands (--static, SA1
-to SB3) or drives up to the corner and is heard on its own roof (--dynamic, DA1 to DB3; no camera results
-there, as in OVAD). Every other recording is an approach, from the left and from the right in turn; the others
-are hazard-free.
-The same seed gives the same bytes, whatever the number of jobs. --video adds what the camera sees,
-ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same.
-
---scene hides the vehicle in the open instead, behind a van ahead, a bridge pier at a ramp, or a barrier that
-ends at a merge; there the ego stands and every approach is from the left."""
-
 EXAMPLE = """\
 examples:
   worldstate simulate --out sim --static 4 --seed 1
@@ -35,7 +35,7 @@ examples:
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
     parser = add_command(
-        subparsers, run, "simulate", "write simulated recordings in the OVAD layout", DESCRIPTION, EXAMPLE
+        subparsers, run, "simulate", "write simulated recordings in the OVAD layout", __doc__, EXAMPLE
     )
     parser.add_argument("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     parser.add_argument(

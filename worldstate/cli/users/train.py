@@ -1,4 +1,14 @@
-"""`worldstate train`: a table of feature windows in, a model file out."""
+"""`worldstate train`: a table of feature windows in, a model file out.
+
+Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
+scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data, and
+what the windows were made with: array, sample rate, band, ego's motion. A table that does not say, as the
+released one, counts as OVAD's unless --array and --sample-rate say otherwise.
+
+  --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
+  --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
+                       thresholds half-way between recordings left out and junctions left out
+"""
 
 import argparse
 from pathlib import Path
@@ -13,16 +23,6 @@ from worldstate.cli.common.progress import progress_bar
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_table import FeatureTable
 
-DESCRIPTION = """\
-Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
-scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data, and
-what the windows were made with: array, sample rate, band, ego's motion. A table that does not say, as the
-released one, counts as OVAD's unless --array and --sample-rate say otherwise.
-
-  --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
-  --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
-                       thresholds half-way between recordings left out and junctions left out"""
-
 EXAMPLE = """\
 example:
   worldstate train features.csv --group static --exclude testset.csv --out model.json"""
@@ -31,7 +31,7 @@ example:
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
     parser = add_command(
-        subparsers, run, "train", "train a signature model on feature windows", DESCRIPTION, EXAMPLE
+        subparsers, run, "train", "train a signature model on feature windows", __doc__, EXAMPLE
     )
     add_table_options(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
