@@ -9,16 +9,19 @@ Subparsers = argparse._SubParsersAction  # argparse gives it no public name
 def add_command(
     subparsers: "Subparsers[argparse.ArgumentParser]",
     run: Callable[[argparse.Namespace], int],
-    name: str,
-    summary: str,
     document: str | None,
     examples: str,
 ) -> argparse.ArgumentParser:
-    """Return the parser of a command, with --json; its help is the module's document below the first line."""
+    """Return the parser of a command, with --json.
+
+    `document` is its module's: "`worldstate NAME`: summary.", an empty line, and the description.
+    """
+    head, _, description = (document or "").partition("\n\n")
+    name, _, summary = head.removeprefix("`worldstate ").partition("`: ")
     parser = subparsers.add_parser(
         name,
-        help=summary,
-        description=(document or "").partition("\n\n")[2].strip(),
+        help=summary.removesuffix("."),
+        description=description.strip(),
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

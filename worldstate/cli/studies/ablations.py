@@ -23,19 +23,13 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "ablations",
-        "what absence, calibration and looming each contribute",
-        __doc__,
-        EXAMPLE,
-    )
-    parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set or hop streams")
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
+    add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set or hop streams")
     add_array_options(parser)
-    parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
-    parser.add_argument("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
-    parser.add_argument("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
+    add("--model", type=Path, help="model file (default: the one that ships)")
+    add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
+    add("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:

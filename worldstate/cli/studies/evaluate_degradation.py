@@ -48,16 +48,10 @@ example:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "evaluate-degradation",
-        "hazard awareness while the camera fails, beside vision alone",
-        __doc__,
-        EXAMPLE,
-    )
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="recordings with video")
-    parser.add_argument(
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
+    add("dataset", type=Path, metavar="DATASET", help="recordings with video")
+    add(
         "--miss-rates",
         type=Path,
         required=True,
@@ -65,16 +59,12 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         help="of the same detector, on other recordings",
     )
     add_detector_options(parser)
-    parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
-    parser.add_argument(
-        "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
-    )
-    parser.add_argument("--most", type=int, metavar="N", help="use the first N recordings")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="noise, folds, intervals (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("degradation"), metavar="DIR", help="(default: %(default)s)"
-    )
+    add("--model", type=Path, help="model file (default: the one that ships)")
+    add("--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)")
+    add("--most", type=int, metavar="N", help="use the first N recordings")
+    add("--jobs", type=int, default=1, help="processes (default: %(default)s)")
+    add("--seed", type=int, default=0, help="noise, folds, intervals (default: %(default)s)")
+    add("--out", type=Path, default=Path("degradation"), metavar="DIR", help="(default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -47,29 +47,23 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "evaluate-features",
-        "evaluate signature and cueing on feature windows",
-        __doc__,
-        EXAMPLE,
-    )
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
     add_table_options(parser)
-    parser.add_argument(
+    add(
         "--protocol",
         choices=("cv", "lojo", "transfer"),
         default="cv",
         help="who is held out (default: %(default)s)",
     )
-    parser.add_argument("--model", type=Path, help="evaluate this model file; no cross-validation")
-    parser.add_argument(
+    add("--model", type=Path, help="evaluate this model file; no cross-validation")
+    add(
         "--only", type=Path, metavar="IDS", help="CSV file with a column ID: only recordings of these windows"
     )
-    parser.add_argument("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
-    parser.add_argument("--predictions", type=Path, metavar="CSV", help="write one row a window and seed")
+    add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
+    add("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+    add("--predictions", type=Path, metavar="CSV", help="write one row a window and seed")
 
 
 def run(arguments: argparse.Namespace) -> int:

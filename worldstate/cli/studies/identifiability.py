@@ -41,9 +41,7 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers, run, "identifiability", "bounds on what any detector could reach", __doc__, EXAMPLE
-    )
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
     add = parser.add_argument
     add_array_options(parser, "the 56-microphone roof array")
     add("--features", type=Path, metavar="CSV", help="labelled feature windows")
@@ -145,10 +143,7 @@ def _lines(array: "ReachOfArray", data: "ReachOnData | None", bands: "BandProfil
     for azimuth, std, both, share in zip(*columns, array.endfire, strict=True):
         lines.append(f"{azimuth:8.0f} {std:10.3g} {both:12.3g} {share:7.3f}".replace("inf", "  -"))
     if data is not None:
-        lines += [
-            "",
-            *(f"{name:24} {value:.4g}" for name, value in asdict(data).items()),
-        ]
+        lines += ["", *(f"{name:24} {value:.4g}" for name, value in asdict(data).items())]
     if bands is not None:
         lines += ["", f"{'band, Hz':>16} {'by level':>10} {'by shape':>10}"]
         for low, high, *ratios in zip(

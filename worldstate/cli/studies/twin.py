@@ -47,38 +47,30 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "twin",
-        "published figures on simulated recordings, beside the paper's",
-        __doc__,
-        EXAMPLE,
-    )
-    parser.add_argument("--static", type=int, default=83, metavar="N", help="recordings (default: 83)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
-    parser.add_argument("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
-    parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
-    parser.add_argument("--preset", metavar="NAME", help="levels of the simulation (default: the newest)")
-    parser.add_argument("--far-rate", type=float, metavar="N", help="distant vehicles a recording")
-    parser.add_argument(
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
+    add("--static", type=int, default=83, metavar="N", help="recordings (default: 83)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+    add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
+    add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
+    add("--preset", metavar="NAME", help="levels of the simulation (default: the newest)")
+    add("--far-rate", type=float, metavar="N", help="distant vehicles a recording")
+    add(
         "--method",
         choices=("baseline", "worldstate"),
         default="baseline",
         help="what is trained: the published classifier or the ensemble (default: %(default)s)",
     )
-    parser.add_argument("--model", metavar="FILE", help='classifier: a model file, or "default"')
-    parser.add_argument(
-        "--out", type=Path, default=Path("twin"), metavar="DIR", help="(default: %(default)s)"
-    )
-    parser.add_argument("--realism", type=Path, metavar="CSV", help="real windows to compare with")
-    parser.add_argument(
+    add("--model", metavar="FILE", help='classifier: a model file, or "default"')
+    add("--out", type=Path, default=Path("twin"), metavar="DIR", help="(default: %(default)s)")
+    add("--realism", type=Path, metavar="CSV", help="real windows to compare with")
+    add(
         "--realism-group",
         choices=("static", "dynamic"),
         default="static",
         help="of the real windows: standing or moving ego (default: %(default)s)",
     )
-    parser.add_argument("--keep", action="store_true", help="keep the recordings too, 80 MB each")
+    add("--keep", action="store_true", help="keep the recordings too, 80 MB each")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,12 @@
-"""`worldstate bearings`: the direction of the loudest source at every hop, without a model."""
+"""`worldstate bearings`: the direction of the loudest source at every hop, without a model.
+
+Write the bearing of the loudest source every tenth of a second, for any array, without a model.
+
+--out is CSV with the columns time_s (middle of the sound that the bearing was read from), azimuth_deg (left
+positive), std_deg (standard deviation as the front-end states it) and prominence (peak over median of the
+spatial spectrum; 1 in silence). --sources adds the number of plane waves in each second by an information
+criterion: reflections count, so it is no number of vehicles.
+"""
 
 import argparse
 from pathlib import Path
@@ -15,14 +23,6 @@ from worldstate.cli.common.output import print_summary
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options
 
-DESCRIPTION = """\
-Write the bearing of the loudest source every tenth of a second, for any array, without a model.
-
---out is CSV with the columns time_s (middle of the sound that the bearing was read from), azimuth_deg (left
-positive), std_deg (standard deviation as the front-end states it) and prominence (peak over median of the
-spatial spectrum; 1 in silence). --sources adds the number of plane waves in each second by an information
-criterion: reflections count, so it is no number of vehicles."""
-
 EXAMPLE = """\
 examples:
   worldstate bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
@@ -31,9 +31,7 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers, run, "bearings", "direction of the loudest source every hop", DESCRIPTION, EXAMPLE
-    )
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
     add_sound_options(parser)
     add_array_options(parser)
     add_search_options(parser)

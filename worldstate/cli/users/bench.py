@@ -17,14 +17,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "bench",
-        "milliseconds per hop, beside the peers",
-        __doc__,
-        "example: worldstate bench --rounds 5",
-    )
+    parser = add_command(subparsers, run, __doc__, "example: worldstate bench --rounds 5")
     parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
 
 

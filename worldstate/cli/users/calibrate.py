@@ -29,30 +29,31 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers, run, "calibrate", "set thresholds on your own hazard-free hours", __doc__, EXAMPLE
-    )
-    parser.add_argument("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
+    add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
     add_array_options(parser)
-    parser.add_argument("--model", type=Path, help="model file to start from (default: the one that ships)")
-    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    parser.add_argument(
-        "--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A",
+    add("--model", type=Path, help="model file to start from (default: the one that ships)")
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    add(
+        "--alpha",
+        type=float,
+        nargs="+",
+        default=[0.01, 0.02, 0.05],
+        metavar="A",
         help="budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--method", choices=("conformal", "plain"), default="conformal",
+    )
+    add(
+        "--method",
+        choices=("conformal", "plain"),
+        default="conformal",
         help="with a finite-sample guarantee, or the smallest threshold that fits (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
-    parser.add_argument(
-        "--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)"
     )
-    parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
-    parser.add_argument(
-        "--keep", type=float, metavar="N", help="let the threshold move to keep N false alarms an hour"
-    )
-    parser.add_argument("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
+    add("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
+    add("--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)")
+    add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    add("--keep", type=float, metavar="N", help="let the threshold move to keep N false alarms an hour")
+    add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -24,14 +24,7 @@ VAN_OVER_CAR_DB = 6.0
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "demo",
-        "hear one hidden vehicle, from simulation to figure",
-        __doc__,
-        "example: worldstate demo --out out/demo --seed 7",
-    )
+    parser = add_command(subparsers, run, __doc__, "example: worldstate demo --out out/demo --seed 7")
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)"
     )

@@ -33,14 +33,7 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "extract-features",
-        "compute feature windows from labelled recordings",
-        __doc__,
-        EXAMPLE,
-    )
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")

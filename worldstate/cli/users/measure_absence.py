@@ -35,24 +35,16 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers,
-        run,
-        "measure-absence",
-        "measure how often a camera's detector misses what is there",
-        __doc__,
-        EXAMPLE,
-    )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
-    parser.add_argument("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
+    add("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
+    add("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
     add_detector_options(parser)
-    parser.add_argument(
-        "--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)"
-    )
-    parser.add_argument("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
-    parser.add_argument("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="JSON", help="exactly this file")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw beta over d")
+    add("--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)")
+    add("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
+    add("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
+    add("--out", type=Path, required=True, metavar="JSON", help="exactly this file")
+    add("--figure", type=Path, metavar="PNG", help="draw beta over d")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,14 +1,14 @@
-"""`worldstate model`: the card of a model file."""
+"""`worldstate model`: the card of a model file.
+
+Say what a model was made of and made for: data, recordings, array, sample rates, band, feature, ego's motion,
+thresholds, limits, licence.
+"""
 
 import argparse
 from pathlib import Path
 
 from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.output import print_summary
-
-DESCRIPTION = """\
-Say what a model was made of and made for: data, recordings, array, sample rates, band, feature, ego's motion,
-thresholds, limits, licence."""
 
 EXAMPLE = """\
 examples:
@@ -18,7 +18,7 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(subparsers, run, "model", "what a model was made for", DESCRIPTION, EXAMPLE)
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
     parser.add_argument(
         "file", type=Path, nargs="?", metavar="FILE", help="model file (default: the one that ships)"
     )

@@ -34,26 +34,19 @@ examples:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers, run, "simulate", "write simulated recordings in the OVAD layout", __doc__, EXAMPLE
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="D", help="folder of the data set")
-    parser.add_argument(
-        "--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)"
-    )
-    parser.add_argument("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
-    parser.add_argument(
-        "--scene", choices=SCENES, default=SCENES[0], help="what hides the vehicle (default: %(default)s)"
-    )
-    parser.add_argument("--kind", choices=KINDS, default=KINDS[0], help="vehicle (default: %(default)s)")
-    parser.add_argument(
-        "--preset", choices=PRESETS, default=PRESETS[0], help="how busy the street is (default: %(default)s)"
-    )
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
+    add("--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)")
+    add("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
+    add("--scene", choices=SCENES, default=SCENES[0], help="what hides the vehicle (default: %(default)s)")
+    add("--kind", choices=KINDS, default=KINDS[0], help="vehicle (default: %(default)s)")
+    add("--preset", choices=PRESETS, default=PRESETS[0], help="how busy the street is (default: %(default)s)")
     add_array_options(parser, "OVAD's")
-    parser.add_argument("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
-    parser.add_argument("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
-    parser.add_argument("--video", action="store_true", help="render the camera's video, too")
+    add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+    add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
+    add("--video", action="store_true", help="render the camera's video, too")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -30,12 +30,11 @@ example:
 
 def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
-    parser = add_command(
-        subparsers, run, "train", "train a signature model on feature windows", __doc__, EXAMPLE
-    )
+    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+    add = parser.add_argument
     add_table_options(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    parser.add_argument(
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    add(
         "--exclude",
         type=Path,
         nargs="+",
@@ -44,13 +43,11 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
         metavar="IDS",
         help="CSV files with a column ID: leave out the recordings of these windows",
     )
-    parser.add_argument(
-        "--array", type=Path, metavar="FILE", help="microphones that the windows were heard by"
-    )
-    parser.add_argument("--sample-rate", type=float, metavar="HZ", help="of that sound (default: 47998)")
-    parser.add_argument("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
-    parser.add_argument("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
-    parser.add_argument("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
+    add("--array", type=Path, metavar="FILE", help="microphones that the windows were heard by")
+    add("--sample-rate", type=float, metavar="HZ", help="of that sound (default: 47998)")
+    add("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
+    add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    add("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -132,10 +132,7 @@ def save_tables(path: str | Path, tables: Iterable[HopTable], origin: str = "") 
 
 
 def load_tables(
-    path: str | Path,
-    what: str,
-    origin: str = "",
-    check: Callable[[HopTable], None] = lambda table: None,
+    path: str | Path, what: str, origin: str = "", check: Callable[[HopTable], None] = lambda table: None
 ) -> list[HopTable]:
     """Read what `save_tables` wrote; nothing if of another origin. `check` refuses what does not fit."""
 
