@@ -177,8 +177,7 @@ def save_model(path: str | Path, model: Model) -> None:
 
 def model_to_dict(model: Model) -> dict[str, Any]:
     """Return JSON-able values."""
-    values: dict[str, Any] = encode(model)
-    return values
+    return encode(model)
 
 
 def model_from_dict(data: object, source: object) -> Model:

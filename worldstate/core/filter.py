@@ -232,10 +232,7 @@ class WorldFilter:
         True
         """
         kept = memory_record(self._memory)
-        values: dict[str, Any] = encode(
-            FilterRecord(self.context, self.policy, self.settings, self.start_ns, kept)
-        )
-        return values
+        return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, kept))
 
     @classmethod
     def from_dict(cls, value: object) -> "WorldFilter":

@@ -138,7 +138,7 @@ class _RefusedError(Exception):
         return self
 
 
-def encode(value: Any) -> Any:
+def encode(value: object) -> dict[str, Any]:
     """Return a dataclass as JSON-able values.
 
     Examples
@@ -148,7 +148,8 @@ def encode(value: Any) -> Any:
     {'reason': 'no peak'}
     """
     cls: Hint = type(value)
-    return _plan(cls)[0](value)
+    record: dict[str, Any] = _plan(cls)[0](value)
+    return record
 
 
 @overload

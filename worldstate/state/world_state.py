@@ -91,8 +91,7 @@ class WorldState:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the snapshot as JSON-able values; unknown is None."""
-        values: dict[str, Any] = encode(self)
-        return values
+        return encode(self)
 
     def to_json(self) -> str:
         """Return the snapshot as one line of strict JSON.

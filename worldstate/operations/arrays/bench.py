@@ -23,6 +23,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array
 
 from .bench_peers import peer_times
@@ -70,18 +71,7 @@ class BenchReport:
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values."""
         stages = {name: {"median_ms": median, "p99_ms": p99} for name, (median, p99) in self.stages.items()}
-        return {
-            "blas": list(self.blas),
-            "threads": self.threads,
-            "rounds": self.rounds,
-            "load": self.load,
-            "settings": dict(self.settings),
-            "stages": stages,
-            "total_ms": self.total_ms,
-            "p99_ms": self.p99_ms,
-            "peers": dict(self.peers),
-            "ratios": dict(self.ratios),
-        }
+        return {**encode(self), "stages": stages}
 
 
 def run_bench(rounds: int = 5, on_round: Callable[[], None] = lambda: None) -> BenchReport:

@@ -6,7 +6,7 @@ ability to tell the two apart (C2ST).
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray, IndexArray, TextArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.training.splits import folds_by_recording
@@ -76,8 +77,8 @@ class Realism:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; every median says whether it is within 15 %."""
-        rows = [asdict(row) | {"within": row.within} for row in self.medians]
-        return {"medians": rows, "transfers": [asdict(t) for t in self.transfers], "c2st": dict(self.c2st)}
+        rows = [encode(row) | {"within": row.within} for row in self.medians]
+        return {**encode(self), "medians": rows}
 
     def table(self) -> str:
         """Return the comparison for people."""
