@@ -8,7 +8,7 @@ import scipy.signal
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.simulation import SITES
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.studies.streets.realism import DESCRIPTORS, compare_windows, describe_windows
@@ -79,7 +79,7 @@ def test_a_set_without_hazards_is_refused():
 def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
     """Band-limited noise from one side, at both rates: the same bins, hence the same feature."""
     rng, n = np.random.default_rng(6), 48_000
-    offsets = roof_array_56().centred_m
+    offsets = ovad_array().centred_m
     spectrum = np.fft.rfft(rng.standard_normal(n + DECIMATION * NFFT))
     frequency = np.fft.rfftfreq(n + DECIMATION * NFFT, 1 / (DECIMATION * RATE_HZ))
     spectrum[frequency > 3000.0] = 0.0
@@ -88,7 +88,7 @@ def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
         spectrum * np.exp(-2j * np.pi * frequency * delays[:, None]), n + DECIMATION * NFFT
     ).T
     sound += 0.3 * scipy.signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(sound.shape), axis=0)
-    full = published_feature(sound[:n], roof_array_56(), DECIMATION * RATE_HZ)
+    full = published_feature(sound[:n], ovad_array(), DECIMATION * RATE_HZ)
     quarter = window_feature(sound[:n:DECIMATION].astype(np.float32))
     assert full.max() > 1.2 * full.mean()
     # The independent noise beyond 6 kHz folds back at the lower rate; it is 20 dB down at 1 kHz.
