@@ -1,6 +1,7 @@
 from .acoustic import AcousticAdapter as AcousticAdapter
 from .acoustic import AcousticSettings as AcousticSettings
 from .acoustic_grounding import Grounding as Grounding
+from .audio.open_sound import RawPcm as RawPcm
 from .audio.sound_file import AudioSource as AudioSource
 from .audio.sound_file import open_audio as open_audio
 from .camera.camera_channel import Watcher as Watcher

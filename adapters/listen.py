@@ -347,30 +347,22 @@ def open_source(
     >>> len(source.array.positions_m), source.policy.alpha
     (56, 0.05)
     """
-    sound, settings = as_sound(path), settings or ListenSettings()
-    recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
-    chosen = model if isinstance(model, Model) else read_model(model)
-    microphones = read_array(array) if isinstance(array, Path | str) else array
-    lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
-    rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
-    alpha, policies = settings.alpha, chosen.policies
-    policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
-    assumed = None if chosen.domain is None else array_of(chosen.domain)
-    heard_by = choose_array(path_of(sound), microphones, assumed=assumed, trust_given=settings.uncalibrated)
-    context = context or Context()
-    moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
-    if settings.uncalibrated or not states_budget(chosen.domain, heard_by, moves):
-        policy = replace(policy, alpha=0.0)
+    sound, settings, context = as_sound(path), settings or ListenSettings(), context or Context()
     if engine is not None and not settings.ego_noise:
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
+    recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
+    chosen = model if isinstance(model, Model) else read_model(model)
+    heard_by = _array(sound, array, chosen, settings)
+    lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
+    rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
     before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
-    start_ns = nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
+    moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
     return Source(
         sound=recording.audio_path if recording else sound,
         array=heard_by,
         detections=_detections(detections, detector, recording, lens),
         model=chosen.signature,
-        policy=policy,
+        policy=_policy(chosen, heard_by, settings, moves),
         context=context,
         settings=settings,
         t0_s=recording.t0_s if recording else None,
@@ -380,9 +372,26 @@ def open_source(
         degradation=_degradation(recording, rates),
         site=None if before is None else before.site,
         resume=None if before is None else before.world,
-        start_ns=start_ns,
+        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)),
         engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
     )
+
+
+def _array(
+    sound: SoundInput, given: Path | str | MicrophoneArray | None, model: Model, settings: ListenSettings
+) -> MicrophoneArray:
+    """Return the array that the sound was recorded with: as given, the data set's or the model's."""
+    microphones = read_array(given) if isinstance(given, Path | str) else given
+    assumed = None if model.domain is None else array_of(model.domain)
+    return choose_array(path_of(sound), microphones, assumed=assumed, trust_given=settings.uncalibrated)
+
+
+def _policy(model: Model, array: MicrophoneArray, settings: ListenSettings, moves: bool) -> CueingPolicy:
+    """Return the policy of the budget, without an alpha where the model was made for something else."""
+    alpha, policies = settings.alpha, model.policies
+    policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
+    calibrated = not settings.uncalibrated and states_budget(model.domain, array, moves)
+    return policy if calibrated else replace(policy, alpha=0.0)
 
 
 def _detections(

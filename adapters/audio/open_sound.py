@@ -72,7 +72,7 @@ class RawPcm:
         """Bytes of one sample of all channels."""
         return BYTES[self.encoding] * self.channels
 
-    def decode(self, data: bytes) -> Float32Array:
+    def to_samples(self, data: bytes) -> Float32Array:
         """Return samples of full scale 1, shape (n, channels)."""
         if self.encoding == "f32":
             flat = np.frombuffer(data, "<f4")
@@ -148,7 +148,7 @@ class RawAudio:
         if len(joined) % self._raw.frame_bytes:
             got = f"{len(joined) % self._raw.frame_bytes} bytes too many"
             raise InputFileError(self.path, f"expected whole samples of {self.channels} channels, got {got}")
-        block = self._raw.decode(joined)
+        block = self._raw.to_samples(joined)
         if self._raw.encoding == "f32":
             check_finite(self.path, block, self.frames)
         self.frames += len(block)

@@ -27,7 +27,8 @@ Listen to a recording and keep the world-state.
 Without detections the camera counts as not asked, which is neither presence nor absence.
 
 --save-state keeps belief and site, --resume goes on from them: with the same recording after what was heard
-before, with the recording that follows it by --start, its first sample's time on the state's clock.
+before, with the recording that follows it by --start, its first sample's time on the state's clock (which is
+that of detections with stamps, too).
 
 --gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
 coverage, where only prominent peaks are kept."""
@@ -53,6 +54,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add_array_options(parser)
     add_search_options(parser)
     _add_model_options(parser)
+    _add_state_options(parser)
     add_camera_options(parser)
     _add_output_options(parser)
     parser.set_defaults(run=run)
@@ -85,6 +87,9 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
         "--ego-noise", action="store_true",
         help="learn the own vehicle's noise while nothing is there and hear past it (default: off)",
     )  # fmt: skip
+
+
+def _add_state_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--engine-rpm", type=Path, metavar="CSV",
         help="columns time_s, rpm of the own engine: cancel its lines, with --ego-noise",
