@@ -217,19 +217,10 @@ def calibrate_cueing(
     if not free:
         raise InvalidArgumentError("recordings: expected at least one without a hazard")
     approaches = [stream for stream in streams if stream.before_sight().any()]
-    budgets, policies = [], []
-    for beta in sorted(MISS_RATES):
-        calm, hazards = _statistics(free, reference_prior, beta), _hazards(approaches, reference_prior, beta)
-        risk = _risk_map(calm, hazards, correlation_time_hops(calm), _risk_of(kept, beta))
-        adaptive = _adaptive(hazards, chosen)
-        reports = [_budget(calm, alpha, beta, chosen) for alpha in chosen.alphas]
-        budgets += reports
-        policies += [
-            CueingPolicy(one.gamma, chosen.sustain_hops, one.alpha, reference_prior, risk, beta, adaptive)
-            for one in reports
-        ]
+    budgets, policies = _by_miss_rate(free, approaches, reference_prior, kept, chosen)
+    calm = _statistics(free, reference_prior, 0.0)
     blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
-    tau = correlation_time_hops(_statistics(free, reference_prior, 0.0))
+    tau = correlation_time_hops(calm)
     return CueingCalibration(
         policies=CueingPolicies(tuple(policies)),
         budgets=tuple(budgets),
@@ -241,6 +232,29 @@ def calibrate_cueing(
         risk=_kind(policies[0].risk_map) if approaches else "kept",
         warnings=tuple(_warnings(budgets, chosen, blocks, tau * HOP_S)),
     )
+
+
+def _by_miss_rate(
+    free: Sequence[HopTable],
+    approaches: Sequence[HopTable],
+    prior: tuple[float, ...],
+    kept: CueingPolicies,
+    settings: CueingSettings,
+) -> tuple[list[BudgetReport], list[CueingPolicy]]:
+    """Return a report and a policy for every miss rate and budget."""
+    budgets: list[BudgetReport] = []
+    policies: list[CueingPolicy] = []
+    for beta in sorted(MISS_RATES):
+        calm, hazards = _statistics(free, prior, beta), _hazards(approaches, prior, beta)
+        risk = _risk_map(calm, hazards, correlation_time_hops(calm), _risk_of(kept, beta))
+        adaptive = _adaptive(hazards, settings)
+        reports = [_budget(calm, alpha, beta, settings) for alpha in settings.alphas]
+        budgets += reports
+        policies += [
+            CueingPolicy(one.gamma, settings.sustain_hops, one.alpha, prior, risk, beta, adaptive)
+            for one in reports
+        ]
+    return budgets, policies
 
 
 def cut(stream: FloatArray, block_hops: int) -> list[FloatArray]:
