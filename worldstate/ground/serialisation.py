@@ -18,7 +18,6 @@ from typing import (
     get_args,
     get_origin,
     get_type_hints,
-    overload,
 )
 
 import numpy as np
@@ -152,11 +151,7 @@ def encode(value: object) -> dict[str, Any]:
     return record
 
 
-@overload
-def decode(hint: type[T], data: object, where: str) -> T: ...
-@overload
-def decode(hint: Hint, data: object, where: str) -> Any: ...
-def decode(hint: Hint, data: object, where: str) -> Any:
+def decode(hint: type[T], data: object, where: str) -> T:
     """Return the value of type `hint` that `encode` wrote; unknown keys are ignored.
 
     Raises
@@ -174,13 +169,15 @@ def decode(hint: Hint, data: object, where: str) -> Any:
         ...
     worldstate...InvalidArgumentError: looks[0].reason: expected text, got 1
     """
+    kind: Hint = hint
     try:
-        return _plan(hint)[1](data)
+        value: T = _plan(kind)[1](data)
     except _RefusedError as error:
         place = where + error.place
         if error.schema:
             raise SchemaVersionError(place, error.problem) from error
         raise InvalidArgumentError(f"{place}: {error.problem}") from error
+    return value
 
 
 def decode_json(text: str, where: str) -> object:
