@@ -352,17 +352,19 @@ def open_source(
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     chosen = model if isinstance(model, Model) else read_model(model)
+    policy = _policy(chosen, settings.alpha)
     heard_by = _array(sound, array, chosen, settings)
     lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
     rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
     before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
     moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
+    stated = not settings.uncalibrated and states_budget(chosen.domain, heard_by, moves)
     return Source(
         sound=recording.audio_path if recording else sound,
         array=heard_by,
         detections=_detections(detections, detector, recording, lens),
         model=chosen.signature,
-        policy=_policy(chosen, heard_by, settings, moves),
+        policy=policy if stated else replace(policy, alpha=0.0),
         context=context,
         settings=settings,
         t0_s=recording.t0_s if recording else None,
@@ -386,12 +388,9 @@ def _array(
     return choose_array(path_of(sound), microphones, assumed=assumed, trust_given=settings.uncalibrated)
 
 
-def _policy(model: Model, array: MicrophoneArray, settings: ListenSettings, moves: bool) -> CueingPolicy:
-    """Return the policy of the budget, without an alpha where the model was made for something else."""
-    alpha, policies = settings.alpha, model.policies
-    policy = policies.policies[0] if alpha is None else policies.for_alpha(alpha)
-    calibrated = not settings.uncalibrated and states_budget(model.domain, array, moves)
-    return policy if calibrated else replace(policy, alpha=0.0)
+def _policy(model: Model, alpha: float | None) -> CueingPolicy:
+    """Return the policy of a budget, the first one without."""
+    return model.policies.policies[0] if alpha is None else model.policies.for_alpha(alpha)
 
 
 def _detections(
