@@ -7,6 +7,7 @@ from typing import Protocol
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.signature.model_domain import ModelDomain
+from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -16,7 +17,6 @@ from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel, MeasurementAdapter, Side
 
-from .acoustic_domain import feature_order
 from .acoustic_grounding import Grounding, observe
 
 

@@ -21,6 +21,7 @@ from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.files.acoustic_domain import array_of, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
 from worldstate.adapters.files.engine_file import EngineSpeed, read_engine
@@ -39,7 +40,6 @@ from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
 
 from .acoustic import AcousticAdapter, Signature
-from .acoustic_domain import array_of, states_budget
 from .acoustic_grounding import Grounding
 
 BLOCKS_PER_SECOND = 20

@@ -1,6 +1,5 @@
 """A camera with a detector and measured miss rates, whose degradation is read from its own images."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,14 +121,6 @@ class Watcher:
         return Watched(
             DetectionLog(tuple(self._found), stamps_ns, "watched camera"), degradation, self._rates
         )
-
-
-def watch(frames: Iterable[tuple[int, ImageArray]], detector: Detector, rates: MissRates) -> Watched:
-    """Run a detector on stamped images and estimate the camera's degradation from the same images."""
-    watcher = Watcher(detector, rates)
-    for stamp_ns, frame in frames:
-        watcher.look(stamp_ns, frame)
-    return watcher.watched()
 
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:

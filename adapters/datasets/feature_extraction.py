@@ -8,8 +8,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from worldstate.abduction.signature.published_signature import CLASSES
-from worldstate.adapters.acoustic_domain import domain_of
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
+from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.csv_rows import read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import published_feature

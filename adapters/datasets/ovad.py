@@ -10,14 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeGuard, final, get_args
 
-import numpy as np
-
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
 from worldstate.adapters.files.csv_rows import read_rows
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import wrap_angle
 
 from .ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
 
@@ -133,7 +129,7 @@ class OvadDataset:
     root : str or Path
         Folder with ``DataLog.csv``.
     ids : collection of str, optional
-        Keep these only, as `read_id_list` reads them from an official list. Some may be in another data set;
+        Keep these only, as `read_ids` reads them from an official list. Some may be in another data set;
         at least one must be here.
 
     Attributes
@@ -170,19 +166,6 @@ class OvadDataset:
 
     def __len__(self) -> int:
         return len(self.recordings)
-
-
-def read_id_list(path: str | Path) -> frozenset[str]:
-    r"""Read the IDs of an official list: a CSV file with a column ID."""
-    name = Path(path)
-    ids = [_identifier(name, line, row["ID"]) for line, row in read_rows(name, ("ID",))]
-    _refuse_duplicates(name, ids)
-    return frozenset(ids)
-
-
-def to_base_link(ovad_azimuth_rad: FloatArray) -> FloatArray:
-    """Turn azimuths that grow to the right, as OVAD counts them, into left-positive ones."""
-    return wrap_angle(-np.asarray(ovad_azimuth_rad, dtype=np.float64)) + 0.0
 
 
 def _read_log(root: Path) -> tuple[Recording, ...]:

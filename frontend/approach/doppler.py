@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.ground.checks import finite_array, in_range
@@ -183,59 +182,6 @@ def radial_speed(
     if not typical <= chosen.max_std_m_s:
         return NotUsable(f"radial speed known to {typical:.1f} m/s only, more than {chosen.max_std_m_s:g}")
     return speed
-
-
-def radial_speed_from_rest(
-    frequency_hz: ArrayLike,
-    variance_hz2: ArrayLike,
-    rest_frequency_hz: float,
-    rest_variance_hz2: float = 0.0,
-    *,
-    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
-) -> tuple[FloatArray, FloatArray]:
-    r"""Estimate the radial speed and its variance where the frequency at rest is known.
-
-    .. math:: v_r = c\,(f_0 / f - 1), \qquad
-              \mathrm{var}(v_r) = (c / f)^2 \big[\mathrm{var}(f_0) + (f_0 / f)^2\,\mathrm{var}(f)\big]
-
-    Parameters
-    ----------
-    frequency_hz, variance_hz2 : array_like, same shape
-        Received frequency, Hz, > 0, and its variance, Hz squared.
-    rest_frequency_hz, rest_variance_hz2 : float
-        f_0, Hz, > 0, and its variance, Hz squared.
-    speed_of_sound_m_s : float
-        c, m/s.
-
-    Returns
-    -------
-    radial_speed_m_s, variance_m2_s2 : ndarray
-        m/s, positive while receding, and (m/s) squared; of the shape of `frequency_hz`, at least 1-D.
-
-    Raises
-    ------
-    InvalidArgumentError
-        On other shapes, numbers that are not finite, or values out of range.
-
-    References
-    ----------
-    P. M. Morse and K. U. Ingard, *Theoretical Acoustics*, 1968, section 11.2 (the shift of a moving source,
-    solved for its speed); the variance to first order in the errors.
-
-    Examples
-    --------
-    >>> radial_speed_from_rest([103.0], [1e-4], 100.0)[0].round(2)
-    array([-9.99])
-    """
-    frequency = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
-    variance = finite_array("variance_hz2", np.atleast_1d(variance_hz2), frequency.shape)
-    rest = in_range("rest_frequency_hz", rest_frequency_hz, 0.0, np.inf, open_low=True)
-    rest_variance = in_range("rest_variance_hz2", rest_variance_hz2, 0.0, np.inf)
-    if not np.all(frequency > 0) or not np.isfinite(frequency).all() or variance.min() < 0:
-        raise InvalidArgumentError("frequency_hz, variance_hz2: expected positive and non-negative numbers")
-    speed = speed_of_sound_m_s * (rest / frequency - 1.0)
-    gain = (speed_of_sound_m_s / frequency) ** 2
-    return np.asarray(speed), np.asarray(gain * (rest_variance + (rest / frequency) ** 2 * variance))
 
 
 def _checked(track: HarmonicTrack) -> tuple[FloatArray, FloatArray, FloatArray]:

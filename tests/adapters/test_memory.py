@@ -23,7 +23,7 @@ resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
 from worldstate.adapters.camera.detection_formats import read_any_detections
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
-from worldstate.adapters.datasets.ovad import read_id_list
+from worldstate.adapters.datasets.feature_table import read_ids
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import WorldstateError
@@ -62,7 +62,7 @@ FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "empty objects": ("read_model", lambda: json_list("{},", 16 * MIB, 4_000_000)),
     "numbers": ("read_checkpoint", lambda: json_list("1.5,", 16 * MIB)),
     "short ids": ("read_ids", lambda: repeated("a\n", 16 * MIB, "ID\n")),
-    "as many ids as may be": ("read_id_list", lambda: "\n".join(["ID", *map(str, range(199_000))]).encode()),
+    "as many ids as may be": ("read_ids", lambda: "\n".join(["ID", *map(str, range(199_000))]).encode()),
     "a wide line": ("read_ids", lambda: repeated("ab,", 16 * MIB, "ID,", "\n")),
     "a wide header": ("read_features", lambda: repeated("a\n", 16 * MIB, HEADER[:-1] + ",b" * MIB + "\n")),
     "one long name": ("read_features", lambda: repeated(ROW, 8 * MIB, LONG_NAME)),

@@ -11,9 +11,9 @@ import soundfile
 
 from tests.conftest import Approach
 from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import load_model, read_model
 from worldstate.adapters.listen import ListenSettings, listen, measure_steps, open_source

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from hypothesis import given
-from hypothesis import strategies as st
 from released_data import FOLDER
 
-from worldstate.adapters.datasets.ovad import OvadDataset, Recording, read_id_list, to_base_link
+from worldstate.adapters.datasets.feature_table import read_ids
+from worldstate.adapters.datasets.ovad import OvadDataset, Recording
 from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
 from worldstate.ground.errors import InputFileError
 
@@ -98,7 +97,7 @@ def test_a_folder_without_sound(tmp_path: Path) -> None:
 
 def test_keeps_an_official_list(tmp_path: Path) -> None:
     (tmp_path / "test.csv").write_text("ID\n3_08_0119\n9_99_9999\n")
-    kept = OvadDataset(write_log(tmp_path, *ROWS), read_id_list(tmp_path / "test.csv"))
+    kept = OvadDataset(write_log(tmp_path, *ROWS), read_ids(tmp_path / "test.csv"))
     assert [recording.recording_id for recording in kept.recordings] == ["3_08_0119"]
     with pytest.raises(InputFileError, match="found none"):
         OvadDataset(tmp_path, {"9_99_9999"})
@@ -108,8 +107,8 @@ def test_the_official_lists() -> None:
     folder = FOLDER or Path()
     if not (folder / "timeHorizonStaticTestset.csv").is_file():
         pytest.skip("the official lists are not here")
-    assert len(read_id_list(folder / "timeHorizonStaticTestset.csv")) == 83
-    assert len(read_id_list(folder / "timeHorizonDynamicTestset.csv")) == 59
+    assert len(read_ids(folder / "timeHorizonStaticTestset.csv")) == 83
+    assert len(read_ids(folder / "timeHorizonDynamicTestset.csv")) == 59
 
 
 def test_other_columns_order_and_a_byte_order_mark_do_not_matter(tmp_path: Path) -> None:
@@ -157,8 +156,3 @@ def test_refuses_what_is_no_table(tmp_path: Path, data: bytes) -> None:
 def test_refuses_a_missing_log(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="DataLog"):
         OvadDataset(tmp_path / "nowhere")
-
-
-@given(st.lists(st.floats(-np.pi / 2, np.pi / 2)))
-def test_left_and_right_change_places(azimuths: list[float]) -> None:
-    np.testing.assert_allclose(to_base_link(np.array(azimuths)), [-a for a in azimuths], atol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from worldstate.abduction.co_evidence import Absent
-from worldstate.adapters.camera.camera_channel import any_motion, watch
+from worldstate.adapters.camera.camera_channel import Watcher, any_motion
 from worldstate.adapters.camera.camera_health import learn_health
 from worldstate.adapters.camera.degradation import degrade
 from worldstate.adapters.camera.detections import read_detections
@@ -152,4 +152,4 @@ def darkening(rates):
 
 def test_without_a_scale_of_health_nothing_is_watched(rates):
     with pytest.raises(InvalidArgumentError, match="health"):
-        watch([], MotionDetector(), MissRates(rates.azimuth_deg, rates.families))
+        Watcher(MotionDetector(), MissRates(rates.azimuth_deg, rates.families))

@@ -11,7 +11,6 @@ from worldstate.frontend.approach.doppler import (
     DopplerSettings,
     RadialSpeed,
     radial_speed,
-    radial_speed_from_rest,
 )
 from worldstate.frontend.approach.engine_line import HarmonicSettings, HarmonicTrack, track_fundamental
 from worldstate.frontend.approach.pass_by import radial_speed_m_s
@@ -220,17 +219,6 @@ def test_closed_form_emission_time_equals_root_finding(time, speed, closest, dis
     assert got[0] == pytest.approx(expected, abs=1e-6 * speed)
 
 
-def test_known_rest_frequency():
-    rng = np.random.default_rng(5)
-    f = 100 / (1 + 7.0 / SOUND_M_S) + 0.05 * rng.normal(size=20_000)
-    rest = 100 + 0.02 * rng.normal(size=20_000)
-    draws = np.array([radial_speed_from_rest(a, 0.0, b)[0][0] for a, b in zip(f[:4000], rest, strict=False)])
-    speed, variance = radial_speed_from_rest(100 / (1 + 7.0 / SOUND_M_S), 0.05**2, 100.0, 0.02**2)
-    assert speed[0] == pytest.approx(7.0)
-    assert draws.var() == pytest.approx(variance[0], rel=0.1)
-    assert radial_speed_from_rest(103.0, 0.0, 100.0)[0][0] < 0
-
-
 @pytest.mark.parametrize(
     "call",
     [
@@ -240,7 +228,6 @@ def test_known_rest_frequency():
         lambda: HarmonicSettings(low_hz=5.0),
         lambda: HarmonicSettings(low_hz=100.0, high_hz=90.0),
         lambda: DopplerSettings(min_windows=4),
-        lambda: radial_speed_from_rest(-1.0, 0.0, 100.0),
         lambda: radial_speed(
             HarmonicTrack(*(np.zeros(20) for _ in range(6)), windows=20)  # type: ignore[arg-type]
         ),

@@ -106,6 +106,8 @@ def _as_table(
             continue
         each = "  ".join(f"{bounds.at(azimuth, level, N):.3g}" for level in levels)
         table[f"  azimuth {azimuth:g} deg"] = f">= {constant:.3g} / sqrt(2 N SNR)   {each}"
+    speeds = "  ".join(f"{bounds.radial_speed_std_m_s(level):.3g}" for level in levels)
+    table["radial speed"] = f"m/s, from a tone of {bounds.frequency_hz:g} Hz heard for a second   {speeds}"
     return table
 
 

@@ -88,7 +88,7 @@ def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "Featu
     import sys
     from dataclasses import replace
 
-    from worldstate.adapters.acoustic_domain import OVAD_RATE_HZ, check_array, domain_of, ovad_domain
+    from worldstate.adapters.files.acoustic_domain import OVAD_RATE_HZ, check_array, domain_of, ovad_domain
     from worldstate.adapters.files.array_file import read_array
 
     environments = table.environments.tolist()

@@ -6,7 +6,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, broadside_rad
+from worldstate.frontend.bounds.cramer_rao import (
+    bearing_crb_rad2,
+    broadside_rad,
+    radial_speed_crb_m2_s2,
+    tone_crb_hz2,
+)
+
+# Samples of one second; the bound depends on the duration and SNR times the number of samples only.
+TONE_RATE_HZ = 48_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +84,28 @@ class ArrayBounds:
         constant = self.sigma_deg[azimuth_deg]
         snr = 10.0 ** (snr_db / 10.0)
         return None if constant is None else constant / float(np.sqrt(2.0 * snapshots * snr))
+
+    def radial_speed_std_m_s(self, snr_db: float) -> float:
+        """Return the bound of a radial speed from one second of a tone at `frequency_hz`, at one microphone.
+
+        Parameters
+        ----------
+        snr_db : float
+            Of the tone's samples, dB.
+
+        Returns
+        -------
+        float
+            A standard deviation, m/s, where the frequency at rest is known.
+
+        Examples
+        --------
+        >>> two = array_bounds(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 500.0, [0.0])
+        >>> round(two.radial_speed_std_m_s(10.0), 5)
+        0.00055
+        """
+        variance = tone_crb_hz2(10.0 ** (snr_db / 10.0), int(TONE_RATE_HZ), TONE_RATE_HZ)
+        return float(np.sqrt(radial_speed_crb_m2_s2(variance, self.frequency_hz)))
 
     def to_dict(self) -> dict[str, object]:
         """Return the same as JSON-able values, azimuths as text.

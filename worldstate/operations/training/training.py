@@ -14,8 +14,8 @@ from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.abduction.signature.signature_io import AnySignature
-from worldstate.adapters.acoustic_domain import ego_motion_of
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
+from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc

@@ -3,8 +3,8 @@
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.adapters.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.training.feature_evaluation import Predictions, predict_with

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from worldstate.abduction.signature.model_domain import EgoMotion, ModelDomain
-from worldstate.adapters.files.array_match import array_difference, microphone_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_VERSION
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import IndexArray
+
+from .array_match import array_difference, microphone_order
 
 OVAD_RATE_HZ = 47_998.0
 # Frames have a fixed number of samples: two per cent move the top of the band by a third of a bin.
