@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from worldstate.adapters.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
 from worldstate.frontend.direction.srp import srp_phat
@@ -35,7 +35,7 @@ def loudest_deg(plan: Site, approach: str, seed: int, levels=QUIET) -> np.ndarra
         plan, approach, duration_s=1.5, entry_s=1.5, speed_mps=8.0, sample_rate_hz=RATE_HZ, preset=levels
     )
     audio = simulate_recording(scene, np.random.default_rng(seed)).audio
-    array, bins = roof_array_56(), band_bins(BAND_HZ, RATE_HZ, NFFT)
+    array, bins = ovad_array(), band_bins(BAND_HZ, RATE_HZ, NFFT)
     steering = Steering.towards(array, bin_frequencies_hz(bins, RATE_HZ, NFFT), AZIMUTHS_RAD)
     frames = len(audio) // NFFT
     cut = audio[: frames * NFFT].reshape(frames, NFFT, -1) * np.hanning(NFFT)[:, None]
