@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal, Self, TypeAlias
+from typing import BinaryIO, Literal, TypeAlias
 
 import numpy as np
 
@@ -11,15 +11,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import Float32Array
 
-from .sound_file import (
-    SHORTEST_S,
-    AudioSource,
-    check_channels,
-    check_finite,
-    check_silence,
-    constant_channels,
-    open_audio,
-)
+from .sound_file import Audio, AudioSource, check_finite, constant_channels, open_audio
 
 Encoding = Literal["s16", "s24", "s32", "f32"]
 BYTES: dict[Encoding, int] = {"s16": 2, "s24": 3, "s32": 4, "f32": 4}
@@ -107,8 +99,8 @@ def path_of(sound: SoundInput) -> Path:
     return sound if isinstance(sound, Path) else sound[0]
 
 
-class RawAudio:
-    """A pipe that is being read, with the face of `AudioSource`; `frames` counts what has been read."""
+class RawAudio(Audio):
+    """A pipe that is being read; `frames` counts what has been read."""
 
     def __init__(self, raw: RawPcm) -> None:
         self._raw = raw
@@ -116,11 +108,6 @@ class RawAudio:
         self.sample_rate_hz, self.channels, self.frames = raw.sample_rate_hz, raw.channels, 0
         self._first = self._read(raw.sample_rate_hz)
         self.silent_channels = constant_channels(self._first)
-
-    @property
-    def duration_s(self) -> float:
-        """What has been read, in seconds."""
-        return self.frames / self.sample_rate_hz
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the samples up to the end of the stream in blocks of `frames`; the last may be shorter."""
@@ -131,12 +118,6 @@ class RawAudio:
 
     def close(self) -> None:
         """Leave the stream to its owner."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _read(self, frames: int) -> Float32Array:
         wanted = frames * self._raw.frame_bytes
@@ -155,8 +136,8 @@ class RawAudio:
         return block
 
 
-class MonoFiles:
-    """Files of one channel each, read side by side, with the face of `AudioSource`."""
+class MonoFiles(Audio):
+    """Files of one channel each, read side by side."""
 
     def __init__(self, sources: Sequence[AudioSource]) -> None:
         self._sources = tuple(sources)
@@ -170,11 +151,6 @@ class MonoFiles:
                 got = f"{other.frames} at {other.sample_rate_hz} Hz"
                 raise InputFileError(other.path, f"expected {expected}, got {got}")
 
-    @property
-    def duration_s(self) -> float:
-        """Length in seconds."""
-        return self.frames / self.sample_rate_hz
-
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
         for parts in zip(*(source.blocks(frames) for source in self._sources), strict=True):
@@ -184,15 +160,6 @@ class MonoFiles:
         """Close the files."""
         for source in self._sources:
             source.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-Audio: TypeAlias = AudioSource | MonoFiles | RawAudio
 
 
 def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict: bool = True) -> Audio:
@@ -210,7 +177,7 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
     Returns
     -------
     AudioSource, MonoFiles or RawAudio
-        With the same face, at its start.
+        Open, at its start.
 
     Raises
     ------
@@ -229,13 +196,10 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
     """
     if isinstance(sound, Path):
         return open_audio(sound, expect_channels, strict=strict)
-    audio: Audio = RawAudio(sound) if isinstance(sound, RawPcm) else _mono(sound)
+    audio = RawAudio(sound) if isinstance(sound, RawPcm) else _mono(sound)
     try:
-        check_channels(audio.path, audio.channels, expect_channels)
-        if audio.duration_s < SHORTEST_S:
-            got = f"{audio.duration_s:.3f} s"
-            raise InputFileError(audio.path, f"expected at least 1 s of audio, got {got}")
-        check_silence(audio.path, audio.silent_channels, audio.channels, strict)
+        audio.check_size(expect_channels)
+        audio.check_silence(strict)
     except BaseException:
         audio.close()
         raise

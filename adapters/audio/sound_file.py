@@ -1,9 +1,9 @@
 """Multichannel sound files, read in blocks and checked when they are opened."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import soundfile
@@ -20,7 +20,52 @@ ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", *FLOATING)
 SHORTEST_S = 1.0
 
 
-class AudioSource:
+class Audio(ABC):
+    """A recording that is being read; a context manager, so that its files are closed on the way out."""
+
+    path: Path
+    sample_rate_hz: int
+    channels: int
+    frames: int
+    silent_channels: tuple[int, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds; of a pipe, what has been read."""
+        return self.frames / self.sample_rate_hz
+
+    @abstractmethod
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
+        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close what was opened for it."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def check_size(self, expect_channels: int | None) -> None:
+        """Refuse another number of channels than microphones, and less than a second."""
+        if expect_channels is not None and self.channels != expect_channels:
+            expected = f"expected {expect_channels} channels, one per microphone"
+            raise InputFileError(self.path, f"{expected}, got {self.channels}")
+        if self.duration_s < SHORTEST_S:
+            raise InputFileError(self.path, f"expected at least 1 s of audio, got {self.duration_s:.3f} s")
+
+    def check_silence(self, strict: bool) -> None:
+        """Refuse silent channels; where not strict, a recording in which more are silent than not."""
+        if self.silent_channels and strict:
+            raise SilentChannelsError(self.path, self.silent_channels, "every channel")
+        if 2 * len(self.silent_channels) > self.channels:
+            most = f"at least half of {self.channels} channels"
+            raise SilentChannelsError(self.path, self.silent_channels, most)
+
+
+class AudioSource(Audio):
     """An open recording; use `open_audio` to get one.
 
     A context manager, so that the file is closed on the way out.
@@ -58,11 +103,6 @@ class AudioSource:
         self.frames = int(file.frames)
         self.silent_channels: tuple[int, ...] = ()
 
-    @property
-    def duration_s(self) -> float:
-        """Length in seconds."""
-        return self.frames / self.sample_rate_hz
-
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the recording from its start in blocks of `frames` samples; the last may be shorter.
 
@@ -96,23 +136,13 @@ class AudioSource:
         """Close the file; a second call does nothing."""
         self._file.close()
 
-    def __enter__(self) -> "AudioSource":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def check_end(self) -> None:
-        """Read the last sample, which a FLAC file that was cut short cannot give."""
-        self._seek(self.frames - 1)
-        self._read(1)
-
-    def first_second(self) -> Float32Array:
-        """Return the first second, shape (sample_rate_hz, M)."""
-        self._seek(0)
-        return self._read(self.sample_rate_hz)
+    def span(self, start: int, frames: int) -> Float32Array:
+        """Return so many samples from one on, shape (frames, M)."""
+        self._seek(start)
+        block = self._read(frames)
+        if self._floating:
+            check_finite(self.path, block, start)
+        return block
 
     def _seek(self, frame: int) -> None:
         if self._file.closed:
@@ -185,7 +215,7 @@ def open_audio(path: str | Path, expect_channels: int | None = None, *, strict: 
     source = AudioSource(name, _open_file(name))
     try:
         _check(source, expect_channels)
-        check_silence(source.path, source.silent_channels, source.channels, strict)
+        source.check_silence(strict)
     except BaseException:
         source.close()
         raise
@@ -208,35 +238,21 @@ def _open_file(path: Path) -> Any:
 
 
 def _check(source: AudioSource, expect_channels: int | None) -> None:
-    _refuse_cut_file(source)
+    size = data_size(source.path)
+    if size is not None and size.is_cut:
+        problem = f"cut short: expected {size.declared} bytes of samples by its header, got {size.available}"
+        raise InputFileError(source.path, problem)
     if source.frames == 0:
         raise InputFileError(source.path, "expected samples, the recording is empty")
-    check_channels(source.path, source.channels, expect_channels)
-    if source.duration_s < SHORTEST_S:
-        raise InputFileError(source.path, f"expected at least 1 s of audio, got {source.duration_s:.3f} s")
-    source.check_end()
-    first = source.first_second()
-    check_finite(source.path, first, 0)
-    source.silent_channels = constant_channels(first)
+    source.check_size(expect_channels)
+    source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
+    source.silent_channels = constant_channels(source.span(0, source.sample_rate_hz))
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:
     """Return the channels, from 1, that hold one constant value."""
     constant = (first == first[:1]).all(axis=0)
     return tuple(int(channel) + 1 for channel in np.flatnonzero(constant))
-
-
-def check_channels(path: Path, channels: int, expected: int | None) -> None:
-    """Refuse a recording of another number of channels than microphones."""
-    if expected is not None and channels != expected:
-        raise InputFileError(path, f"expected {expected} channels, one per microphone, got {channels}")
-
-
-def _refuse_cut_file(source: AudioSource) -> None:
-    size = data_size(source.path)
-    if size is not None and size.is_cut:
-        problem = f"cut short: expected {size.declared} bytes of samples by its header, got {size.available}"
-        raise InputFileError(source.path, problem)
 
 
 def _cut_short(path: Path, frames: int) -> InputFileError:
@@ -250,11 +266,3 @@ def check_finite(path: Path, block: Float32Array, start: int) -> None:
         sample, channel = np.argwhere(~finite)[0]
         where = f"channel {channel + 1}, sample {start + sample}"
         raise InputFileError(path, f"expected finite samples, got {block[sample, channel]} in {where}")
-
-
-def check_silence(path: Path, silent: tuple[int, ...], channels: int, strict: bool) -> None:
-    """Refuse silent channels; where not strict, a recording in which more are silent than not."""
-    if silent and strict:
-        raise SilentChannelsError(path, silent, "every channel")
-    if 2 * len(silent) > channels:
-        raise SilentChannelsError(path, silent, f"at least half of {channels} channels")

@@ -1,17 +1,17 @@
 """Detections as other tools write them: COCO results and YOLO text, beside OVAD's JSON."""
 
-import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
-from worldstate.adapters.files.json_file import read_json
+from worldstate.adapters.files.json_file import read_json, refused_as_file
 from worldstate.adapters.files.text_file import read_text
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import Check, Probability, decode
 
 from .detections import (
     MAX_BOXES_A_FRAME,
@@ -34,6 +34,20 @@ MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
 _FRAME_NUMBER = re.compile(r"(\d{1,9})\.txt$", re.ASCII)
 
 Row = tuple[tuple[float, float, float, float], float, str]
+# Beyond any image, and a sum of two is still a number.
+MAX_NUMBER = 1e9
+Place = Annotated[float, Check("a number below 1e9", lambda value: abs(value) < MAX_NUMBER)]
+Extent = Annotated[float, Check("a number in [0, 1e9)", lambda value: 0.0 <= value < MAX_NUMBER)]
+
+
+@dataclass(frozen=True, slots=True)
+class _CocoResult:
+    """One box of a COCO results file."""
+
+    image_id: int
+    category_id: int
+    bbox: tuple[Place, Place, Extent, Extent]
+    score: Probability
 
 
 def read_any_detections(
@@ -98,12 +112,13 @@ def read_coco_results(
     if not isinstance(found, list) or len(found) > MAX_FRAMES * 10:
         raise InputFileError(name, "expected a list of COCO results")
     rows: dict[int, list[Row]] = {}
-    for i, item in enumerate(found):
-        try:
-            number, row = _coco_row(item, categories)
-            rows.setdefault(number - first_image, []).append(row)
-        except InvalidArgumentError as error:
-            raise InputFileError(name, f"result {i}: {error}") from error
+    with refused_as_file(name):
+        for i, item in enumerate(found):
+            result = decode(_CocoResult, item, f"result {i}")
+            left, top, width, height = result.bbox
+            label = categories.get(result.category_id, str(result.category_id))
+            row = (left, top, left + width, top + height), result.score, label
+            rows.setdefault(result.image_id - first_image, []).append(row)
     return _log(name, rows, frames, frame_rate_hz)
 
 
@@ -130,54 +145,26 @@ def read_yolo_text(
     return _log(folder, rows, frames, frame_rate_hz)
 
 
-def _coco_row(item: Any, categories: Mapping[int, str]) -> tuple[int, Row]:
-    if not isinstance(item, dict):
-        raise InvalidArgumentError("expected an object")
-    image, category = item.get("image_id"), item.get("category_id")
-    if type(image) is not int or type(category) is not int:
-        raise InvalidArgumentError("image_id, category_id: expected integers")
-    box = item.get("bbox")
-    if not isinstance(box, list) or len(box) != 4:
-        raise InvalidArgumentError("bbox: expected four numbers, x y w h")
-    left, top, width, height = (_number("bbox", value) for value in box)
-    if width < 0.0 or height < 0.0:
-        raise InvalidArgumentError("bbox: expected a width and a height >= 0")
-    score = in_range("score", _number("score", item.get("score")), 0.0, 1.0)
-    label = categories.get(category, str(category))
-    return image, ((left, top, left + width, top + height), score, label)
-
-
 def _yolo_rows(path: Path, size_px: tuple[int, int], classes: Mapping[int, str]) -> list[Row]:
-    try:
+    with refused_as_file(path):
         lines = read_text(path, "a text file", MAX_TEXT_BYTES).splitlines()
         return [_yolo_row(line, size_px, classes) for line in lines if line.strip()]
-    except InvalidArgumentError as error:
-        raise InputFileError(path, str(error)) from error
 
 
 def _yolo_row(line: str, size_px: tuple[int, int], classes: Mapping[int, str]) -> Row:
-    words = line.split()
-    if len(words) not in (5, 6) or not (words[0].isascii() and words[0].isdecimal() and len(words[0]) < 6):
-        raise InvalidArgumentError(f"expected class x y w h [score], got {line!r:.60}")
-    x, y, width, height, score = (_number("line", _float(word)) for word in [*words[1:], "1"][:5])
-    if min(width, height) < 0.0:
-        raise InvalidArgumentError(f"expected a width and a height >= 0, got {line!r:.60}")
+    name, *numbers = line.split()
+    expected = "class x y w h [score] with w, h >= 0 and the score in [0, 1]"
+    problem = f"expected {expected}, got {line!r:.60}"
+    try:
+        x, y, width, height, score = map(float, numbers if len(numbers) == 5 else [*numbers, "1"])
+    except ValueError as error:
+        raise InvalidArgumentError(problem) from error
+    sizes_fit = max(abs(x), abs(y)) < MAX_NUMBER and 0.0 <= width < MAX_NUMBER and 0.0 <= height < MAX_NUMBER
+    if not (sizes_fit and 0.0 <= score <= 1.0 and name.isascii() and name.isdecimal() and len(name) < 6):
+        raise InvalidArgumentError(problem)
     centre, half = (x * size_px[0], y * size_px[1]), (width * size_px[0] / 2, height * size_px[1] / 2)
     box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
-    return box, in_range("score", score, 0.0, 1.0), classes.get(int(words[0]), words[0])
-
-
-def _float(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise InvalidArgumentError(f"expected a number, got {word!r:.40}") from error
-
-
-def _number(name: str, value: Any) -> float:
-    if type(value) not in (int, float) or not abs(value) < 1e9 or not math.isfinite(value):
-        raise InvalidArgumentError(f"{name}: expected a finite number, got {value!r:.40}")
-    return float(value)
+    return box, score, classes.get(int(name), name)
 
 
 def _log(path: Path, rows: Mapping[int, list[Row]], frames: int | None, frame_rate_hz: float) -> DetectionLog:

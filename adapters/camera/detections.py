@@ -4,13 +4,13 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.files.json_file import read_json
+from worldstate.adapters.files.json_file import read_json, refused_as_file
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import Count, Probability, decode
 from worldstate.ground.typing import FloatArray, IntArray
 from worldstate.ground.values import nanoseconds
 
@@ -205,70 +205,35 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int
     if not isinstance(rows, list) or len(rows) > MAX_FRAMES:
         problem = f"expected an object with a list of at most {MAX_FRAMES} frames in detections_per_frame"
         raise InputFileError(name, problem)
-    frames = [_frame(name, number, row) for number, row in enumerate(rows)]
-    try:
-        return _stamp(name, rows, frames, frame_rate_hz, start_ns)
-    except InvalidArgumentError as error:
-        raise InputFileError(name, str(error)) from error
+    frames: list[DetectionFrame] = []
+    stamps: list[int | None] = []
+    with refused_as_file(name):
+        for number, row in enumerate(rows):
+            read = decode(_OvadFrame, row, f"frame {number}")
+            boxes_px = np.array(read.boxes, dtype=np.float64).reshape(-1, 4)
+            frames.append(DetectionFrame(boxes_px, np.array(read.scores), read.classes_str))
+            stamps.append(read.stamp_ns)
+        if all(stamp is None for stamp in stamps):
+            return DetectionLog.at_rate(frames, frame_rate_hz, start_ns, str(name))
+        if None in stamps:
+            raise InvalidArgumentError(f"frame {stamps.index(None)}: expected stamp_ns, as in other frames")
+        return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), str(name))
 
 
-def _frame(path: Path, number: int, row: Any) -> DetectionFrame:
-    try:
-        return _parse_frame(row)
-    except InvalidArgumentError as error:
-        raise InputFileError(path, f"frame {number}: {error}") from error
+@dataclass(frozen=True, slots=True)
+class _OvadFrame:
+    """What OVAD's file holds of one image."""
 
+    boxes: tuple[tuple[float, float, float, float], ...]
+    scores: tuple[Probability, ...]
+    classes_str: tuple[str, ...]
+    stamp_ns: Count | None = None
 
-def _parse_frame(row: Any) -> DetectionFrame:
-    boxes, scores, labels = (_list(row, key) for key in ("boxes", "scores", "classes_str"))
-    if not len(boxes) == len(scores) == len(labels) <= MAX_BOXES_A_FRAME:
-        got = f"{len(boxes)} boxes, {len(scores)} scores, {len(labels)} classes_str"
-        raise InvalidArgumentError(f"expected as many of each, at most {MAX_BOXES_A_FRAME}, got {got}")
-    if not all(isinstance(label, str) for label in labels):
-        raise InvalidArgumentError("classes_str: expected class names")
-    if not all(isinstance(box, list) and len(box) == 4 for box in boxes):
-        raise InvalidArgumentError("boxes: expected four numbers each, x1 y1 x2 y2")
-    boxes_px = _numbers("boxes", [value for box in boxes for value in box]).reshape(-1, 4)
-    frame = DetectionFrame(boxes_px, _numbers("scores", scores), tuple(labels))
-    _check_frame(frame)
-    return frame
-
-
-def _check_frame(frame: DetectionFrame) -> None:
-    if (frame.boxes_px[:, :2] > frame.boxes_px[:, 2:]).any():
-        raise InvalidArgumentError("boxes: expected x1 <= x2 and y1 <= y2")
-    if ((frame.scores < 0.0) | (frame.scores > 1.0)).any():
-        raise InvalidArgumentError("scores: expected numbers in [0, 1]")
-
-
-def _list(row: Any, key: str) -> list[Any]:
-    value = row.get(key) if isinstance(row, dict) else None
-    if not isinstance(value, list):
-        raise InvalidArgumentError(f"{key}: expected a list, got {type(value).__name__}")
-    return value
-
-
-def _numbers(name: str, values: list[Any]) -> FloatArray:
-    # numpy alone would take True and "1" for numbers.
-    wrong = next((type(v).__name__ for v in values if type(v) not in (int, float)), None)
-    if wrong is not None:
-        raise InvalidArgumentError(f"{name}: expected numbers, got {wrong}")
-    try:
-        array = np.array(values, dtype=np.float64)
-    except OverflowError:
-        array = np.array([math.inf])
-    if not np.isfinite(array).all():
-        raise InvalidArgumentError(f"{name}: expected finite numbers")
-    return array
-
-
-def _stamp(
-    path: Path, rows: list[Any], frames: list[DetectionFrame], frame_rate_hz: float, start_ns: int
-) -> DetectionLog:
-    stamps = [row.get("stamp_ns") for row in rows]
-    if all(stamp is None for stamp in stamps):
-        return DetectionLog.at_rate(frames, frame_rate_hz, start_ns, str(path))
-    for number, stamp in enumerate(stamps):
-        if type(stamp) is not int or not 0 <= stamp < 1 << 63:
-            raise InputFileError(path, f"frame {number}: expected stamp_ns as an integer, got {stamp!r}")
-    return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), str(path))
+    def __post_init__(self) -> None:
+        if not len(self.boxes) == len(self.scores) == len(self.classes_str) <= MAX_BOXES_A_FRAME:
+            got = f"{len(self.boxes)} boxes, {len(self.scores)} scores, {len(self.classes_str)} classes_str"
+            raise InvalidArgumentError(f"expected as many of each, at most {MAX_BOXES_A_FRAME}, got {got}")
+        for left, top, right, bottom in self.boxes:
+            if left > right or top > bottom:
+                got = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
+                raise InvalidArgumentError(f"boxes: expected x1 <= x2 and y1 <= y2, got {got}")

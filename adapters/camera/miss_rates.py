@@ -12,10 +12,10 @@ import numpy as np
 from worldstate.abduction.absence import MissRateTable
 from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
 from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.adapters.files.json_file import read_record
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import ADDED, Layout, decode, encode
+from worldstate.ground.serialisation import ADDED, Layout, encode
 from worldstate.ground.typing import FloatArray
 
 from .camera_health import CameraHealth, Health
@@ -231,6 +231,4 @@ def load_miss_rates(path: str | Path) -> MissRates:
     ...     load_miss_rates(Path(folder) / "beta.json").families["noise"].misses
     ((0.0, 1.0, 2.0, 5.0, 10.0),)
     """
-    data = read_json(path, "a file of miss rates")
-    with refused_as_file(path):
-        return decode(MissRates, data, "miss rates")
+    return read_record(MissRates, path, "miss rates")

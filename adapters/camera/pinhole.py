@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.adapters.files.json_file import read_record, refused_as_file
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import decode
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
@@ -238,7 +237,7 @@ def read_camera(path: str | Path) -> PinholeCamera:
     [-45.0, 45.0]
     """
     with refused_as_file(path):
-        return decode(_CameraFile, read_json(path, "a camera file"), "camera").camera()
+        return read_record(_CameraFile, path, "camera").camera()
 
 
 @dataclass(frozen=True, slots=True)

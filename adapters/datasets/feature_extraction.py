@@ -1,6 +1,5 @@
 """Extraction of labelled feature windows from recordings of any array."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -10,17 +9,16 @@ import numpy as np
 from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.csv_rows import read_rows
+from worldstate.adapters.files.csv_rows import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 
-from .feature_table import FeatureTable
+from .feature_table import FeatureTable, t0_of
 from .ovad_layout import AUDIO_NAME
 
 WINDOW_S = 1.0
-BLOCK_S = 0.1
 REQUIRED = ("ID", "Class", "Environment", "Recording ID")
 OPTIONAL = ("File", "End", "T0")
 
@@ -124,15 +122,7 @@ def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
     if end > source.frames or start < 0:
         at = "" if window.end_s is None else f" before {window.end_s:g} s"
         raise InputFileError(source.path, f"expected a second of sound{at}, got {source.duration_s:.3g} s")
-    kept, at_frame = [], 0
-    for block in source.blocks(max(round(BLOCK_S * rate), 1)):
-        low, high = max(start - at_frame, 0), min(end - at_frame, len(block))
-        if low < high:
-            kept.append(block[low:high])
-        at_frame += len(block)
-        if at_frame >= end:
-            break
-    return np.concatenate(kept)
+    return source.span(start, end - start)
 
 
 def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:
@@ -141,17 +131,13 @@ def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> Labelle
     for column in ("ID", "Environment", "Recording ID"):
         if not row[column]:
             raise InputFileError(name, f"line {line}: expected a value of {column}")
-    try:
-        end_s = float(row["End"]) if row.get("End") else None
-        t0_frame = int(row["T0"]) if row.get("T0") else None
-    except ValueError as error:
-        raise InputFileError(name, f"line {line}: {error}") from error
-    if end_s is not None and not (math.isfinite(end_s) and end_s > 0):
+    end_s = number(name, line, row, "End") if row.get("End") else None
+    if end_s is not None and end_s <= 0:
         raise InputFileError(name, f"line {line}: expected End > 0 s, got {end_s}")
     where = _sound_file(name, root, line, row)
-    return LabelledWindow(
-        row["ID"], row["Class"], row["Environment"], row["Recording ID"], t0_frame, where, end_s
-    )
+    t0_frame = t0_of(name, line, row)
+    origin = row["ID"], row["Class"], row["Environment"], row["Recording ID"]
+    return LabelledWindow(*origin, t0_frame, where, end_s)
 
 
 def _sound_file(name: Path, root: Path, line: int, row: dict[str, str]) -> Path:

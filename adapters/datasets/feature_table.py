@@ -17,10 +17,10 @@ import numpy as np
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.adapters.files.atomic import atomic_path, write_text
-from worldstate.adapters.files.csv_rows import read_rows
-from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.adapters.files.csv_rows import number, read_rows
+from worldstate.adapters.files.json_file import read_record
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.serialisation import decode, encode
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 
 N_FEATURES = 60
@@ -29,7 +29,6 @@ LONGEST_NAME = 100
 LABEL_COLUMNS = ("Class", "ID", "Environment", "T0", "Recording ID")
 
 Group = Literal["static", "dynamic", "all"]
-GROUPS: tuple[Group, ...] = ("static", "dynamic", "all")
 _PREFIX = {"static": "S", "dynamic": "D", "all": ""}
 
 
@@ -105,10 +104,8 @@ class FeatureTable:
         InvalidArgumentError
             If there are none.
         """
-        found = self.select(np.char.startswith(self.environments, _PREFIX[group]))
-        if len(found) == 0:
-            raise InvalidArgumentError(f"group: expected windows of group {group}, found none")
-        return found
+        in_group = np.char.startswith(self.environments, _PREFIX[group])
+        return self._not_empty(in_group, f"group: expected windows of group {group}")
 
     def only(self, ids: Collection[str]) -> "FeatureTable":
         """Return all windows of the recordings that hold a window of one of these IDs.
@@ -118,7 +115,7 @@ class FeatureTable:
         InvalidArgumentError
             If there are none.
         """
-        return self._not_empty(self._of_recordings(ids), "expected a window that is listed")
+        return self._not_empty(self._of_recordings(ids), "ids: expected a window that is listed")
 
     def without(self, ids: Collection[str]) -> "FeatureTable":
         """Return all windows of the other recordings.
@@ -128,11 +125,11 @@ class FeatureTable:
         InvalidArgumentError
             If none are left.
         """
-        return self._not_empty(~self._of_recordings(ids), "expected a window that is not listed")
+        return self._not_empty(~self._of_recordings(ids), "ids: expected a window that is not listed")
 
     def _not_empty(self, chosen: BoolArray, expected: str) -> "FeatureTable":
         if not chosen.any():
-            raise InvalidArgumentError(f"ids: {expected}, found none")
+            raise InvalidArgumentError(f"{expected}, found none")
         return self.select(chosen)
 
     def _of_recordings(self, ids: Collection[str]) -> BoolArray:
@@ -179,9 +176,7 @@ def read_features(path: str | Path) -> FeatureTable:
     domain = _companion(path)
     made_with = None
     if domain.is_file():
-        what = "what the windows were made with"
-        with refused_as_file(domain):
-            made_with = decode(ModelDomain, read_json(domain, what), "domain")
+        made_with = read_record(ModelDomain, domain, "domain")
     return FeatureTable(np.array(features), classes, ids, environments, recordings, t0_frames, made_with)
 
 
@@ -249,11 +244,16 @@ def _window(
         raise InputFileError(path, f"line {line}: expected a Recording ID")
     if max(map(len, labels)) > LONGEST_NAME:
         raise InputFileError(path, f"line {line}: expected names of at most {LONGEST_NAME} characters")
-    try:
-        features = np.array([float(row[column]) for column in FEATURE_COLUMNS])
-        t0_frame = int(row["T0"]) if row["T0"] else None
-    except ValueError as error:
-        raise InputFileError(path, f"line {line}: {error}") from error
-    if not np.isfinite(features).all():
-        raise InputFileError(path, f"line {line}: expected finite features, got NaN or infinity")
+    features = np.array([number(path, line, row, column) for column in FEATURE_COLUMNS])
+    t0_frame = t0_of(path, line, row)
     return features, labels, t0_frame
+
+
+def t0_of(path: str | Path, line: int, row: dict[str, str]) -> int | None:
+    """Return the frame number T0 of a row, None where it has none."""
+    try:
+        return int(row["T0"]) if row.get("T0") else None
+    except ValueError as error:
+        raise InputFileError(
+            path, f"line {line}: expected T0 as an integer, got {row['T0'][:40]!r}"
+        ) from error

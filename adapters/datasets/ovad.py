@@ -5,10 +5,11 @@
 """
 
 import re
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeGuard, final, get_args
+from typing import Literal, final, get_args
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
@@ -18,10 +19,12 @@ from worldstate.ground.errors import InputFileError
 from .ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
 
 Label = Literal["left", "none", "right"]
+LABELS: dict[str, Label] = {label: label for label in get_args(Label)}
 
 MAX_T0_FRAME = 1_000_000
 # S or D for a standing or moving ego, then the junction: its type and number.
-ENVIRONMENT = re.compile(r"(?P<ego>[SD])(?P<junction>[A-Z][0-9]{1,3})", re.ASCII)
+ENVIRONMENT = re.compile(r"[SD][A-Z][0-9]{1,3}", re.ASCII)
+T0 = re.compile(r"[0-9]{1,7}", re.ASCII)
 IDENTIFIER = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 
 
@@ -74,7 +77,9 @@ class Recording:
         listed = () if log is None else _read_log(log.parent)
         entry = next((recording for recording in listed if recording.recording_id == folder.name), None)
         if entry is None:
-            return cls(folder, folder.name, _environment_of(folder), _label_of(folder))
+            place = folder.parent.parent.name
+            environment = place if ENVIRONMENT.fullmatch(place) else None
+            return cls(folder, folder.name, environment, LABELS.get(folder.parent.name))
         if entry.path != folder:
             place = f"{entry.environment}/{entry.label}"
             raise InputFileError(log, f"expected {folder.name} in {place}, as listed, found it at {path}")
@@ -171,53 +176,24 @@ class OvadDataset:
 def _read_log(root: Path) -> tuple[Recording, ...]:
     name = root / LOG_NAME
     recordings = tuple(_recording(name, line, row) for line, row in read_rows(name, COLUMNS))
-    _refuse_duplicates(name, [recording.recording_id for recording in recordings])
+    counts = Counter(recording.recording_id for recording in recordings)
+    twice = next((identifier for identifier, count in counts.items() if count > 1), None)
+    if twice is not None:
+        raise InputFileError(name, f"expected every ID once, got {twice} twice")
     return recordings
 
 
 def _recording(log: Path, line: int, row: dict[str, str]) -> Recording:
-    identifier = _identifier(log, line, row["ID"])
-    environment, label = row["Environment"], row["Class"]
-    if not ENVIRONMENT.fullmatch(environment):
-        problem = f"line {line}: expected an Environment such as SA1 or DB3, got {environment!r}"
-        raise InputFileError(log, problem)
-    if not _is_label(label):
-        raise InputFileError(log, f"line {line}: expected Class left, none or right, got {label!r}")
-    folder = log.parent / environment / label / identifier
-    return Recording(folder, identifier, environment, label, _logged_frame(log, line, label, row["T0"]))
-
-
-def _identifier(path: Path, line: int, text: str) -> str:
-    if not IDENTIFIER.fullmatch(text):
-        raise InputFileError(path, f"line {line}: expected an ID such as 1_00_0002, got {text!r}")
-    return text
-
-
-def _logged_frame(log: Path, line: int, label: Label, text: str) -> int | None:
-    if label == "none" and not text:
-        return None
-    if not (text.isascii() and text.isdecimal() and len(text) < 8 and int(text) <= MAX_T0_FRAME):
-        raise InputFileError(log, f"line {line}: expected T0 as a frame number, an integer, got {text!r}")
-    return int(text)
-
-
-def _refuse_duplicates(path: Path, ids: list[str]) -> None:
-    seen: set[str] = set()
-    for identifier in ids:
-        if identifier in seen:
-            raise InputFileError(path, f"expected every ID once, got {identifier} twice")
-        seen.add(identifier)
-
-
-def _is_label(text: str) -> TypeGuard[Label]:
-    return text in get_args(Label)
-
-
-def _label_of(folder: Path) -> Label | None:
-    name = folder.parent.name
-    return name if _is_label(name) else None
-
-
-def _environment_of(folder: Path) -> str | None:
-    name = folder.parent.parent.name
-    return name if ENVIRONMENT.fullmatch(name) else None
+    identifier, environment, side, t0 = (row[column] for column in COLUMNS)
+    label = LABELS.get(side)
+    number_fits = T0.fullmatch(t0) and int(t0) <= MAX_T0_FRAME
+    for expected, got, fits in (
+        ("an ID such as 1_00_0002", identifier, IDENTIFIER.fullmatch(identifier)),
+        ("an Environment such as SA1 or DB3", environment, ENVIRONMENT.fullmatch(environment)),
+        ("Class left, none or right", side, label),
+        ("T0 as a frame number, an integer", t0, number_fits or (label == "none" and not t0)),
+    ):
+        if not fits:
+            raise InputFileError(log, f"line {line}: expected {expected}, got {got!r}")
+    folder = log.parent / environment / side / identifier
+    return Recording(folder, identifier, environment, label, int(t0) if t0 else None)

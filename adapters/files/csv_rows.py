@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -41,6 +42,18 @@ def read_rows(
             yield reader.line_num, row
     except csv.Error as error:
         raise InputFileError(path, f"line {reader.line_num}: expected CSV: {error}") from error
+
+
+def number(path: str | Path, line: int, row: dict[str, str], column: str) -> float:
+    """Return the finite number in a column of a row that `read_rows` yielded."""
+    try:
+        value = float(row[column])
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        problem = f"line {line}: expected a finite number as {column}, got {row[column][:40]!r}"
+        raise InputFileError(path, problem)
+    return value
 
 
 def _places(

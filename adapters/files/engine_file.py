@@ -1,6 +1,5 @@
 """The engine's speed over time, from CSV: what its harmonics are cancelled by."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import FloatArray
 
-from .csv_rows import read_rows
+from .csv_rows import number, read_rows
 
 # What a front-end follows, Hz.
 LOWEST_HZ, HIGHEST_HZ = 10.0, 1000.0
@@ -54,21 +53,11 @@ def read_engine(path: str | Path, lines_per_turn: float = 2.0) -> EngineSpeed:
     [30.0, 60.0]
     """
     name = Path(path)
-    rows = [
-        (line, [_number(row[key]) for key in ("time_s", "rpm")])
+    times_and_rpm = [
+        [number(name, line, row, column) for column in ("time_s", "rpm")]
         for line, row in read_rows(name, ("time_s", "rpm"))
     ]
-    for line, values in rows:
-        if not all(map(math.isfinite, values)):
-            raise InputFileError(name, f"line {line}: expected finite numbers as time_s and rpm")
-    table = np.array([values for _, values in rows], dtype=np.float64).reshape(-1, 2)
+    table = np.array(times_and_rpm, dtype=np.float64).reshape(-1, 2)
     if not len(table) or (np.diff(table[:, 0]) <= 0.0).any():
         raise InputFileError(name, "expected at least one line, and increasing times")
     return EngineSpeed(table[:, 0], table[:, 1] * lines_per_turn / 60.0)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

@@ -84,7 +84,7 @@ def test_only_the_labels_are_needed(dataset, tmp_path):
         ("Class", "up", "line 3: expected a class"),
         ("Environment", "", "line 3: expected a value of Environment"),
         ("End", "soon", "line 3"),
-        ("End", "nan", "line 3: expected End"),
+        ("End", "nan", "line 3: expected a finite number as End"),
         ("End", "0.5", "expected a second of sound before 0.5 s"),
         ("End", "9", "expected a second of sound before 9 s"),
         ("T0", "x", "line 3"),

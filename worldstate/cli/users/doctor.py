@@ -14,7 +14,7 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.open_sound import Audio
+    from worldstate.adapters.audio.sound_file import Audio
     from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.channel_report import RecordingHealth
 

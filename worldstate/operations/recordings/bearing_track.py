@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.audio.open_sound import Audio
+from worldstate.adapters.audio.sound_file import Audio
 from worldstate.adapters.files.atomic import write_text
 from worldstate.frontend.direction.source_count import count_sources
 from worldstate.frontend.frame import AcousticFrame
