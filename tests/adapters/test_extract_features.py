@@ -1,6 +1,5 @@
 """Labelled recordings to feature windows: the command, where sound is looked for, damage by line."""
 
-import argparse
 import csv
 import json
 
@@ -10,7 +9,7 @@ import soundfile
 
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.cli.users import extract_features
+from worldstate.cli.main import execute
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InputFileError
@@ -50,12 +49,9 @@ def write_labels(path, rows, header=HEADER):
 
 
 def command(dataset, labels, out):
-    parser = argparse.ArgumentParser()
-    extract_features.add_parser(parser.add_subparsers(required=True))
     listed = [] if labels is None else ["--labels", labels]
     words = [dataset, *listed, "--array", dataset.parent / "mics.xml", "--out", out, "--json"]
-    arguments = parser.parse_args(["extract-features", *map(str, words)])
-    return arguments.run(arguments)
+    return execute(["extract-features", *map(str, words)])
 
 
 def test_each_window_is_the_second_before_its_end(dataset, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """Golden runs of the method on the released windows of OVAD, beside what it has to beat."""
 
-import argparse
 import csv
 import json
 
@@ -10,7 +9,7 @@ from released_data import FOLDER, needs_released_windows
 from released_data import TABLE as NAME
 
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
-from worldstate.cli.studies import evaluate_features
+from worldstate.cli.main import execute
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.operations.training.methods import row_of
@@ -83,10 +82,7 @@ def test_a_moving_ego_gains_on_every_other_row(protocol, row):
 
 
 def command(*words):
-    parser = argparse.ArgumentParser()
-    evaluate_features.add_parser(parser.add_subparsers(required=True))
-    arguments = parser.parse_args(["evaluate-features", str(TABLE), *map(str, words)])
-    return arguments.run(arguments)
+    return execute(["evaluate-features", str(TABLE), *map(str, words)])
 
 
 @pytest.mark.slow

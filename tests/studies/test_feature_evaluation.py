@@ -1,6 +1,5 @@
 """Protocols on made-up windows: nothing of a recording on both sides, every figure recomputable."""
 
-import argparse
 import csv
 import json
 
@@ -13,8 +12,7 @@ from sklearn.metrics import roc_auc_score
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
 from worldstate.adapters.files.model_file import load_model
-from worldstate.cli.studies import evaluate_features
-from worldstate.cli.users import train
+from worldstate.cli.main import execute
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.operations.training.feature_evaluation import cross_validate
 from worldstate.operations.training.splits import folds_by_recording, junction_folds, recording_labels
@@ -57,12 +55,7 @@ def csv_path(tmp_path_factory):
 
 
 def command(*words):
-    parser = argparse.ArgumentParser()
-    subparsers = parser.add_subparsers(required=True)
-    for module in (train, evaluate_features):
-        module.add_parser(subparsers)
-    arguments = parser.parse_args([str(word) for word in words])
-    return arguments.run(arguments)
+    return execute([str(word) for word in words])
 
 
 @given(st.integers(0, 1000), st.integers(12, 60), st.integers(2, 5))

@@ -1,4 +1,4 @@
-"""Entry point: one module per command, each with `add_parser` and `run`."""
+"""Entry point: one module per command, each with `EXAMPLE`, `add_options` and `run`."""
 
 import argparse
 import os
@@ -9,6 +9,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 
+from worldstate.cli.common.command import add_command
+from worldstate.cli.common.output import CommandResult, print_result
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.version import __version__
 
@@ -44,16 +46,23 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"worldstate {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name in COMMANDS:
-        import_module(f"worldstate.cli.{name}").add_parser(subparsers)
+        add_command(subparsers, import_module(f"worldstate.cli.{name}"))
     return parser
+
+
+def execute(argv: Sequence[str] | None) -> int:
+    """Run one command and print what it found; return its exit code."""
+    arguments = build_parser().parse_args(argv)
+    result: CommandResult = arguments.run(arguments)
+    print_result(result, as_json=arguments.json)
+    return result.code
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code: 0, or 2 and one line on standard error for bad input."""
     try:
         with _orderly_termination():
-            arguments = build_parser().parse_args(argv)
-            code = int(arguments.run(arguments))
+            code = execute(argv)
             sys.stdout.flush()
             return code
     except WorldstateError as error:

@@ -26,25 +26,19 @@ def add_array_options(
 ) -> None:
     """Declare --array and --array-axes, and say in the help what the files look like."""
     parser.description = f"{parser.description}\n\n{HELP}"
-    parser.add_argument(
-        "--array", type=Path, metavar="FILE", help=f"microphone positions (default: {default})"
-    )
-    parser.add_argument(
-        "--array-axes", choices=("acoular", "base_link"),
-        help="x right, y up, z forward, or x forward, y left, z up (default: by the form of the file)",
-    )  # fmt: skip
+    add = parser.add_argument
+    add("--array", type=Path, metavar="FILE", help=f"microphone positions (default: {default})")
+    axes = "x right, y up, z forward, or x forward, y left, z up (default: by the form of the file)"
+    add("--array-axes", choices=("acoular", "base_link"), help=axes)
 
 
 def add_search_options(parser: argparse.ArgumentParser) -> None:
     """Declare --band and --azimuth-span: where a bearing is looked for."""
-    parser.add_argument(
-        "--band", type=float, nargs=2, metavar=("LOW", "HIGH"),
-        help="band of the bearing, Hz (default: by the spacing of the microphones; 300 to 1800 for the roof)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--azimuth-span", type=float, default=180.0, metavar="DEG",
-        help="sector ahead that is searched, 360 for all round (default: %(default)g)",
-    )  # fmt: skip
+    add = parser.add_argument
+    band = "band of the bearing, Hz (default: by the spacing of the microphones; 300 to 1800 for the roof)"
+    add("--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help=band)
+    span = "sector ahead that is searched, 360 for all round (default: %(default)g)"
+    add("--azimuth-span", type=float, default=180.0, metavar="DEG", help=span)
 
 
 def given_array(arguments: argparse.Namespace) -> "MicrophoneArray | None":

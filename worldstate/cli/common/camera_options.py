@@ -17,20 +17,14 @@ the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "position_m": [x
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
     """Declare --detections, --camera, --miss-rates and which boxes count."""
     parser.description = f"{parser.description}\n\n{HELP}"
-    group = parser.add_argument_group("camera")
-    group.add_argument("--detections", type=Path, metavar="PATH", help="what its detector reported")
-    group.add_argument("--camera", type=Path, metavar="JSON", help="its lens (default: OVAD's camera)")
-    group.add_argument(
-        "--min-box-px", type=float, default=100.0, metavar="PX", help="boxes must be higher (100)"
-    )
-    group.add_argument("--min-score", type=float, default=0.75, metavar="P", help="lowest score (0.75)")
-    group.add_argument(
-        "--classes", nargs="+", default=["car", "motorcycle"], metavar="NAME",
-        help="classes that count as road users (car motorcycle)",
-    )  # fmt: skip
-    group.add_argument(
-        "--miss-rates", type=Path, metavar="JSON", help="how often it misses, as measure-absence wrote it"
-    )
+    add = parser.add_argument_group("camera").add_argument
+    add("--detections", type=Path, metavar="PATH", help="what its detector reported")
+    add("--camera", type=Path, metavar="JSON", help="its lens (default: OVAD's camera)")
+    add("--min-box-px", type=float, default=100.0, metavar="PX", help="boxes must be higher (100)")
+    add("--min-score", type=float, default=0.75, metavar="P", help="lowest score (0.75)")
+    classes = "classes that count as road users (car motorcycle)"
+    add("--classes", nargs="+", default=["car", "motorcycle"], metavar="NAME", help=classes)
+    add("--miss-rates", type=Path, metavar="JSON", help="how often it misses, as measure-absence wrote it")
 
 
 def boxes_of(arguments: argparse.Namespace) -> "DetectionFilter":

@@ -5,6 +5,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .command import add_choice
+
 if TYPE_CHECKING:
     from worldstate.adapters.camera.detections import DetectionFilter
     from worldstate.adapters.camera.onnx_detector import OnnxDetector, OnnxSettings
@@ -13,10 +15,8 @@ if TYPE_CHECKING:
 
 def add_detector_options(parser: argparse.ArgumentParser) -> None:
     """Declare --detector, --onnx-model and --labels."""
-    parser.add_argument(
-        "--detector", choices=("motion", "knn", "onnx"), default="motion",
-        help="background subtraction by mixtures or neighbours, or a model (default: %(default)s)",
-    )  # fmt: skip
+    kinds = "background subtraction by mixtures or neighbours, or a model"
+    add_choice(parser, "--detector", kinds, "motion", "knn", "onnx")
     parser.add_argument("--onnx-model", type=Path, metavar="ONNX", help="model in YOLO's output form")
     parser.add_argument("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of the model")
 

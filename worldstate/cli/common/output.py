@@ -1,24 +1,46 @@
-"""Printing a summary: a table for people, one JSON object for machines."""
+"""What a command found: tables for people, one JSON object for machines."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from worldstate.adapters.files.atomic import write_text
 
 
-def print_summary(summary: Mapping[str, object], *, as_json: bool) -> None:
-    """Print `summary` on standard output; None shows as a dash in the table, as null in JSON.
+@dataclass(frozen=True, slots=True)
+class CommandResult:
+    """What a command found."""
+
+    report: Mapping[str, object]  # One JSON object
+    table: Mapping[str, object] | None = None  # The same for people, where it is not the report itself
+    lines: Iterable[str] = ()  # For people, below the table
+    code: int = 0  # Exit code
+
+
+def print_result(result: CommandResult, *, as_json: bool) -> None:
+    """Print a result on standard output; None shows as a dash in the table, as null in JSON.
 
     Examples
     --------
-    >>> print_summary({"lead_time_s": 1.75, "t0_s": None}, as_json=False)
+    >>> print_result(CommandResult({"lead_time_s": 1.75, "t0_s": None}), as_json=False)
     lead_time_s  1.75
     t0_s         -
     """
     if as_json:
-        print(json.dumps(summary, allow_nan=False))
+        print(json.dumps(result.report, allow_nan=False))
         return
-    width = max(map(len, summary), default=0)
-    for key, value in summary.items():
+    table = result.report if result.table is None else result.table
+    width = max(map(len, table), default=0)
+    for key, value in table.items():
         print(f"{key:<{width}}  {_readable(value)}")
+    for line in result.lines:
+        print(line)
+
+
+def write_report(path: Path, report: Mapping[str, object]) -> None:
+    """Write a report as JSON, whole or not at all."""
+    write_text(path, json.dumps(report, allow_nan=False, indent=1) + "\n")
 
 
 def _readable(value: object) -> str:

@@ -52,15 +52,10 @@ def output_folder(folder: Path, *files: str) -> Path:
 def _is_read(target: Path, source: Path) -> bool:
     """Whether an output is the input file itself, or one of the files of an input in the layout of OVAD."""
     from worldstate.adapters.camera.video import VIDEO_NAME
-    from worldstate.adapters.datasets.ovad_layout import (
-        ARRAY_NAME,
-        AUDIO_NAME,
-        DETECTION_NAMES,
-        LOG_NAME,
-        TRUTH_NAME,
-    )
+    from worldstate.adapters.datasets import ovad_layout as ovad
 
     if source.is_dir():
-        names = (ARRAY_NAME, AUDIO_NAME, LOG_NAME, TRUTH_NAME, VIDEO_NAME, *DETECTION_NAMES)
+        sound_and_log = ovad.ARRAY_NAME, ovad.AUDIO_NAME, ovad.LOG_NAME, ovad.TRUTH_NAME
+        names = (*sound_and_log, VIDEO_NAME, *ovad.DETECTION_NAMES)
         return target.name in names and target.is_relative_to(os.path.realpath(source))
     return target.exists() and source.exists() and target.samefile(source)

@@ -21,13 +21,11 @@ def add_sound_options(parser: argparse.ArgumentParser) -> None:
     parser.description = f"{parser.description}\n\n{HELP}"
     parser.epilog = f"{parser.epilog}\n{EXAMPLE.format(parser.prog.split()[-1])}"
     parser.add_argument("input", type=Path, nargs="+", metavar="INPUT", help="what to listen to")
-    group = parser.add_argument_group("raw samples")
-    group.add_argument("--rate", type=int, metavar="HZ", help="samples a second")
-    group.add_argument("--channels", type=int, metavar="M", help="microphones")
-    group.add_argument(
-        "--format", choices=("s16", "s24", "s32", "f32"), default="s16",
-        help="little-endian whole numbers of so many bits, or floats (default: %(default)s)",
-    )  # fmt: skip
+    add = parser.add_argument_group("raw samples").add_argument
+    add("--rate", type=int, metavar="HZ", help="samples a second")
+    add("--channels", type=int, metavar="M", help="microphones")
+    bits = "little-endian whole numbers of so many bits, or floats (default: %(default)s)"
+    add("--format", choices=("s16", "s24", "s32", "f32"), default="s16", help=bits)
 
 
 def sound_of(arguments: argparse.Namespace) -> "SoundInput":

@@ -12,8 +12,7 @@ import argparse
 from pathlib import Path
 
 from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 
 EXAMPLE = """\
 examples:
@@ -21,9 +20,8 @@ examples:
   worldstate calibrate sim --out model.json --save-streams sim.npz && worldstate ablations sim.npz --json"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set or hop streams")
     add_array_options(parser)
@@ -32,8 +30,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from dataclasses import asdict
 
     from worldstate.adapters.files.model_file import load_model
@@ -45,11 +43,11 @@ def run(arguments: argparse.Namespace) -> int:
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     table = ablation_table(streams, policy.reference_prior, arguments.seed, switches)
     rows = {name: asdict(row) for name, row in table.items()}
-    if arguments.json:
-        print_summary({"recordings": len(streams), "alpha": arguments.alpha, "rows": rows}, as_json=True)
-        return 0
-    print(f"{'':24}" + "".join(f"{name:>16}" for name in rows))
+    lines = [f"{'':24}" + "".join(f"{name:>16}" for name in rows)]
     for figure in rows["full"]:
         values = [row[figure] for row in rows.values()]
-        print(f"{figure:24}" + "".join(f"{'-' if v is None else format(v, '.3g'):>16}" for v in values))
-    return 0
+        lines.append(
+            f"{figure:24}" + "".join(f"{'-' if v is None else format(v, '.3g'):>16}" for v in values)
+        )
+    report = {"recordings": len(streams), "alpha": arguments.alpha, "rows": rows}
+    return CommandResult(report, table={}, lines=lines)

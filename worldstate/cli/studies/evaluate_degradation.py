@@ -21,14 +21,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.detector_options import (
     add_detector_options,
     detector_filter,
     detector_maker,
     detector_name,
 )
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import track
 
@@ -46,18 +45,12 @@ example:
   worldstate evaluate-degradation sim --miss-rates beta.json --model street.json --jobs 2 --out sweep"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add("dataset", type=Path, metavar="DATASET", help="recordings with video")
-    add(
-        "--miss-rates",
-        type=Path,
-        required=True,
-        metavar="JSON",
-        help="of the same detector, on other recordings",
-    )
+    of_others = "of the same detector, on other recordings"
+    add("--miss-rates", type=Path, required=True, metavar="JSON", help=of_others)
     add_detector_options(parser)
     add("--model", type=Path, help="model file (default: the one that ships)")
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)")
@@ -67,13 +60,10 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--out", type=Path, default=Path("degradation"), metavar="DIR", help="(default: %(default)s)")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
-    import json
-
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.adapters.files.atomic import write_text
     from worldstate.adapters.files.model_file import load_model
     from worldstate.studies.degradation.degradation_report import (
         sweep_report,
@@ -91,10 +81,10 @@ def run(arguments: argparse.Namespace) -> int:
     recordings = _stage(arguments.out / "staged", found, settings, arguments.jobs)
     rows = degradation_sweep(recordings, judged_by, np.random.default_rng(arguments.seed))
     report = _origin(arguments, recordings) | sweep_report(rows)
-    write_text(arguments.out / "degradation.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
+    write_report(arguments.out / "degradation.json", report)
     write_sweep_figure(rows, arguments.out / "degradation.png")
-    _print(report, sweep_table(rows), as_json=arguments.json)
-    return 0
+    shown = {key: value for key, value in report.items() if key != "states"}
+    return CommandResult(report, table=shown, lines=[sweep_table(rows)])
 
 
 def _settings(arguments: argparse.Namespace) -> "StagedDataset":
@@ -142,11 +132,3 @@ def _origin(arguments: argparse.Namespace, recordings: "list[StagedHops]") -> di
         "alpha": arguments.alpha,
         "seed": arguments.seed,
     }
-
-
-def _print(report: dict[str, object], table: str, *, as_json: bool) -> None:
-    if as_json:
-        print_summary(report, as_json=True)
-        return
-    print_summary({key: value for key, value in report.items() if key != "states"}, as_json=False)
-    print(table)

@@ -25,9 +25,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from worldstate.cli.common.command import Subparsers, add_command
+from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.feature_options import add_table_options
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
@@ -45,29 +45,22 @@ examples:
   worldstate evaluate-features features.csv --model model.json --only testset.csv"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add_table_options(parser)
-    add(
-        "--protocol",
-        choices=("cv", "lojo", "transfer"),
-        default="cv",
-        help="who is held out (default: %(default)s)",
-    )
+    add_choice(parser, "--protocol", "who is held out", "cv", "lojo", "transfer")
     add("--model", type=Path, help="evaluate this model file; no cross-validation")
-    add(
-        "--only", type=Path, metavar="IDS", help="CSV file with a column ID: only recordings of these windows"
-    )
+    only = "CSV file with a column ID: only recordings of these windows"
+    add("--only", type=Path, metavar="IDS", help=only)
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
     add("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--predictions", type=Path, metavar="CSV", help="write one row a window and seed")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.datasets.feature_table import read_features, read_ids
     from worldstate.studies.features.feature_report import write_predictions
 
@@ -80,8 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     figures, predictions = evaluate(arguments, whole, table)
     if arguments.predictions is not None:
         write_predictions(arguments.predictions, table, predictions, range(len(predictions)))
-    print_summary(figures if arguments.json else _flat(figures), as_json=arguments.json)
-    return 0
+    return CommandResult(figures, table=_flat(figures))
 
 
 def _evaluate_method(

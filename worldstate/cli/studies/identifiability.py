@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.feature_options import add_which_windows
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
 
@@ -39,14 +39,12 @@ examples:
   worldstate simulate --out sim --static 40 && worldstate identifiability --recordings sim"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add_array_options(parser, "the 56-microphone roof array")
     add("--features", type=Path, metavar="CSV", help="labelled feature windows")
-    add("--group", choices=("static", "dynamic", "all"), default="static", help="of them (default: static)")
-    add("--method", choices=("baseline", "worldstate"), default="worldstate", help="(default: %(default)s)")
+    add_which_windows(parser, "of them")
     add("--recordings", type=Path, metavar="DATASET", help="labelled recordings")
     add("--band", type=float, nargs=2, default=[300.0, 1800.0], metavar="HZ", help="(default: 300 1800)")
     add("--snr-db", type=float, default=-10.0, metavar="DB", help="in each bin (default: %(default)g)")
@@ -56,8 +54,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--figure", type=Path, metavar="PNG", help="draw what was found")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from dataclasses import asdict
 
     from worldstate.studies.paper.identifiability_figure import write_identifiability_figure
@@ -66,13 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
     array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
     if arguments.figure is not None:
         write_identifiability_figure(arguments.figure, array, data, bands)
-    if arguments.json:
-        found = {"array": array, "features": data, "bands": bands}
-        told = {name: _plain(asdict(one)) for name, one in found.items() if one is not None}
-        print_summary(told, as_json=True)
-        return 0
-    print(*_lines(array, data, bands), sep="\n")
-    return 0
+    found = {"array": array, "features": data, "bands": bands}
+    report = {name: _plain(asdict(one)) for name, one in found.items() if one is not None}
+    return CommandResult(report, table={}, lines=_lines(array, data, bands))
 
 
 def _array(arguments: argparse.Namespace) -> "ReachOfArray":

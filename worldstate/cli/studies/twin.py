@@ -20,8 +20,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar, track
 
@@ -45,9 +45,8 @@ examples:
   worldstate twin --realism features.csv --out twin"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add("--static", type=int, default=83, metavar="N", help="recordings (default: 83)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -55,31 +54,20 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
     add("--preset", metavar="NAME", help="levels of the simulation (default: the newest)")
     add("--far-rate", type=float, metavar="N", help="distant vehicles a recording")
-    add(
-        "--method",
-        choices=("baseline", "worldstate"),
-        default="baseline",
-        help="what is trained: the published classifier or the ensemble (default: %(default)s)",
-    )
+    trained = "what is trained: the published classifier or the ensemble"
+    add_choice(parser, "--method", trained, "baseline", "worldstate")
     add("--model", metavar="FILE", help='classifier: a model file, or "default"')
     add("--out", type=Path, default=Path("twin"), metavar="DIR", help="(default: %(default)s)")
     add("--realism", type=Path, metavar="CSV", help="real windows to compare with")
-    add(
-        "--realism-group",
-        choices=("static", "dynamic"),
-        default="static",
-        help="of the real windows: standing or moving ego (default: %(default)s)",
-    )
+    ego = "of the real windows: standing or moving ego"
+    add_choice(parser, "--realism-group", ego, "static", "dynamic")
     add("--keep", action="store_true", help="keep the recordings too, 80 MB each")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
-    import json
-
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.adapters.files.atomic import write_text
     from worldstate.studies.streets.decision_rules import score_rules
     from worldstate.studies.streets.figure import write_comparison_figure
     from worldstate.studies.streets.published_figures import figure_intervals, published_figures
@@ -98,16 +86,11 @@ def run(arguments: argparse.Namespace) -> int:
     report = origin | comparison_report(published_figures(score), figure_intervals(score, draws))
     if realism:
         report["realism"] = {str(seed): one.to_dict() for seed, one in realism.items()}
-    write_text(arguments.out / "twin.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
+    write_report(arguments.out / "twin.json", report)
     write_comparison_figure(score, arguments.out / "twin.png")
-    if arguments.json:
-        print_summary(report, as_json=True)
-        return 0
-    print_summary(origin | {"outside": report["outside"]}, as_json=False)
-    print(comparison_table(report))
-    for seed, one in realism.items():
-        print(f"\nrealism, seed {seed}\n{one.table()}")
-    return 0
+    tables = [f"\nrealism, seed {seed}\n{one.table()}" for seed, one in realism.items()]
+    shown = origin | {"outside": report["outside"]}
+    return CommandResult(report, table=shown, lines=[comparison_table(report), *tables])
 
 
 def _simulate(arguments: argparse.Namespace) -> "list[HopTable]":

@@ -18,8 +18,7 @@ from worldstate.cli.common.array_options import (
     sound_and_array,
     stance,
 )
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options
 
@@ -29,9 +28,8 @@ examples:
   worldstate bearings mic1.wav mic2.wav mic3.wav --array ring.json --azimuth-span 360 --out bearings.csv"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_sound_options(parser)
     add_array_options(parser)
     add_search_options(parser)
@@ -40,8 +38,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.audio.open_sound import open_sound, path_of
     from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.bearing_track import (
@@ -67,5 +65,4 @@ def run(arguments: argparse.Namespace) -> int:
         "hops": len(track.time_s),
         "silent_channels": silent,
     }
-    print_summary(summary, as_json=arguments.json)
-    return 0
+    return CommandResult(summary)

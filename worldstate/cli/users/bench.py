@@ -5,35 +5,31 @@ that are installed (pyroomacoustics, and the published chain built on it) are ti
 """
 
 import argparse
-import json
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import Subparsers, add_command
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
     from worldstate.operations.arrays.bench import BenchReport
 
+EXAMPLE = "example: worldstate bench --rounds 5"
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, "example: worldstate bench --rounds 5")
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.ground.checks import in_range
     from worldstate.operations.arrays.bench import run_bench
 
     rounds = int(in_range("rounds", arguments.rounds, 1, 1000))
     with progress_bar("timing", rounds, quiet=arguments.json) as bar:
         report = run_bench(rounds, on_round=bar.advance)
-    if arguments.json:
-        print(json.dumps(report.to_dict(), allow_nan=False))
-        return 0
-    print("\n".join(_lines(report)))
-    return 0
+    return CommandResult(report.to_dict(), table={}, lines=_lines(report))
 
 
 def _lines(report: "BenchReport") -> list[str]:

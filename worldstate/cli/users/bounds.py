@@ -1,11 +1,20 @@
-"""`worldstate bounds`: what an array allows, and how near the estimators come to it."""
+"""`worldstate bounds`: what an array allows, and how near the estimators come to it.
+
+Print the second moment S_xx, aperture and alias frequency of an array, and the Cramer-Rao bound of a bearing
+at several azimuths: the standard deviation that no unbiased estimator can beat. The SNR is per microphone and
+snapshot, N snapshots independent.
+
+--out also tries the estimators (tone, delay, bearing) on random sound, beside their bounds:
+OUT/efficiency.png, variance over bound against SNR; OUT/endfire.png, the bearing from broadside to 80 degrees
+from it; OUT/bounds.json, the numbers.
+"""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, given_array, stance
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
 
@@ -21,47 +30,26 @@ SNR_DB = (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
 # Every fourth microphone of the array beside all of them.
 THINNING = 4
 
-DESCRIPTION = """\
-Print the second moment S_xx, aperture and alias frequency of an array, and the Cramer-Rao bound of a bearing
-at several azimuths: the standard deviation that no unbiased estimator can beat. The SNR is per microphone and
-snapshot, N snapshots independent.
-
---out also tries the estimators (tone, delay, bearing) on random sound, beside their bounds:
-OUT/efficiency.png, variance over bound against SNR; OUT/endfire.png, the bearing from broadside to 80 degrees
-from it; OUT/bounds.json, the numbers."""
-
 EXAMPLE = """\
 examples:
   worldstate bounds
   worldstate bounds --array mics.xml --frequency 800 --snr-db 0 10 20 --out bounds"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = subparsers.add_parser(
-        "bounds",
-        help="what an array allows, and how near the estimators come",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_array_options(parser, "the 56-microphone roof array")
-    parser.add_argument(
-        "--frequency", type=float, default=1000.0, metavar="HZ", help="of the source (default: %(default)g)"
-    )
-    parser.add_argument(
-        "--snr-db", type=float, nargs="+", default=list(SNR_DB), metavar="DB", help="(default: -15 to 30)"
-    )
-    parser.add_argument("--snapshots", type=int, default=20, metavar="N", help="(default: %(default)s)")
-    parser.add_argument("--trials", type=int, default=400, help="estimates a point (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the random sound (default: %(default)s)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="try the estimators and draw the figures")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("--frequency", type=float, default=1000.0, metavar="HZ", help="of the source (default: %(default)g)")
+    add("--snr-db", type=float, nargs="+", default=list(SNR_DB), metavar="DB", help="(default: -15 to 30)")
+    add("--snapshots", type=int, default=20, metavar="N", help="(default: %(default)s)")
+    add("--trials", type=int, default=400, help="estimates a point (default: %(default)s)")
+    add("--seed", type=int, default=1, help="of the random sound (default: %(default)s)")
+    add("--out", type=Path, metavar="DIR", help="try the estimators and draw the figures")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.frontend.array.microphone_array import roof_array_56
     from worldstate.ground.checks import in_range
     from worldstate.operations.arrays.array_bounds import array_bounds
@@ -75,15 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     array = given_array(arguments) or roof_array_56()
     bounds = array_bounds(array, arguments.frequency, AZIMUTHS_DEG)
     found = {} if arguments.out is None else _try_estimators(array, arguments)
-    if arguments.json:
-        print_summary(_as_dict(bounds, arguments) | found, as_json=True)
-    else:
-        print_summary(_as_table(bounds, array, arguments), as_json=False)
-    return 0
-
-
-def _as_dict(bounds: "ArrayBounds", arguments: argparse.Namespace) -> dict[str, object]:
-    return bounds.to_dict() | {"snapshots": arguments.snapshots, "snr_db": arguments.snr_db}
+    report = bounds.to_dict() | {"snapshots": arguments.snapshots, "snr_db": arguments.snr_db} | found
+    return CommandResult(report, table=_as_table(bounds, array, arguments))
 
 
 def _as_table(
@@ -113,9 +94,6 @@ def _as_table(
 
 def _try_estimators(array: "MicrophoneArray", arguments: argparse.Namespace) -> dict[str, object]:
     """Measure, draw, write; return the numbers."""
-    import json
-
-    from worldstate.adapters.files.atomic import write_text
     from worldstate.operations.arrays.efficiency_figure import write_efficiency_figure, write_endfire_figure
 
     output_folder(arguments.out, "efficiency.png", "endfire.png", "bounds.json")
@@ -133,7 +111,7 @@ def _try_estimators(array: "MicrophoneArray", arguments: argparse.Namespace) -> 
         "endfire_bound_rad2": endfire.bound.tolist(),
         "endfire_mean_square_rad2": endfire.mean_square.tolist(),
     }
-    write_text(arguments.out / "bounds.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
+    write_report(arguments.out / "bounds.json", report)
     return report
 
 

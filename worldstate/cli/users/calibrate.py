@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 
 if TYPE_CHECKING:
@@ -27,28 +27,17 @@ examples:
   worldstate calibrate my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
     add_array_options(parser)
     add("--model", type=Path, help="model file to start from (default: the one that ships)")
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    add(
-        "--alpha",
-        type=float,
-        nargs="+",
-        default=[0.01, 0.02, 0.05],
-        metavar="A",
-        help="budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)",
-    )
-    add(
-        "--method",
-        choices=("conformal", "plain"),
-        default="conformal",
-        help="with a finite-sample guarantee, or the smallest threshold that fits (default: %(default)s)",
-    )
+    budgets = "budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
+    add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
+    guarantee = "with a finite-sample guarantee, or the smallest threshold that fits"
+    add_choice(parser, "--method", guarantee, "conformal", "plain")
     add("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
     add("--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)")
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
@@ -56,8 +45,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from dataclasses import replace
 
     from worldstate.adapters.files.model_file import read_model, save_model
@@ -84,11 +73,10 @@ def run(arguments: argparse.Namespace) -> int:
     save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
     for warning in done.warnings:
         print(f"worldstate: warning: {warning}", file=sys.stderr)
-    _print(arguments, done)
-    return 0
+    return _result(arguments, done)
 
 
-def _print(arguments: argparse.Namespace, done: "CueingCalibration") -> None:
+def _result(arguments: argparse.Namespace, done: "CueingCalibration") -> CommandResult:
     summary: dict[str, object] = {
         "out": str(arguments.out),
         "hazard_free_hours": done.hours,
@@ -98,10 +86,7 @@ def _print(arguments: argparse.Namespace, done: "CueingCalibration") -> None:
         "correlation_time_s": done.correlation_time_s,
         "risk_map": done.risk,
     }
-    if arguments.json:
-        budgets = [report.to_dict() for report in done.budgets]
-        print_summary(summary | {"budgets": budgets, "warnings": list(done.warnings)}, as_json=True)
-        return
+    detail = {"budgets": [report.to_dict() for report in done.budgets], "warnings": list(done.warnings)}
     lines = {
         f"alpha {report.alpha:g}, beta {report.miss_rate:g}": (
             f"gamma {report.gamma:.4f}  {report.counted.per_hour:.3g} false alarms/h "
@@ -110,4 +95,4 @@ def _print(arguments: argparse.Namespace, done: "CueingCalibration") -> None:
         )
         for report in done.budgets
     }
-    print_summary(summary | lines, as_json=False)
+    return CommandResult(summary | detail, table=summary | lines)

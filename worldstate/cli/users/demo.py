@@ -5,13 +5,11 @@ before any camera can see it. Leaves timeline.png, states.jsonl and summary.json
 """
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 
 if TYPE_CHECKING:
@@ -21,14 +19,14 @@ if TYPE_CHECKING:
 
 VAN_OVER_CAR_DB = 6.0
 
+EXAMPLE = "example: worldstate demo --out out/demo --seed 7"
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, "example: worldstate demo --out out/demo --seed 7")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="another seed, another recording (default: 1)")
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)")
+    add("--seed", type=int, default=1, help="another seed, another recording (default: 1)")
 
 
 def simulate_approach(root: Path, seed: int) -> Path:
@@ -60,9 +58,8 @@ def _delivery_van(rng: "np.random.Generator") -> "SimulationSettings":
     return replace(drawn, speed_mps=rng.uniform(5.5, 8.0), braking_mps2=0.0, preset=louder)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
-    from worldstate.adapters.files.atomic import write_text
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.listen import open_source
     from worldstate.cli.common.listening import listen_with_progress
     from worldstate.operations.recordings.timeline import write_timeline
@@ -74,8 +71,5 @@ def run(arguments: argparse.Namespace) -> int:
         states_path=out / "states.jsonl",
     )  # fmt: skip
     write_timeline(report.timeline, out / "timeline.png")
-    write_text(out / "summary.json", json.dumps(report.to_dict(), allow_nan=False, indent=2) + "\n")
-    print_summary(report.to_dict(), as_json=arguments.json)
-    if not arguments.json:
-        print(f"\nsee {out / 'timeline.png'}")
-    return 0
+    write_report(out / "summary.json", report.to_dict())
+    return CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}"])

@@ -1,4 +1,11 @@
-"""`worldstate doctor`: which microphones of a recording misbehave, and what to do about it."""
+"""`worldstate doctor`: which microphones of a recording misbehave, and what to do about it.
+
+Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
+or clipped ones, offsets, levels, missing or repeated samples, the sample rate. Channels are counted from 1.
+
+Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted and noisy
+microphones show only in sound that all of them hear: two seconds of traffic do.
+"""
 
 import argparse
 from pathlib import Path
@@ -10,6 +17,7 @@ from worldstate.cli.common.array_options import (
     search_of,
     sound_and_array,
 )
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options
 
@@ -18,43 +26,25 @@ if TYPE_CHECKING:
     from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.channel_report import RecordingHealth
 
-DESCRIPTION = """\
-Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
-or clipped ones, offsets, levels, missing or repeated samples, the sample rate. Channels are counted from 1.
-
-Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted and noisy
-microphones show only in sound that all of them hear: two seconds of traffic do."""
-
 EXAMPLE = """\
 examples:
   worldstate doctor some.wav --array mics.xml
   worldstate doctor some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = subparsers.add_parser(
-        "doctor",
-        help="what is wrong with the microphones of a recording",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_sound_options(parser)
     add_array_options(parser)
     add_search_options(parser)
-    parser.add_argument("--duration", type=float, metavar="S", help="its length by another clock, seconds")
-    parser.add_argument(
-        "--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)"
-    )
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
-    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
+    add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
+    add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
-    import json
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from dataclasses import replace
 
     from worldstate.adapters.audio.open_sound import open_sound
@@ -74,13 +64,10 @@ def run(arguments: argparse.Namespace) -> int:
                 audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
             )
             health = replace(health, sample_rate=rate)
-        if arguments.json:
-            print(json.dumps(as_json(health, audio, array), allow_nan=False))
-        else:
-            print(*as_text(health, audio, array), sep="\n")
+        report, lines = as_json(health, audio, array), list(as_text(health, audio, array))
     if arguments.figure is not None:
         write_array_figure(array, health, arguments.figure)
-    return 0 if health.is_healthy else 1
+    return CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
 
 
 def examine(audio: "Audio", front_end: "FrontEnd") -> "RecordingHealth":

@@ -7,6 +7,7 @@ from worldstate.cli.common.array_options import stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_health import Fault
 from worldstate.frontend.health.sample_clock import RateEstimate
+from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.operations.recordings.channel_report import ChannelVerdict, RecordingHealth
 
@@ -26,24 +27,16 @@ def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray) -> di
         "masked_microphones": [channel + 1 for channel in health.masked_channels],
         "faults": [_fault_json(verdict) for verdict in health.verdicts],
         "n_dropouts": health.n_dropouts,
-        "dropouts": [
-            {"kind": one.kind, "sample": one.sample, "n_samples": one.n_samples} for one in health.dropouts
-        ],
+        "dropouts": [encode(one) for one in health.dropouts],
         "measured_rate_hz": rate and rate.rate_hz,
         "measured_rate_std_hz": rate and rate.std_hz,
     }
 
 
 def _fault_json(verdict: ChannelVerdict) -> dict[str, object]:
-    return {
-        "channel": verdict.channel + 1,
-        "fault": verdict.fault.value,
-        "share": verdict.share,
-        "first_s": verdict.first_s,
-        "value": verdict.value,
-        "looks_like": None if verdict.looks_like is None else verdict.looks_like + 1,
-        "masked": verdict.masked,
-    }
+    other = None if verdict.looks_like is None else verdict.looks_like + 1
+    counted = {"channel": verdict.channel + 1, "looks_like": other, "masked": verdict.masked}
+    return encode(verdict) | counted
 
 
 def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray) -> Iterator[str]:

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, given_array, stance
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
 
@@ -31,17 +30,16 @@ examples:
   worldstate train features.csv --method worldstate --out model.json"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
     add_array_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     import numpy as np
 
     from worldstate.adapters.datasets.array_choice import choose_array
@@ -63,8 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         "n_hazard": int(table.hazards.sum()),
         "n_hazard_free": int(table.hazard_free.sum()),
     }
-    print_summary(summary, as_json=arguments.json)
-    return 0
+    return CommandResult(summary)
 
 
 def _windows(arguments: argparse.Namespace) -> "tuple[list[LabelledWindow], int]":

@@ -16,9 +16,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.detector_options import add_detector_options, detector_maker, detector_name
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
@@ -33,9 +32,8 @@ examples:
       --labels person bicycle car --out beta.json"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
     add("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
@@ -47,8 +45,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--figure", type=Path, metavar="PNG", help="draw beta over d")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     import numpy as np
 
     from worldstate.adapters.camera.miss_rates import save_miss_rates
@@ -71,8 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     save_miss_rates(arguments.out, rates)
     if arguments.figure is not None:
         write_absence_figure(rates, arguments.figure)
-    print_summary(_summary(arguments, rates), as_json=arguments.json)
-    return 0
+    return CommandResult(_summary(arguments, rates))
 
 
 def _scene(

@@ -7,8 +7,7 @@ thresholds, limits, licence.
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 
 EXAMPLE = """\
 examples:
@@ -16,22 +15,19 @@ examples:
   worldstate model my_model.json --json"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
-    parser.add_argument(
-        "file", type=Path, nargs="?", metavar="FILE", help="model file (default: the one that ships)"
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("file", type=Path, nargs="?", metavar="FILE", help="model file (default: the one that ships)")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.files.model_file import read_model
     from worldstate.operations.training.model_card import model_card
 
     card = model_card(read_model(arguments.file))
-    print_summary(card if arguments.json else _readable(card), as_json=arguments.json)
-    return 0
+    return CommandResult(card, table=_readable(card))
 
 
 def _readable(card: dict[str, object]) -> dict[str, object]:

@@ -1,4 +1,16 @@
-"""`worldstate run`: a recording in, one snapshot a hop out."""
+"""`worldstate run`: a recording in, one snapshot a hop out.
+
+Listen to a recording and keep the world-state.
+
+Without detections the camera counts as not asked, which is neither presence nor absence.
+
+--save-state keeps belief and site, --resume goes on from them: with the same recording after what was heard
+before, with the recording that follows it by --start, its first sample's time on the state's clock (which is
+that of detections with stamps, too).
+
+--gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
+coverage, where only prominent peaks are kept.
+"""
 
 import argparse
 from pathlib import Path
@@ -12,7 +24,7 @@ from worldstate.cli.common.array_options import (
     stance,
 )
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options, sound_of
 from worldstate.ground.errors import InputFileError
@@ -20,18 +32,6 @@ from worldstate.ground.errors import InputFileError
 if TYPE_CHECKING:
     from worldstate.adapters.files.engine_file import EngineSpeed
     from worldstate.adapters.listen import Source
-
-DESCRIPTION = """\
-Listen to a recording and keep the world-state.
-
-Without detections the camera counts as not asked, which is neither presence nor absence.
-
---save-state keeps belief and site, --resume goes on from them: with the same recording after what was heard
-before, with the recording that follows it by --start, its first sample's time on the state's clock (which is
-that of detections with stamps, too).
-
---gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
-coverage, where only prominent peaks are kept."""
 
 EXAMPLE = """\
 examples:
@@ -41,80 +41,54 @@ examples:
   worldstate run drive.wav --ego-noise --engine-rpm rpm.csv"""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = subparsers.add_parser(
-        "run",
-        help="sound in, one world-state a hop out",
-        description=DESCRIPTION,
-        epilog=EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_sound_options(parser)
     add_array_options(parser)
     add_search_options(parser)
     _add_model_options(parser)
-    _add_state_options(parser)
     add_camera_options(parser)
     _add_output_options(parser)
-    parser.set_defaults(run=run)
 
 
 def _add_model_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", type=Path, help="model file (default: the one that ships)")
-    parser.add_argument(
-        "--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--model", type=Path, help="model file (default: the one that ships)")
+    add("--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)")
+    add(
         "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
     )
-    parser.add_argument(
+    add(
         "--site-adaptation", action=argparse.BooleanOptionalAction, default=True,
         help="learn what the site is like while listening (default: on)",
     )  # fmt: skip
-    parser.add_argument(
-        "--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)"
-    )
-    parser.add_argument(
+    add("--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)")
+    add(
         "--uncalibrated", action="store_true",
         help="go on where the model was made for another array or rate; no cue states an alpha then",
     )  # fmt: skip
-    parser.add_argument(
-        "--grounded", action="store_true",
-        help="weigh the signature with bearing and approach, eq. (5) (default: off)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--ego-noise", action="store_true",
-        help="learn the own vehicle's noise while nothing is there and hear past it (default: off)",
-    )  # fmt: skip
-
-
-def _add_state_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--engine-rpm", type=Path, metavar="CSV",
-        help="columns time_s, rpm of the own engine: cancel its lines, with --ego-noise",
-    )  # fmt: skip
-    parser.add_argument(
-        "--engine-lines", type=float, default=2.0, metavar="N",
-        help="firings a turn: half the cylinders (default: %(default)g)",
-    )  # fmt: skip
-    parser.add_argument("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
+    grounded = "weigh the signature with bearing and approach, eq. (5) (default: off)"
+    add("--grounded", action="store_true", help=grounded)
+    ego_noise = "learn the own vehicle's noise while nothing is there and hear past it (default: off)"
+    add("--ego-noise", action="store_true", help=ego_noise)
+    rpm = "columns time_s, rpm of the own engine: cancel its lines, with --ego-noise"
+    add("--engine-rpm", type=Path, metavar="CSV", help=rpm)
+    firings = "firings a turn: half the cylinders (default: %(default)g)"
+    add("--engine-lines", type=float, default=2.0, metavar="N", help=firings)
+    add("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
+    add("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("output")
-    group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    group.add_argument("--save-state", type=Path, metavar="STATE", help="keep belief and site for --resume")
-    group.add_argument("--figure", type=Path, metavar="PNG", help="draw the timeline")
-    group.add_argument(
-        "--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence"
-    )
-    group.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    add = parser.add_argument_group("output").add_argument
+    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    add("--save-state", type=Path, metavar="STATE", help="keep belief and site for --resume")
+    add("--figure", type=Path, metavar="PNG", help="draw the timeline")
+    add("--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.audio.sound_file import SilentChannelsError
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.cli.common.listening import listen_with_progress
@@ -140,8 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.gating is not None:
         write_gating_figure(report.bearings, arguments.gating, title=str(source.audio_path))
         summary |= bearing_figures(report.bearings)
-    print_summary(summary, as_json=arguments.json)
-    return 0
+    return CommandResult(summary)
 
 
 def _source(arguments: argparse.Namespace) -> "Source":

@@ -17,8 +17,8 @@ import argparse
 from pathlib import Path
 
 from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.command import Subparsers, add_command
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
@@ -32,16 +32,15 @@ examples:
   worldstate run sim/SA1/left/1_00_0000"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
     add("--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)")
     add("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
-    add("--scene", choices=SCENES, default=SCENES[0], help="what hides the vehicle (default: %(default)s)")
-    add("--kind", choices=KINDS, default=KINDS[0], help="vehicle (default: %(default)s)")
-    add("--preset", choices=PRESETS, default=PRESETS[0], help="how busy the street is (default: %(default)s)")
+    add_choice(parser, "--scene", "what hides the vehicle", *SCENES)
+    add_choice(parser, "--kind", "vehicle", *KINDS)
+    add_choice(parser, "--preset", "how busy the street is", *PRESETS)
     add_array_options(parser, "OVAD's")
     add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -49,8 +48,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--video", action="store_true", help="render the camera's video, too")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
@@ -83,5 +82,4 @@ def run(arguments: argparse.Namespace) -> int:
         "seed": arguments.seed,
         "folders": [row.folder.as_posix() for row in rows],
     }
-    print_summary(summary, as_json=arguments.json)
-    return 0
+    return CommandResult(summary)

@@ -14,9 +14,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.command import Subparsers, add_command
 from worldstate.cli.common.feature_options import add_table_options
-from worldstate.cli.common.output import print_summary
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
@@ -28,21 +27,13 @@ example:
   worldstate train features.csv --group static --exclude testset.csv --out model.json"""
 
 
-def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    parser = add_command(subparsers, run, __doc__, EXAMPLE)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add = parser.add_argument
     add_table_options(parser)
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    add(
-        "--exclude",
-        type=Path,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="IDS",
-        help="CSV files with a column ID: leave out the recordings of these windows",
-    )
+    ids = "CSV files with a column ID: leave out the recordings of these windows"
+    add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--array", type=Path, metavar="FILE", help="microphones that the windows were heard by")
     add("--sample-rate", type=float, metavar="HZ", help="of that sound (default: 47998)")
     add("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
@@ -50,8 +41,8 @@ def add_parser(subparsers: "Subparsers[argparse.ArgumentParser]") -> None:
     add("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
     from worldstate.adapters.datasets.feature_table import read_features, read_ids
     from worldstate.adapters.files.model_file import save_model
     from worldstate.operations.training.training import TrainingSettings, train_model
@@ -79,8 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         "n_excluded_windows": len(table) - len(kept),
         **(model.provenance.figures or {}),
     }
-    print_summary(summary, as_json=arguments.json)
-    return 0
+    return CommandResult(summary)
 
 
 def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "FeatureTable":
