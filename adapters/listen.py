@@ -347,35 +347,66 @@ def open_source(
     >>> len(source.array.positions_m), source.policy.alpha
     (56, 0.05)
     """
-    sound, settings, context = as_sound(path), settings or ListenSettings(), context or Context()
+    settings, context = settings or ListenSettings(), context or Context()
     if engine is not None and not settings.ego_noise:
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
-    recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     chosen = model if isinstance(model, Model) else read_model(model)
-    policy = _policy(chosen, settings.alpha)
-    heard_by = _array(sound, array, chosen, settings)
-    lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
-    rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
+    source, recording = _heard(as_sound(path), array, chosen, context, settings)
+    source = _with_camera(source, recording, detections, detector, camera, miss_rates)
     before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
+    return replace(
+        source,
+        site=None if before is None else before.site,
+        resume=None if before is None else before.world,
+        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)),
+        engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
+    )
+
+
+def _heard(
+    sound: SoundInput,
+    array: Path | str | MicrophoneArray | None,
+    model: Model,
+    context: Context,
+    settings: ListenSettings,
+) -> tuple[Source, Recording | None]:
+    """Return what is heard and by which array and model, and the recording folder if it is one."""
+    recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
+    policy = _policy(model, settings.alpha)
+    heard_by = _array(sound, array, model, settings)
     moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
-    stated = not settings.uncalibrated and states_budget(chosen.domain, heard_by, moves)
-    return Source(
+    stated = not settings.uncalibrated and states_budget(model.domain, heard_by, moves)
+    source = Source(
         sound=recording.audio_path if recording else sound,
         array=heard_by,
-        detections=_detections(detections, detector, recording, lens),
-        model=chosen.signature,
+        detections=None,
+        model=model.signature,
         policy=policy if stated else replace(policy, alpha=0.0),
         context=context,
         settings=settings,
         t0_s=recording.t0_s if recording else None,
         hazard_free=recording is not None and recording.label == "none",
+    )
+    return source, recording
+
+
+def _with_camera(
+    source: Source,
+    recording: Recording | None,
+    detections: Path | str | DetectionLog | None,
+    detector: Detector | None,
+    camera: Path | str | PinholeCamera | None,
+    miss_rates: Path | str | MissRates | None,
+) -> Source:
+    """Return the source with what the camera reported and how well it sees."""
+    lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
+    rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
+    return replace(
+        source,
+        detections=_detections(detections, detector, recording, lens),
         camera=lens,
         miss_rates=rates,
         degradation=_degradation(recording, rates),
-        site=None if before is None else before.site,
-        resume=None if before is None else before.world,
-        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)),
-        engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
     )
 
 

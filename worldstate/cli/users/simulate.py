@@ -15,11 +15,15 @@ ends at a merge; there the ego stands and every approach is from the left.
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
@@ -51,19 +55,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
-    from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
-    static = arguments.static
-    settings = DatasetSettings(
-        n_static=(0 if arguments.dynamic else 4) if static is None else static,
-        n_dynamic=arguments.dynamic,
-        seed=arguments.seed,
-        scene=arguments.scene,
-        kind=arguments.kind,
-        duration_s=arguments.duration,
-        video=arguments.video,
-        preset=arguments.preset,
-    )
+    settings = _settings(arguments)
     with progress_bar("simulating", settings.n_static + settings.n_dynamic) as bar:
         rows = write_dataset(
             arguments.out,
@@ -76,10 +69,23 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "out": str(arguments.out),
         "recordings": len(rows),
         "approaches": sum(row.approach != "none" for row in rows),
-        "scene": arguments.scene,
-        "kind": arguments.kind,
-        "preset": arguments.preset,
-        "seed": arguments.seed,
+        **{name: getattr(arguments, name) for name in ("scene", "kind", "preset", "seed")},
         "folders": [row.folder.as_posix() for row in rows],
     }
     return CommandResult(summary)
+
+
+def _settings(arguments: argparse.Namespace) -> "DatasetSettings":
+    from worldstate.adapters.simulation.dataset.plan import DatasetSettings
+
+    static = arguments.static
+    return DatasetSettings(
+        n_static=(0 if arguments.dynamic else 4) if static is None else static,
+        n_dynamic=arguments.dynamic,
+        seed=arguments.seed,
+        scene=arguments.scene,
+        kind=arguments.kind,
+        duration_s=arguments.duration,
+        video=arguments.video,
+        preset=arguments.preset,
+    )
