@@ -3,13 +3,19 @@
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
+import soundfile
 
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.camera.static_boxes import ParkedRule, count_boxes
-from worldstate.ground.errors import InputFileError
+from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.listen import listen, open_source
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 SIZE = {"width_px": 1000, "height_px": 600}
 
@@ -52,3 +58,57 @@ def test_every_box_is_put_down_to_one_reason():
     counts = count_boxes(DetectionLog.at_rate([frame] * 20, 10.0), DetectionFilter(), ParkedRule())
     assert (counts.boxes, counts.other_class, counts.low_score, counts.too_small) == (80, 20, 20, 20)
     assert (counts.counted, counts.parked) == (10, 10)
+
+
+@pytest.fixture
+def watched(tmp_path):
+    """A recording folder whose video shows a square that crosses from left to right: 2 s at 10 Hz."""
+    folder = tmp_path / "SA1" / "left" / "1_00_0002"
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    soundfile.write(folder / "out_multi.wav", 0.01 * rng.standard_normal((2 * 48_000, 56)), 48_000)
+    video = cv2.VideoWriter(str(folder / VIDEO_NAME), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (640, 402))
+    street = rng.integers(90, 110, (402, 640, 3)).astype(np.uint8)
+    for left in range(0, 500, 25):
+        image = street.copy()
+        image[150:300, left : left + 120] = 220
+        video.write(image)
+    video.release()
+    return folder
+
+
+def test_a_detector_looks_at_the_video_of_a_folder(watched):
+    source = open_source(watched, detector=MotionDetector())
+    assert len(source.detections) == 20 and source.detections.source.endswith(VIDEO_NAME)
+    for number in range(10, 20):
+        (box,) = source.detections.frames[number].boxes_px
+        # A square without texture moves at its edges: its front is found, its middle is still.
+        np.testing.assert_allclose(box[1:], [150, 25 * number + 120, 300], atol=12)
+        assert 25 * number - 12 <= box[0] < box[2]
+    states = list(listen(watched, detector=MotionDetector()))
+    assert len(states) == 11
+
+
+def test_a_detector_needs_a_folder_with_a_video_and_no_detections(watched):
+    with pytest.raises(InvalidArgumentError, match="expected a recording folder with a video"):
+        open_source(watched / "out_multi.wav", detector=MotionDetector())
+    with pytest.raises(InvalidArgumentError, match="no detections"):
+        open_source(watched, detector=MotionDetector(), detections=DetectionLog((), np.empty(0, np.int64)))
+    (watched / VIDEO_NAME).unlink()
+    with pytest.raises(InputFileError, match=VIDEO_NAME):
+        open_source(watched, detector=MotionDetector())
+
+
+def test_run_says_how_many_boxes_count(watched, tmp_path, capsys):
+    names = ("car", "dog", "car")
+    boxes = [[10.0, 20.0, 60.0, 220.0], [10.0, 20.0, 60.0, 220.0], [300.0, 20.0, 350.0, 30.0]]
+    frame = {"boxes": boxes, "scores": [0.9, 0.9, 0.9], "classes_str": names}
+    (tmp_path / "d.json").write_text(json.dumps({"detections_per_frame": [frame] * 20}))
+    words = ["run", str(watched), "--detections", str(tmp_path / "d.json")]
+    assert main(words) == 0
+    said = (
+        "10 of 60 boxes in 20 frames count; 20 of another class, 0 below the score, 20 too small, 10 parked"
+    )
+    assert said in capsys.readouterr().out
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["detections"]["counted"] == 10

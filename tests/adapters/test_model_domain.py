@@ -1,6 +1,7 @@
 """What a model was made for: another array or rate is refused, another order is understood."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of, ovad_domain
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.model_file import load_model, read_model
+from worldstate.adapters.files.model_file import load_model, read_model, save_model
 from worldstate.adapters.listen import ListenSettings, listen, measure_steps, open_source
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
@@ -56,7 +57,11 @@ WRONG = {
     "yawed": (turned(20.0, axis=2), "looks rotated by 20 deg"),
     "shuffled and wrong": (SHUFFLED * [1, 1, 0.9], "elsewhere"),
     "one moved": (HERE + np.eye(56)[7][:, None] * [0, 0.003, 0], "microphones up to 3 mm elsewhere"),
+    "a quarter turn": (HERE[:, [1, 0, 2]] * [-1, 1, 1], "axes swapped"),
+    "one twice": (np.vstack([HERE[:55], HERE[:1]]), "microphones [0, 55] in one"),
 }
+FORMS = ("xml", "csv", "json")
+NO_METRES = dict.fromkeys(("millimetres", "centimetres"), "expected positions in metres")
 RIGHT = {
     "the same": HERE,
     "rounded to a millimetre": HERE.round(3),
@@ -74,15 +79,41 @@ def alone(approach: Approach, tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("case", WRONG)
+def array_file(path: Path, positions: np.ndarray) -> Path:
+    """Write positions as a user would, by the suffix: the library's writer takes no wrong ones."""
+    if path.suffix == ".json":
+        path.write_text(json.dumps(positions.tolist()))
+    elif path.suffix == ".csv":
+        path.write_text("x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in positions.tolist()))
+    else:
+        marks = "".join(f'<pos Name="m" x="{-y}" y="{z}" z="{x}"/>' for x, y, z in positions.tolist())
+        path.write_text(f'<MicArray name="mics">{marks}</MicArray>')
+    return path
+
+
+@pytest.mark.parametrize(("case", "form"), list(zip(WRONG, 7 * FORMS, strict=False)))
 @pytest.mark.parametrize("beside", ["model", "data set"])
-def test_a_wrong_array_is_never_taken(case: str, beside: str, alone: Path, approach: Approach) -> None:
+def test_a_wrong_array_is_never_taken(
+    case: str,
+    form: str,
+    beside: str,
+    alone: Path,
+    approach: Approach,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     positions, why = WRONG[case]
+    said = NO_METRES.get(case, why)
     path = alone if beside == "model" else approach.folder
-    with pytest.raises(OutOfDomainError, match=why):
-        open_source(path, array=MicrophoneArray(positions))
-    with pytest.raises(OutOfDomainError, match=why):
-        AcousticAdapter(MicrophoneArray(positions), RATE, load_model()[0])
+    mics, states = array_file(tmp_path / f"mics.{form}", positions), tmp_path / "states.jsonl"
+    with pytest.raises((OutOfDomainError, InputFileError), match=re.escape(said)):
+        open_source(path, array=mics)
+    assert main(["run", str(path), "--array", str(mics), "--out", str(states)]) == 2
+    assert said in capsys.readouterr().err
+    assert not states.exists()
+    if case != "one twice":  # no such object can be made
+        with pytest.raises(OutOfDomainError, match=why):
+            AcousticAdapter(MicrophoneArray(positions), RATE, load_model()[0])
 
 
 @pytest.mark.parametrize("case", RIGHT)
@@ -168,6 +199,41 @@ def test_ovads_layout_is_read_with_ovads_array(azimuth_deg: float, tmp_path: Pat
     assert abs(np.degrees(first.bearing.azimuth_rad) - azimuth_deg) < 1.0
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_another_order_is_said_and_gives_the_same_bearings(
+    form: str, tmp_path: Path, approach: Approach, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a sound file the order given counts, in a data set its own."""
+    order = RNG.permutation(56)
+    mics = array_file(tmp_path / f"mics.{form}", HERE[order])
+    soundfile.write(tmp_path / "some.wav", plane_wave(20.0)[:, order], RATE, subtype="PCM_24")
+    (_, first), *_ = measure_steps(open_source(tmp_path / "some.wav", array=mics))
+    assert isinstance(first.bearing, Bearing)
+    assert abs(np.degrees(first.bearing.azimuth_rad) - 20.0) < 1.0
+    assert "in another order" in caplog.text
+    caplog.clear()
+    np.testing.assert_allclose(open_source(approach.folder, array=mics).array.positions_m, HERE, atol=1e-9)
+    assert "in another order" in caplog.text
+
+
+def test_a_recordings_own_array_gives_the_bearings_of_the_same_one_passed(
+    tmp_path: Path, approach: Approach
+) -> None:
+    """In a data set that names its array, and in OVAD's layout, which names none."""
+    bare = tmp_path / "SA1" / "left" / "1_00_0002"
+    bare.mkdir(parents=True)
+    (bare / "out_multi.wav").symlink_to(approach.audio_path)
+    given = ["--array", str(approach.array_path)]
+    tracks = []
+    for number, words in enumerate(([str(approach.folder)], [str(approach.folder), *given], [str(bare)])):
+        out = tmp_path / f"{number}.csv"
+        assert main(["bearings", *words, "--out", str(out)]) == 0
+        tracks.append(np.genfromtxt(out, delimiter=",", names=True)["azimuth_deg"])
+    assert len(tracks[0]) > 50 and np.isfinite(tracks[0]).any()
+    for track in tracks[1:]:
+        np.testing.assert_allclose(track, tracks[0], atol=0.1)
+
+
 def test_a_data_set_is_read_with_its_own_array(tmp_path: Path, approach: Approach) -> None:
     own = open_source(approach.folder).array.positions_m
     assert np.array_equal(own, open_source(approach.folder, array=approach.array_path).array.positions_m)
@@ -233,6 +299,56 @@ def test_windows_of_another_array_are_not_scored() -> None:
         other = domain_of(MicrophoneArray(positions), [RATE], ["SA1"])
         with pytest.raises(OutOfDomainError, match=why):
             check_tables(model, other)
+
+
+def test_evaluating_a_table_of_another_array_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = replace(windows(), domain=domain_of(MicrophoneArray(HERE[:8], "eight"), [RATE], ["SA1"]))
+    write_features(tmp_path / "t.csv", table)
+    model, alone = tmp_path / "m.json", ["--group", "all"]
+    shipped = read_model()
+    unseen = replace(shipped.provenance, training_recordings=())
+    save_model(model, replace(shipped, provenance=unseen))
+    assert main(["evaluate-features", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 2
+    assert "eight: not the array of the model" in capsys.readouterr().err
+    # A table that names none is OVAD's, as the released one.
+    write_features(tmp_path / "t.csv", replace(windows(), environments=np.array(["SA1"] * 60)))
+    assert main(["evaluate-features", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 0
+
+
+def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
+    alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Thresholds set on one array say nothing of another; streams are one signature's scores, too."""
+    shipped = read_model()
+    elsewhere = MicrophoneArray(HERE * [1, -1, 1], "mirrored")
+    own = replace(shipped.signature, domain=domain_of(elsewhere, [RATE], ["SA1"]))
+    save_model(tmp_path / "own.json", replace(shipped, signature=own))
+    quiet, mics = tmp_path / "quiet.wav", array_file(tmp_path / "mics.csv", elsewhere.positions_m)
+    soundfile.write(quiet, 0.01 * RNG.standard_normal((RATE * 2, 56)), RATE, subtype="FLOAT")
+    out, streams = tmp_path / "out.json", tmp_path / "s.npz"
+    words = ["--alpha", "0.2", "--method", "plain", "--out", str(out)]
+    assert main(["calibrate", str(quiet), "--array", str(mics), *words]) == 2
+    assert "looks mirrored" in capsys.readouterr().err and not out.exists()
+    heard = ["--array", str(mics), "--model", str(tmp_path / "own.json"), "--save-streams", str(streams)]
+    assert main(["calibrate", str(quiet), *heard, *words]) == 0
+    written = read_model(out).domain
+    assert written is not None and written.array == "mirrored"
+    assert main(["calibrate", str(streams), "--model", str(tmp_path / "own.json"), *words]) == 0
+    out.unlink()
+    assert main(["calibrate", str(streams), *words]) == 2
+    assert "heard with another model's signature" in capsys.readouterr().err and not out.exists()
+
+
+def test_twin_refuses_a_model_of_another_array(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = read_model()
+    roof = domain_of(roof_array_56(), [RATE], ["SA1"])
+    save_model(tmp_path / "roof.json", replace(shipped, signature=replace(shipped.signature, domain=roof)))
+    words = ["twin", "--static", "4", "--out", str(tmp_path / "twin"), "--model", str(tmp_path / "roof.json")]
+    assert main(words) == 2
+    assert "not the array of the model" in capsys.readouterr().err
+    assert not (tmp_path / "twin" / "hops").exists()
 
 
 @pytest.mark.parametrize(

@@ -76,8 +76,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     output_folder(arguments.out, "twin.json", "twin.png")
     realism = _realism(arguments)
+    given = None if arguments.model is None else _given(arguments.model)
     hops = _simulate(arguments)
-    signature = _signature(arguments)
+    signature = given or _trained(arguments)
     recordings = [classified(recording, signature) for recording in hops]
     # Folds and bootstrap are drawn apart from the recordings, from the same seed.
     folds, draws = np.random.default_rng(arguments.seed).spawn(2)
@@ -110,12 +111,20 @@ def _simulate(arguments: argparse.Namespace) -> "list[HopTable]":
     return list(track(made, "simulating and listening", len(plans)))
 
 
-def _signature(arguments: argparse.Namespace) -> "AnySignature":
+def _given(model: str) -> "AnySignature":
+    """Read a model's signature; one that was made for another array than the simulator's is refused."""
+    from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
     from worldstate.adapters.files.model_file import load_model
+
+    signature, _ = load_model(None if model == DEFAULT_MODEL else model)
+    if signature.domain is not None:
+        check_tables(signature.domain, ovad_domain(["SA1"]))
+    return signature
+
+
+def _trained(arguments: argparse.Namespace) -> "AnySignature":
     from worldstate.studies.streets.street_training import N_RECORDINGS, train_on_simulation
 
-    if arguments.model is not None:
-        return load_model(None if arguments.model == DEFAULT_MODEL else arguments.model)[0]
     with progress_bar("simulating the training windows", N_RECORDINGS) as bar:
         return train_on_simulation(
             arguments.out,

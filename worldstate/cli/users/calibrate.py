@@ -3,9 +3,10 @@
 Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
 
 INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
-that --save-streams wrote. Recordings labelled none and sound files count as hazard-free. Approaches with a
-T0, where there are some, give the risk map (Platt for few, isotonic for many); without them the model's own
-is kept. A budget that the hours do not suffice for is warned about, with the hours that it would take.
+that --save-streams wrote with the same signature. Recordings labelled none and sound files count as
+hazard-free. Approaches with a T0, where there are some, give the risk map (Platt for few, isotonic for many);
+without them the model's own is kept. A budget that the hours do not suffice for is warned about, with the
+hours that it would take.
 """
 
 import argparse
