@@ -27,8 +27,10 @@ from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
 from worldstate.adapters.simulation.sound.propagation import add_sources
 from worldstate.adapters.simulation.sound.receiver import Receiver, add_turning
+from worldstate.adapters.simulation.sound.scatter import scattering
 from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 FS = 48_000.0
@@ -74,7 +76,7 @@ def test_a_moving_ego_hears_the_doppler_of_its_own_speed():
     sound = emission(receiver, tone(1000.0))
     out = np.zeros((1, receiver.samples), np.float32)
     still = MovingSource(sound, place[0], np.full(len(sound.knots_s), place[1]))
-    add_sources(out, StaticSources(out, FS), [still], FREE_FIELD, receiver, 40.0)
+    add_sources(StaticSources(out, FS), [still], Surroundings(FREE_FIELD, receiver, 40.0))
     time = np.arange(receiver.samples) / FS
     distance = np.sqrt((20.0 - ego.x_m(time)) ** 2 + 3.0**2 + 1.4**2)
     exact = np.cos(2 * np.pi * 1000.0 * (time - distance / C)) / distance
@@ -120,8 +122,9 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
     out = np.zeros((1, receiver.samples), np.float32)
     source = MovingSource(emitted, *path.behind(0.9))
     static = StaticSources(out, FS)
-    add_sources(out, static, [source], scene.site, receiver, 24.0, outdoors=True)
-    add_scattered(out, static, source, scene.site, receiver, scene.preset)
+    around = Surroundings(scene.site, receiver, 24.0, scattering(scene.preset), outdoors=True)
+    add_sources(static, [source], around)
+    add_scattered(static, source, around)
     static.render()
     return out[0].astype(float)
 

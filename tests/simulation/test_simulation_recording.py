@@ -37,6 +37,7 @@ from worldstate.adapters.simulation.sound.paths import trace_paths
 from worldstate.adapters.simulation.sound.propagation import add_sources
 from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.cli.main import main
 from worldstate.cli.users import simulate as cli
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
@@ -61,7 +62,8 @@ def pass_by(tone_hz: float, name: str, approach: str) -> np.ndarray:
     receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / FS)
     out = np.zeros((1, blocks * KNOT_SAMPLES), np.float32)
     static = StaticSources(out, FS)
-    add_sources(out, static, [MovingSource(emission, lane, path.axle_y_m())], plan, receiver, 24.0)
+    source = MovingSource(emission, lane, path.axle_y_m())
+    add_sources(static, [source], Surroundings(plan, receiver, 24.0))
     static.render()
     return out[0].astype(float)
 

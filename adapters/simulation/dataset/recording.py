@@ -28,6 +28,7 @@ from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.scatter import scattering
 from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -131,9 +132,9 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     static = StaticSources(sound, settings.sample_rate_hz)
     paths = trajectories(settings, _knots(settings))
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
-        _add_vehicle_sound(sound, static, settings, path, receiver, draws)
+        _add_vehicle_sound(static, settings, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
-    add_background(sound, static, settings.site, settings.preset, positions, rate, to_street)
+    add_background(static, settings.site, settings.preset, positions, to_street)
     static.render()
     if not settings.ego.stands:
         time = np.arange(receiver.samples) / rate
@@ -165,29 +166,25 @@ def _knots(settings: SimulationSettings) -> FloatArray:
 
 
 def _add_vehicle_sound(
-    sound: Float32Array,
     static: StaticSources,
     settings: SimulationSettings,
     path: Trajectory,
     receiver: Receiver,
     rng: np.random.Generator,
 ) -> None:
-    preset, rate = settings.preset, settings.sample_rate_hz
+    preset, rate, site = settings.preset, settings.sample_rate_hz, settings.site
     level = preset.vehicle_level_db + preset.vehicle_spread_db * rng.standard_normal()
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
-    mirrored = np.sqrt(1.0 - scattering(preset))
-    cap_db, site = preset.screen_cap_db, settings.site
-    add_sources(sound, static, sources, site, receiver, cap_db, mirrored, outdoors=True)
+    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
+    add_sources(static, sources, around)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
-    body = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
-    add_scattered(sound, static, body, site, receiver, preset)
+    add_scattered(static, _moving(path, whole, middle, SOURCE_HEIGHT_M, rate), around)
     dry = whole * _late_gain(settings, path, len(whole))
-    heard = dry[: round(-path.time_s[0] * rate) + sound.shape[1]]
+    heard = dry[: round(-path.time_s[0] * rate) + receiver.samples]
     field = street_field(site, preset.late_lobe_share)
-    samples, positions = sound.shape[1], receiver.positions_m
-    add_late_field(static, heard, samples, preset.late_decay_s, positions, rate, rng, field)
+    add_late_field(static, heard, preset.late_decay_s, receiver.positions_m, rng, field)
 
 
 def _moving(

@@ -8,7 +8,7 @@ from worldstate.adapters.simulation.scene.octave_bands import REFERENCE_PA, leve
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.ground.typing import Float32Array, FloatArray
 
-from .static_field import StaticSources, plane_wave_delays
+from .static_field import StaticSources, plane_wave_delays, unit_vectors
 
 FLUCTUATION_STEP_S = 1.0
 LOBES = 3
@@ -20,27 +20,32 @@ WIND_FLOOR_HZ = 20.0  # below, wind stays as it is there
 
 
 def add_background(
-    out: Float32Array,
-    static: StaticSources,
-    site: Site,
-    preset: Preset,
-    positions_m: FloatArray,
-    sample_rate_hz: float,
-    rng: np.random.Generator,
+    static: StaticSources, site: Site, preset: Preset, positions_m: FloatArray, rng: np.random.Generator
 ) -> None:
     """Add everything that a street without a vehicle sounds like.
 
-    Shapes: out (M, n), positions_m (M, 3).
+    Shapes: positions_m (M, 3).
     """
     offsets = positions_m - positions_m.mean(axis=0)
     level_db = np.array(preset.ambient_octaves_db) + preset.ambient_spread_db * rng.standard_normal()
     azimuth, power = ambient_directions(site, preset, rng)
-    waves = _ambient_waves(power, level_db, preset, out.shape[1], sample_rate_hz, rng)
-    static.add(waves, plane_wave_delays(unit_vectors(azimuth, rng), offsets))
-    far_db = level_db + preset.far_level_db
-    for loudest_s in far_passages_s(preset, out.shape[1] / sample_rate_hz, rng):
-        static.add(*_far_vehicle(loudest_s, out.shape[1], far_db, offsets, sample_rate_hz, rng))
-    _add_channel_noise(out, preset, sample_rate_hz, rng)
+    waves = _octave_noise(static, level_db, rng, len(power))
+    time = np.arange(waves.shape[1]) / static.sample_rate_hz
+    duration_s = waves.shape[1] / static.sample_rate_hz
+    knots = np.arange(0.0, duration_s + 2.0 * FLUCTUATION_STEP_S, FLUCTUATION_STEP_S)
+    for wave, share in zip(waves, power, strict=True):
+        wander_db = preset.wave_fluctuation_db * rng.standard_normal(len(knots))
+        wave *= np.interp(time, knots, np.sqrt(share) * 10.0 ** (wander_db / 20.0)).astype(np.float32)
+    static.add(waves, plane_wave_delays(_low_directions(azimuth, rng), offsets))
+    for loudest_s in far_passages_s(preset, duration_s, rng):
+        # A vehicle some streets away: one direction, one facade reflection, gone in seconds.
+        noise = _octave_noise(static, level_db + preset.far_level_db, rng, 1)
+        noise *= np.exp(-0.5 * ((time - loudest_s) / rng.uniform(*FAR_WIDTH_S)) ** 2).astype(np.float32)
+        echo = np.roll(noise, int(rng.uniform(0.01, 0.05) * static.sample_rate_hz))
+        echo *= np.float32(rng.uniform(0.3, 0.8))
+        directions = _low_directions(rng.uniform(-np.pi, np.pi, 2), rng)
+        static.add(np.concatenate([noise, echo]), plane_wave_delays(directions, offsets))
+    _add_channel_noise(static, preset, rng)
 
 
 def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -55,11 +60,9 @@ def ambient_directions(site: Site, preset: Preset, rng: np.random.Generator) -> 
     return azimuth, preset.lobe_share * shaped + (1.0 - preset.lobe_share) / preset.ambient_waves
 
 
-def unit_vectors(azimuth_rad: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _low_directions(azimuth_rad: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Directions with a small random elevation, as traffic between buildings has, shape (Q, 3)."""
-    elevation = np.abs(rng.normal(0.0, 0.2, len(azimuth_rad)))
-    flat = np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation)], axis=1)
+    return unit_vectors(azimuth_rad, np.abs(rng.normal(0.0, 0.2, len(azimuth_rad))))
 
 
 def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator, channels: int) -> Float32Array:
@@ -82,22 +85,13 @@ def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:
     return np.asarray(rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz))
 
 
-def _ambient_waves(
-    power: FloatArray,
-    level_db: FloatArray,
-    preset: Preset,
-    samples: int,
-    rate: float,
-    rng: np.random.Generator,
+def _octave_noise(
+    static: StaticSources, level_db: FloatArray, rng: np.random.Generator, channels: int
 ) -> Float32Array:
+    """Noise of given octave levels (8,), as long as the recording."""
+    samples, rate = static.out.shape[1], static.sample_rate_hz
     density = level_curve(level_db, noise_frequencies(samples, rate)) * rate
-    waves = shaped_noise(density, samples, rng, len(power))
-    knots = np.arange(0.0, samples / rate + 2.0 * FLUCTUATION_STEP_S, FLUCTUATION_STEP_S)
-    time = np.arange(samples) / rate
-    for wave, share in zip(waves, power, strict=True):
-        wander_db = preset.wave_fluctuation_db * rng.standard_normal(len(knots))
-        wave *= np.interp(time, knots, np.sqrt(share) * 10.0 ** (wander_db / 20.0)).astype(np.float32)
-    return waves
+    return shaped_noise(density, samples, rng, channels)
 
 
 def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
@@ -107,28 +101,16 @@ def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) 
     return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, number)
 
 
-def _far_vehicle(
-    loudest_s: float,
-    samples: int,
-    level_db: FloatArray,
-    offsets_m: FloatArray,
-    rate: float,
-    rng: np.random.Generator,
-) -> tuple[Float32Array, FloatArray]:
-    """Draw a vehicle some streets away: one direction, one facade reflection, gone in seconds."""
-    noise = shaped_noise(level_curve(level_db, noise_frequencies(samples, rate)) * rate, samples, rng, 1)
-    time = np.arange(samples) / rate
-    noise *= np.exp(-0.5 * ((time - loudest_s) / rng.uniform(*FAR_WIDTH_S)) ** 2).astype(np.float32)
-    echo = np.roll(noise, int(rng.uniform(0.01, 0.05) * rate)) * np.float32(rng.uniform(0.3, 0.8))
-    directions = unit_vectors(rng.uniform(-np.pi, np.pi, 2), rng)
-    return np.concatenate([noise, echo]), plane_wave_delays(directions, offsets_m)
+def wind_density(octave_100hz_db: float, frequencies_hz: FloatArray) -> FloatArray:
+    """Power spectral density of wind at a microphone, Pa^2/Hz, from its level in the octave of 100 Hz."""
+    at_100hz = REFERENCE_PA**2 * 10.0 ** (octave_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))
+    return np.asarray(at_100hz * (np.maximum(frequencies_hz, WIND_FLOOR_HZ) / 100.0) ** WIND_SLOPE)
 
 
-def _add_channel_noise(out: Float32Array, preset: Preset, rate: float, rng: np.random.Generator) -> None:
+def _add_channel_noise(static: StaticSources, preset: Preset, rng: np.random.Generator) -> None:
     """Add wind and electronic noise: every microphone by itself."""
-    frequencies = noise_frequencies(out.shape[1], rate)
-    wind_density = REFERENCE_PA**2 * 10.0 ** (preset.wind_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))
-    wind = wind_density * (np.maximum(frequencies, WIND_FLOOR_HZ) / 100.0) ** WIND_SLOPE
+    samples, rate = static.out.shape[1], static.sample_rate_hz
+    wind = wind_density(preset.wind_100hz_db, noise_frequencies(samples, rate))
     electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / (rate / 2.0)
-    for channel in out:
-        channel += shaped_noise((wind + electronic) * rate, out.shape[1], rng, 1)[0]
+    for channel in static.out:
+        channel += shaped_noise((wind + electronic) * rate, samples, rng, 1)[0]

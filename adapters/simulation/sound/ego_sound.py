@@ -29,7 +29,7 @@ from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 
-from .background import noise_frequencies, shaped_noise
+from .background import noise_frequencies, shaped_noise, wind_density
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from .static_field import StaticSources
 
@@ -48,7 +48,6 @@ FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # at
 FLOW_EXPONENT = 60.0  # dB per decade of speed: a dipole's power grows with the sixth power of the flow
 WIND_AT_10_DB = 76.0  # octave of 100 Hz at 10 m/s behind a windscreen
 WIND_EXPONENT = 40.0  # dB per decade: pseudo-sound is dynamic pressure
-WIND_SLOPE, WIND_FLOOR_HZ = -2.2, 20.0
 
 # Firing frequency of four cylinders over speed in gears 1 to 5, Hz per m/s; the engine idles at 800 rpm.
 GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0, 3.2)
@@ -229,8 +228,7 @@ def _paths_m(source: FloatArray, positions: FloatArray, roof: FloatArray) -> tup
 def _add_wind(out: Float32Array, speed: FloatArray, rate: float, rng: np.random.Generator) -> None:
     """Add turbulence at every microphone by itself, its level following the speed."""
     frequencies = noise_frequencies(len(speed), rate)
-    density = REFERENCE_PA**2 * 10.0 ** (WIND_AT_10_DB / 10.0) / (100.0 / np.sqrt(2.0))
-    shape = density * (np.maximum(frequencies, WIND_FLOOR_HZ) / 100.0) ** WIND_SLOPE * rate
+    shape = wind_density(WIND_AT_10_DB, frequencies) * rate
     gain = (np.maximum(speed, 0.1) / 10.0) ** (WIND_EXPONENT / 20.0)
     for channel in out:
         channel += shaped_noise(shape, len(speed), rng, 1)[0] * gain.astype(np.float32)

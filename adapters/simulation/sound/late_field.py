@@ -9,21 +9,12 @@ from scipy.fft import irfft, next_fast_len, rfft
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
 from worldstate.ground.typing import Float32Array, FloatArray
 
-from .static_field import StaticSources, plane_wave_delays
+from .static_field import StaticSources, plane_wave_delays, unit_vectors
 
 DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
 ELEVATION_RAD = 0.3
 TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
-
-
-def sphere(count: int) -> FloatArray:
-    """Evenly spread unit vectors on a Fibonacci spiral, shape (count, 3)."""
-    index = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * index / count
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * index
-    flat = np.sqrt(1.0 - z * z)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
 def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]:
@@ -44,30 +35,24 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
     centres, weights = rng.uniform(-LOBE_SPAN_RAD, LOBE_SPAN_RAD, LOBES), rng.dirichlet(np.full(LOBES, 3.0))
     lobes = np.exp(LOBE_CONCENTRATION * (np.cos(azimuth[:, None] - centres) - 1.0))
     shares = lobe_share * (lobes / lobes.sum(axis=0)) @ weights + (1.0 - lobe_share) / DIRECTIONS
-    flat = np.cos(elevation)
-    directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
-    return directions, shares
+    return unit_vectors(azimuth, elevation), shares
 
 
 def add_late_field(
     static: StaticSources,
     dry: Float32Array,
-    samples: int,
     decay_s: float,
     positions_m: FloatArray,
-    sample_rate_hz: float,
     rng: np.random.Generator,
-    field: tuple[FloatArray, FloatArray] | None = None,
+    field: tuple[FloatArray, FloatArray],
 ) -> None:
-    r"""Add a diffuse tail of a dry signal.
+    """Add a diffuse tail of a dry signal.
 
     Shapes: dry (pre + samples,), positions_m (M, 3), field (ndarray, ndarray).
     """
-    # From a full sphere two microphones d apart hear it with coherence sinc(2 f d / c).
-    directions, shares = (
-        (sphere(DIRECTIONS), np.full(DIRECTIONS, 1.0 / DIRECTIONS)) if field is None else field
-    )
-    tail = max(int(TAIL_DECAYS * decay_s * sample_rate_hz), 1)
+    directions, shares = field
+    samples = static.out.shape[1]
+    tail = max(int(TAIL_DECAYS * decay_s * static.sample_rate_hz), 1)
     n = next_fast_len(len(dry) + tail, real=True)
     spectrum = rfft(dry, n)
     envelope = 10.0 ** (-3.0 * np.arange(tail) / tail * TAIL_DECAYS)

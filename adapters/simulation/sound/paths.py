@@ -131,11 +131,16 @@ def trace_paths(
     Shapes: lane_x_m (T,), source_y_m (T,), receiver_x_m (T,), specular (8,).
     """
     mirror = np.ones(len(OCTAVES_HZ)) if specular is None else specular
-    pairs = product(source_images(site, lane_x_m), receiver_images(site))
-    return [
-        _trace(site, source, receiver, source_y_m, height_m, cap_db, receiver_x_m, mirror)
-        for source, receiver in pairs
-    ]
+    paths = []
+    for source, receiver in product(source_images(site, lane_x_m), receiver_images(site)):
+        end_m = receiver_x_m, float(receiver.mirror(np.zeros(1))[0])
+        passage = through_mouth(site, (source.x_m, source_y_m), end_m, height_m)
+        walls = source.gain * receiver.gain * near_facade(site, source, source_y_m, passage.aim_y_m)
+        gain = walls[:, None] * mirror ** (source.order + receiver.order) * passage.screen_gain(cap_db)
+        edge_y = np.where(passage.edge == LEFT, site.corner_left_m, -site.corner_right_m)
+        before = np.hypot(source.x_m - site.corner_ahead_m, source_y_m - edge_y)
+        paths.append(Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain, before, edge_y))
+    return paths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,10 +167,8 @@ class Passage:
 
 def through_mouth(
     site: Site,
-    source_x_m: float | FloatArray,
-    source_y_m: FloatArray,
-    end_x_m: float | FloatArray,
-    end_y_m: float,
+    source_m: tuple[float | FloatArray, FloatArray],
+    end_m: tuple[float | FloatArray, float],
     height_m: float,
 ) -> Passage:
     """Follow a line from a source, beyond the mouth or in it, to an end before it.
@@ -173,57 +176,26 @@ def through_mouth(
     Examples
     --------
     >>> plan = Site("SA1", 2.8, 2.8, 4.0, 10.0, 2.8, 2.8, 6.0)
-    >>> passage = through_mouth(plan, 8.0, np.array([2.0, 12.0]), 0.0, 0.0, 0.0)
+    >>> passage = through_mouth(plan, (8.0, np.array([2.0, 12.0])), (0.0, 0.0), 0.0)
     >>> passage.clearance_m, passage.lit
     (array([ 1.8, -3.2]), array([1., 0.]))
     """
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
-    run, depth = source_x_m - end_x_m, mouth - end_x_m
+    (x, y), (end_x, end_y) = source_m, end_m
+    run, depth = x - end_x, mouth - end_x
     # A source that has turned in stands before the mouth: what counts there is where it is itself.
-    crossing = end_y_m + (source_y_m - end_y_m) * depth / np.maximum(run, depth)
+    crossing = end_y + (y - end_y) * depth / np.maximum(run, depth)
     clearance = np.minimum(left - crossing, crossing - right)
-    # The shorter way round: both are equal where the corner changes, so nothing jumps there.
+    # Over a vertical edge both legs lie in one unfolded plane. The shorter way round counts: both are equal
+    # where the corner changes, so nothing jumps there.
     ways = [
-        _bent_length(source_x_m - mouth, source_y_m - y, depth, y - end_y_m, height_m) for y in (left, right)
+        np.hypot(np.hypot(x - mouth, y - edge) + np.hypot(depth, edge - end_y), height_m)
+        for edge in (left, right)
     ]
+    across = y - end_y
+    straight = np.sqrt(run * run + across * across + height_m * height_m)
     edge, bent = np.argmin(ways, axis=0).astype(np.int8), np.minimum(*ways)
-    return Passage(
-        clearance, edge, _length(run, source_y_m - end_y_m, height_m), bent, np.clip(crossing, right, left)
-    )
-
-
-def _trace(
-    site: Site,
-    source: SourceImage,
-    receiver: ReceiverImage,
-    source_y: FloatArray,
-    height: float,
-    cap_db: float,
-    receiver_x: float | FloatArray,
-    specular: FloatArray,
-) -> Path:
-    end_y = float(receiver.mirror(np.zeros(1))[0])
-    passage = through_mouth(site, source.x_m, source_y, receiver_x, end_y, height)
-    walls = source.gain * receiver.gain * near_facade(site, source, source_y, passage.aim_y_m)
-    gain = walls[:, None] * specular ** (source.order + receiver.order) * passage.screen_gain(cap_db)
-    edge_y = np.where(passage.edge == LEFT, site.corner_left_m, -site.corner_right_m)
-    before = np.hypot(source.x_m - site.corner_ahead_m, source_y - edge_y)
-    return Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain, before, edge_y)
-
-
-def _length(dx: float | FloatArray, dy: FloatArray, dz: float) -> FloatArray:
-    return np.asarray(np.sqrt(dx * dx + dy * dy + dz * dz))
-
-
-def _bent_length(
-    before_x: float | FloatArray,
-    before_y: FloatArray,
-    after_x: float | FloatArray,
-    after_y: float,
-    height: float,
-) -> FloatArray:
-    """Shortest way over a vertical edge: the two legs lie in one unfolded plane."""
-    return np.asarray(np.hypot(np.hypot(before_x, before_y) + np.hypot(after_x, after_y), height))
+    return Passage(clearance, edge, straight, bent, np.clip(crossing, right, left))
 
 
 def near_facade(site: Site, source: SourceImage, source_y: FloatArray, aim_y: FloatArray) -> FloatArray:

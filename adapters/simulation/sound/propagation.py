@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 
-from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -18,61 +17,44 @@ from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_path
 from .receiver import NEAREST_M, Receiver, add_turning
 from .screened import screened_legs
 from .static_field import StaticSources
+from .surroundings import Surroundings
 
 TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
 FAINTEST = 1e-3  # a path below this share of the whole is left out
 
 
-def add_sources(
-    out: Float32Array,
-    static: StaticSources,
-    sources: Sequence[MovingSource],
-    site: Site,
-    receiver: Receiver,
-    cap_db: float,
-    specular: FloatArray | None = None,
-    *,
-    outdoors: bool = False,
-) -> None:
-    """Add moving sources, by every path, to all microphones.
-
-    Shapes: out (M, K * KNOT_SAMPLES), specular (8,).
-    """
-    if site.occluders:
+def add_sources(static: StaticSources, sources: Sequence[MovingSource], around: Surroundings) -> None:
+    """Add moving sources, by every path, to all microphones."""
+    if around.site.occluders:
         for source in sources:
-            _add_screened(out, source, site, receiver, cap_db, outdoors)
+            _add_screened(static.out, source, around)
         return
-    images = receiver_images(site)
-    bent = np.zeros((len(images), 2, receiver.samples), np.float32)
+    images = receiver_images(around.site)
+    bent = np.zeros((len(images), 2, around.receiver.samples), np.float32)
     for source in sources:
-        for path in _audible(_paths(source, site, receiver, cap_db, specular, outdoors)):
+        for path in _audible(_paths(source, around)):
             for edge in (LEFT, RIGHT):
-                _add_bent(bent[images.index(path.receiver), edge], source, path, edge, site, receiver)
-            _add_lit(out, source, path, receiver)
-    _add_corners(out, static, bent, images, site, receiver)
+                _add_bent(bent[images.index(path.receiver), edge], source, path, edge, around)
+            _add_lit(static.out, source, path, around.receiver)
+    _add_corners(static, bent, images, around)
 
 
-def _paths(
-    source: MovingSource,
-    site: Site,
-    receiver: Receiver,
-    cap_db: float,
-    specular: FloatArray | None,
-    outdoors: bool,
-) -> list[Path]:
+def _paths(source: MovingSource, around: Surroundings) -> list[Path]:
+    receiver = around.receiver
     above = receiver.above(source.height_m)
     flat = source.y_m**2 + above**2
     _, heard_x = receiver.arrivals(source.emission.knots_s, partial(_slant, source.x_m, flat))
-    paths = trace_paths(site, source.x_m, source.y_m, above, cap_db, receiver_x_m=heard_x, specular=specular)
-    if not outdoors:
-        return paths
-    return [replace(path, gain=path.gain * _media(path.bent_m, source, receiver)) for path in paths]
+    mirrored = np.sqrt(1.0 - around.scattering)
+    place = source.x_m, source.y_m, above
+    paths = trace_paths(around.site, *place, around.cap_db, receiver_x_m=heard_x, specular=mirrored)
+    return [replace(path, gain=path.gain * _media(path.bent_m, source, around)) for path in paths]
 
 
-def _media(length_m: FloatArray, source: MovingSource, receiver: Receiver) -> FloatArray:
+def _media(length_m: FloatArray, source: MovingSource, around: Surroundings) -> float | FloatArray:
     """Amplitude that air and road leave per octave, shape (T, 8)."""
-    ground = ground_gain(length_m, source.height_m, float(receiver.centre_m[2]))
-    return air_gain(length_m) * ground
+    if not around.outdoors:
+        return 1.0
+    return air_gain(length_m) * ground_gain(length_m, source.height_m, float(around.receiver.centre_m[2]))
 
 
 def _audible(paths: list[Path]) -> list[Path]:
@@ -82,20 +64,17 @@ def _audible(paths: list[Path]) -> list[Path]:
     return [path for path, peak in zip(paths, share.max(axis=1), strict=True) if peak > FAINTEST]
 
 
-def _add_bent(
-    out: Float32Array, source: MovingSource, path: Path, edge: int, site: Site, receiver: Receiver
-) -> None:
+def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, around: Surroundings) -> None:
     """Add what reaches the array's centre round one corner."""
     made = source.emission.table(path.gain * ((1.0 - path.lit) * (path.edge == edge))[:, None])
     if made is None:
         return
     table, span = made
+    receiver, mouth = around.receiver, around.site.corner_ahead_m
     before, above = path.before_m[span], receiver.above(source.height_m)
     across = path.edge_y_m[span] - float(path.receiver.mirror(np.zeros(1))[0])
     knots = source.emission.knots_s[span]
-    travel, _ = receiver.arrivals(
-        knots, lambda x: np.hypot(before + np.hypot(site.corner_ahead_m - x, across), above)
-    )
+    travel, _ = receiver.arrivals(knots, partial(_round, before, mouth, across, above))
     _add_along(out, table, knots, travel, receiver.knots_s)
 
 
@@ -119,15 +98,13 @@ def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray)
     return np.asarray(np.sqrt((along - x_m) ** 2 + flat_squared))
 
 
-def _add_screened(
-    out: Float32Array, source: MovingSource, site: Site, receiver: Receiver, cap_db: float, outdoors: bool
-) -> None:
+def _add_screened(out: Float32Array, source: MovingSource, around: Surroundings) -> None:
     """Add what reaches every microphone past the bodies of an open scene, on the straight line or round."""
-    knots, ahead = source.emission.knots_s, source.ahead_m
+    receiver, knots, ahead = around.receiver, source.emission.knots_s, source.ahead_m
     flat = source.y_m**2 + receiver.above(source.height_m) ** 2
     straight, heard_x = receiver.arrivals(knots, partial(_slant, ahead, flat))
-    media = _media(straight, source, receiver) if outdoors else 1.0
-    for leg in screened_legs(site.occluders, ahead, source.y_m, heard_x, cap_db):
+    media = _media(straight, source, around)
+    for leg in screened_legs(around.site.occluders, ahead, source.y_m, heard_x, around.cap_db):
         made = source.emission.table(leg.gain * media)
         if made is None:
             continue
@@ -150,20 +127,16 @@ def _add_along(
 
 
 def _round(
-    before: FloatArray, along: FloatArray, across: FloatArray, rise: float, x_m: FloatArray
+    before: FloatArray, along: float | FloatArray, across: FloatArray, rise: float, x_m: FloatArray
 ) -> FloatArray:
     return np.asarray(np.hypot(before + np.hypot(along - x_m, across), rise))
 
 
 def _add_corners(
-    out: Float32Array,
-    static: StaticSources,
-    bent: Float32Array,
-    images: list[ReceiverImage],
-    site: Site,
-    receiver: Receiver,
+    static: StaticSources, bent: Float32Array, images: list[ReceiverImage], around: Surroundings
 ) -> None:
     """Let every corner, as every side image sees it, sound to all microphones."""
+    site, receiver = around.site, around.receiver
     places = [(image, y) for image in images for y in (site.corner_left_m, -site.corner_right_m)]
     signals = bent.reshape(-1, bent.shape[2])
     used = np.flatnonzero(np.abs(signals).max(axis=1) > 0.0)
@@ -174,7 +147,7 @@ def _add_corners(
         for i in used:
             image, y = places[i]
             place = np.array([site.corner_ahead_m, image.sign * (y - image.offset_m), receiver.centre_m[2]])
-            add_turning(out, signals[i], place, np.ones(len(receiver.knots_s)), receiver)
+            add_turning(static.out, signals[i], place, np.ones(len(receiver.knots_s)), receiver)
 
 
 def _corner_delays(image: ReceiverImage, corner_y: float, mouth: float, receiver: Receiver) -> FloatArray:

@@ -21,8 +21,10 @@ from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.ground.typing import FloatArray
 
+from .emission import MovingSource
 from .paths import SourceImage, near_facade, source_images, through_mouth
 from .receiver import NEAREST_M
+from .surroundings import Surroundings
 
 PATCH_M = 0.9  # along the wall
 WALL_HEIGHT_M = 3.0  # what of a wall is near enough to matter
@@ -113,50 +115,33 @@ class FirstLeg:
     gain: FloatArray
 
 
-def first_legs(
-    site: Site,
-    group: Patches,
-    index: int,
-    source_x_m: float | FloatArray,
-    source_y_m: FloatArray,
-    height_m: float,
-    cap_db: float,
-) -> list[FirstLeg]:
+def first_legs(group: Patches, index: int, source: MovingSource, around: Surroundings) -> list[FirstLeg]:
     """Ways of one source to one patch: direct and by the facades of the crossing street."""
-    images = source_images(site, source_x_m)
     if group.beyond_mouth:
-        return [_open_leg(group, index, images[0], source_y_m, height_m)]
-    near = [image for image in images if image.order <= IMAGE_ORDERS]
-    return [_mouth_leg(site, group, index, image, source_y_m, height_m, cap_db) for image in near]
+        return [_open_leg(group, index, source)]
+    near = [image for image in source_images(around.site, source.x_m) if image.order <= IMAGE_ORDERS]
+    return [_mouth_leg(group, index, image, source, around) for image in near]
 
 
-def _open_leg(
-    group: Patches, index: int, image: SourceImage, source_y: FloatArray, height: float
-) -> FirstLeg:
+def _open_leg(group: Patches, index: int, source: MovingSource) -> FirstLeg:
     x, y, z = group.positions_m[index]
-    away = np.stack([image.x_m - x + np.zeros_like(source_y), source_y - y], axis=1)
-    length = np.sqrt((away**2).sum(axis=1) + (z - height) ** 2)
+    away = np.stack([source.ahead_m - x, source.y_m - y], axis=1)
+    length = np.sqrt((away**2).sum(axis=1) + (z - source.height_m) ** 2)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(length, NEAREST_M)
     return FirstLeg(length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ)))
 
 
 def _mouth_leg(
-    site: Site,
-    group: Patches,
-    index: int,
-    image: SourceImage,
-    source_y: FloatArray,
-    height: float,
-    cap_db: float,
+    group: Patches, index: int, image: SourceImage, source: MovingSource, around: Surroundings
 ) -> FirstLeg:
-    x, y, z = group.positions_m[index]
-    passage = through_mouth(site, image.x_m, source_y, x, y, z - height)
-    away = np.stack([np.full_like(source_y, site.corner_ahead_m - x), passage.aim_y_m - y], axis=1)
+    site, (x, y, z) = around.site, group.positions_m[index]
+    passage = through_mouth(site, (image.x_m, source.y_m), (x, y), z - source.height_m)
+    away = np.stack([np.full_like(source.y_m, site.corner_ahead_m - x), passage.aim_y_m - y], axis=1)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(np.hypot(*away.T), NEAREST_M)
     length = passage.lit * passage.straight_m + (1.0 - passage.lit) * passage.bent_m
-    walls = image.gain * near_facade(site, image, source_y, passage.aim_y_m)
+    walls = image.gain * near_facade(site, image, source.y_m, passage.aim_y_m)
     gain = group.strengths_m[index] * np.sqrt(cosine) * walls
-    return FirstLeg(length, gain[:, None] * passage.screen_gain(cap_db))
+    return FirstLeg(length, gain[:, None] * passage.screen_gain(around.cap_db))
 
 
 def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -169,5 +154,5 @@ def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, Float
 
 def seen_through_mouth(site: Site, place_m: FloatArray, x_m: FloatArray) -> FloatArray:
     """1 where an ego at `x_m` (T,) sees a place in the crossing street, 0 where a corner is in the way."""
-    passage = through_mouth(site, float(place_m[0]), np.full_like(x_m, place_m[1]), x_m, 0.0, 0.0)
+    passage = through_mouth(site, (float(place_m[0]), np.full_like(x_m, place_m[1])), (x_m, 0.0), 0.0)
     return passage.lit

@@ -2,53 +2,38 @@
 
 import numpy as np
 
-from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import Emission, MovingSource
-from .receiver import NEAREST_M, Receiver, add_turning, distance_m
-from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, scattering, seen_through_mouth
+from .receiver import NEAREST_M, add_turning, distance_m
+from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, seen_through_mouth
 from .static_field import StaticSources
+from .surroundings import Surroundings
 
 
-def add_scattered(
-    out: Float32Array,
-    static: StaticSources,
-    source: MovingSource,
-    site: Site,
-    receiver: Receiver,
-    preset: Preset,
-) -> None:
+def add_scattered(static: StaticSources, source: MovingSource, around: Surroundings) -> None:
     """Add what rough walls send on of one moving source, from where they stand, to all microphones."""
-    amplitude = np.sqrt(scattering(preset))
-    if not amplitude.any() or site.occluders:
+    if not around.scattering.any() or around.site.occluders:
         return
-    for group in patches(site):
-        arrived = np.zeros((len(group.strengths_m), receiver.samples), np.float32)
+    for group in patches(around.site):
+        arrived = np.zeros((len(group.strengths_m), around.receiver.samples), np.float32)
         for index, signal in enumerate(arrived):
-            for leg in first_legs(
-                site, group, index, source.x_m, source.y_m, source.height_m, preset.screen_cap_db
-            ):
-                _add_leg(signal, source.emission, leg, amplitude, receiver, group.positions_m[index])
-        _add_patches(out, static, arrived, group, site, receiver)
+            for leg in first_legs(group, index, source, around):
+                _add_leg(signal, source.emission, leg, around, group.positions_m[index])
+        _add_patches(static, arrived, group, around)
 
 
 def _add_leg(
-    out: Float32Array,
-    emission: Emission,
-    leg: FirstLeg,
-    amplitude: FloatArray,
-    receiver: Receiver,
-    patch_m: FloatArray,
+    out: Float32Array, emission: Emission, leg: FirstLeg, around: Surroundings, patch_m: FloatArray
 ) -> None:
     """Add what one patch sends on, as late as the array's centre hears it."""
-    made = emission.table(leg.gain * amplitude)
+    made = emission.table(leg.gain * np.sqrt(around.scattering))
     if made is None:
         return
     table, span = made
+    receiver = around.receiver
     knots, first = emission.knots_s[span], leg.length_m[span]
     total, _ = receiver.arrivals(knots, lambda x: first + distance_m(patch_m, x, receiver.centre_m))
     emit = emission_times(receiver.knots_s, knots, total, SPEED_OF_SOUND_MPS)
@@ -56,15 +41,9 @@ def _add_leg(
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 
 
-def _add_patches(
-    out: Float32Array,
-    static: StaticSources,
-    arrived: Float32Array,
-    group: Patches,
-    site: Site,
-    receiver: Receiver,
-) -> None:
+def _add_patches(static: StaticSources, arrived: Float32Array, group: Patches, around: Surroundings) -> None:
     """Let every patch sound to all microphones."""
+    receiver = around.receiver
     if receiver.ego.stands:
         distance, gain = last_leg(group, receiver.positions_m)
         centre = np.linalg.norm(group.positions_m - receiver.centre_m, axis=1)
@@ -75,5 +54,5 @@ def _add_patches(
     for place, normal, signal in zip(group.positions_m, group.normals, arrived, strict=True):
         distance = np.maximum(distance_m(place, x, receiver.centre_m), NEAREST_M)
         cosine = np.abs((x - place[0]) * normal[0] - place[1] * normal[1]) / distance
-        seen = seen_through_mouth(site, place, x) if group.beyond_mouth else 1.0
-        add_turning(out, signal, place, np.sqrt(np.minimum(cosine, 1.0)) / distance * seen, receiver)
+        seen = seen_through_mouth(around.site, place, x) if group.beyond_mouth else 1.0
+        add_turning(static.out, signal, place, np.sqrt(np.minimum(cosine, 1.0)) / distance * seen, receiver)

@@ -6,6 +6,7 @@ from the spectra, once per microphone however many sources there are: sources ar
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.fft import irfft, rfft
@@ -28,15 +29,25 @@ def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArr
     return -(directions @ offsets_m.T) / SPEED_OF_SOUND_MPS
 
 
+def unit_vectors(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
+    """Directions in `base_link`, shape (Q, 3)."""
+    flat = np.cos(elevation_rad)
+    return np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class StaticSources:
     """Sources that wait to be rendered together."""
 
-    def __init__(self, out: Float32Array, sample_rate_hz: float) -> None:
-        self._out, self._rate = out, sample_rate_hz
-        self._waiting: list[tuple[Float32Array, FloatArray, FloatArray]] = []
+    out: Float32Array  # shape (M, n): What every microphone hears, added to
+    sample_rate_hz: float
+    _waiting: list[tuple[Float32Array, FloatArray, FloatArray]] = field(default_factory=list)
 
     def add(self, signals: Float32Array, delays_s: FloatArray, gains: FloatArray | None = None) -> None:
-        """Add sources; see `add_static`."""
+        """Let sources wait whose delayed copies are added to every microphone.
+
+        Shapes: signals (Q, n), delays_s (Q, M), gains (Q, M).
+        """
         factors = np.ones_like(delays_s) if gains is None else gains
         self._waiting.append((signals, delays_s, factors))
         if sum(len(delays) for _, delays, _ in self._waiting) > PENDING:
@@ -44,34 +55,21 @@ class StaticSources:
 
     def render(self) -> None:
         """Render what waits."""
-        if self._waiting:
-            signals, delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in range(3))
-            self._waiting.clear()
-            add_static(self._out, signals, delays, self._rate, gains)
-
-
-def add_static(
-    out: Float32Array,
-    signals: Float32Array,
-    delays_s: FloatArray,
-    sample_rate_hz: float,
-    gains: FloatArray | None = None,
-) -> None:
-    """Add delayed copies of `signals` to every microphone.
-
-    Shapes: out (M, n), signals (Q, n), delays_s (Q, M), gains (Q, M).
-    """
-    frequencies = np.fft.rfftfreq(BLOCK, 1.0 / sample_rate_hz)
-    steering = np.exp(-2j * np.pi * frequencies[:, None, None] * delays_s).astype(np.complex64)
-    if gains is not None:
+        if not self._waiting:
+            return
+        signals, delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in range(3))
+        self._waiting.clear()
+        frequencies = np.fft.rfftfreq(BLOCK, 1.0 / self.sample_rate_hz)
+        steering = np.exp(-2j * np.pi * frequencies[:, None, None] * delays).astype(np.complex64)
         steering *= gains.astype(np.float32)
-    padded = np.zeros((out.shape[0], _blocks(out.shape[1]) * HOP + HOP), np.float32)
-    for start, spectra in _analyse(signals):
-        heard = np.matmul(spectra, steering).transpose(1, 2, 0)  # (blocks, M, F)
-        for i, block in enumerate(irfft(heard, BLOCK)):
-            at = (start + i) * HOP
-            padded[:, at : at + BLOCK] += block
-    out += padded[:, HOP : HOP + out.shape[1]]
+        microphones, samples = self.out.shape
+        padded = np.zeros((microphones, _blocks(samples) * HOP + HOP), np.float32)
+        for start, spectra in _analyse(signals):
+            heard = np.matmul(spectra, steering).transpose(1, 2, 0)  # (blocks, M, F)
+            for i, block in enumerate(irfft(heard, BLOCK)):
+                at = (start + i) * HOP
+                padded[:, at : at + BLOCK] += block
+        self.out[:] += padded[:, HOP : HOP + samples]
 
 
 def _blocks(samples: int) -> int:
