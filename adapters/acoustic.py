@@ -196,7 +196,10 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         """
         self.last_frame = frame
         signature = self._model.evidence(frame.feature)
-        bearing, approach = _bearing(frame, self._settings), _approach(frame)
+        bearing, looming = _bearing(frame, self._settings), frame.looming
+        approach = (
+            looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
+        )
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         return Measurement(
@@ -224,11 +227,6 @@ def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotU
         ratio = f"{frame.prominence:.2f}, not above {settings.min_prominence:.2f}"
         return NotUsable(f"peak-to-median ratio {ratio}")
     return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence)
-
-
-def _approach(frame: AcousticFrame) -> Approach | NotUsable:
-    looming = frame.looming
-    return looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
 
 
 def _likelier_side(signature: SignatureEvidence) -> Side | None:

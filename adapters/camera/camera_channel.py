@@ -7,16 +7,13 @@ import numpy as np
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ImageArray
 from worldstate.ground.values import nanoseconds
-from worldstate.measurement.sector import Sector
 
 from .camera_health import CameraHealth, DegradationLog, HealthMonitor, degradation_log
 from .detections import DetectionFilter, DetectionFrame, DetectionLog
 from .detector import Detector
 from .image_quality import image_quality
 from .miss_rates import MissRates
-from .pinhole import PinholeCamera
 from .video import Video
-from .vision_query import VisionQuery, VisionSettings
 
 # Period of the degradation estimate: it costs as much as a detection, and dirt or dusk take longer.
 HEALTH_PERIOD_NS = 400_000_000
@@ -28,24 +25,6 @@ class Watched:
 
     detections: DetectionLog  # One entry a frame
     degradation: DegradationLog  # d as last read, on the scale of the measured table
-    rates: MissRates  # Miss and clutter rates of the same detector behind the same camera
-
-    def query(
-        self,
-        camera: PinholeCamera,
-        settings: VisionSettings | None = None,
-        line_of_sight: Sector | None = None,
-    ) -> VisionQuery:
-        """Return the co-evidence channel, whose miss and clutter rates follow the measured degradation."""
-        return VisionQuery(
-            camera,
-            self.detections,
-            self.rates.table,
-            self.degradation,
-            settings,
-            line_of_sight,
-            self.rates.clutter_rate,
-        )
 
 
 class Watcher:
@@ -118,9 +97,7 @@ class Watcher:
         """
         stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
         degradation = DegradationLog(np.array(self._read_ns, dtype=np.int64), np.array(self._levels))
-        return Watched(
-            DetectionLog(tuple(self._found), stamps_ns, "watched camera"), degradation, self._rates
-        )
+        return Watched(DetectionLog(tuple(self._found), stamps_ns, "watched camera"), degradation)
 
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:

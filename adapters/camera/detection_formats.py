@@ -141,14 +141,10 @@ def read_yolo_text(
         number = int(match.group(1)) - first_image
         if number in rows:
             raise InputFileError(file, "expected every frame once, another file has the same number")
-        rows[number] = _yolo_rows(file, size_px, classes)
+        with refused_as_file(file):
+            lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
+            rows[number] = [_yolo_row(line, size_px, classes) for line in lines if line.strip()]
     return _log(folder, rows, frames, frame_rate_hz)
-
-
-def _yolo_rows(path: Path, size_px: tuple[int, int], classes: Mapping[int, str]) -> list[Row]:
-    with refused_as_file(path):
-        lines = read_text(path, "a text file", MAX_TEXT_BYTES).splitlines()
-        return [_yolo_row(line, size_px, classes) for line in lines if line.strip()]
 
 
 def _yolo_row(line: str, size_px: tuple[int, int], classes: Mapping[int, str]) -> Row:

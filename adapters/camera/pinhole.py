@@ -106,7 +106,10 @@ class PinholeCamera:
             Radians in (-pi, pi], left positive, same shape.
         """
         column = np.asarray(column_px, dtype=np.float64)
-        return self._to_base_link(np.arctan(self._slope * (self._middle - 2.0 * column / self.width_px)))
+        seen = np.arctan(self._slope * (self._middle - 2.0 * column / self.width_px)) + self.yaw_rad
+        x = self.position_m[0] + self.nominal_range_m * np.cos(seen)
+        y = self.position_m[1] + self.nominal_range_m * np.sin(seen)
+        return np.asarray(wrap_angle(np.arctan2(y, x)))
 
     def column(self, azimuth_rad: ArrayLike) -> FloatArray:
         """Return the image column of an azimuth in `base_link`: the inverse of `azimuth`.
@@ -196,12 +199,6 @@ class PinholeCamera:
     @property
     def _slope(self) -> float:
         return math.cos(self.pitch_rad) * math.tan(self.half_angle_rad)
-
-    def _to_base_link(self, off_axis_rad: FloatArray) -> FloatArray:
-        seen = off_axis_rad + self.yaw_rad
-        x = self.position_m[0] + self.nominal_range_m * np.cos(seen)
-        y = self.position_m[1] + self.nominal_range_m * np.sin(seen)
-        return np.asarray(wrap_angle(np.arctan2(y, x)))
 
 
 def read_camera(path: str | Path) -> PinholeCamera:

@@ -36,7 +36,8 @@ def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule
     past = log.frames[first:frame]
     if not past or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
         return np.zeros(len(boxes_px), dtype=bool)
-    present = [_held(earlier.boxes_px, boxes_px, rule.tolerance_px) for earlier in past]
+    apart_px = (np.abs(boxes_px[:, None] - earlier.boxes_px[None]).max(axis=2) for earlier in past)
+    present = [(apart <= rule.tolerance_px).any(axis=1) for apart in apart_px]
     return np.asarray(np.mean(present, axis=0) >= rule.share)
 
 
@@ -80,9 +81,3 @@ def count_boxes(log: DetectionLog, keep: DetectionFilter, rule: ParkedRule) -> B
     boxes = sum(map(len, log.frames))
     still = sum(int(kept_and_parked(log, i, keep, rule)[1].sum()) for i in range(len(log)))
     return BoxCounts(len(log), boxes, high - still, boxes - named, named - scored, scored - high, still)
-
-
-def _held(earlier_px: FloatArray, boxes_px: FloatArray, tolerance_px: float) -> BoolArray:
-    """Return which of the boxes (n, 4) coincide with an earlier box, shape (n,)."""
-    distances = np.abs(boxes_px[:, None, :] - earlier_px[None, :, :])
-    return np.asarray(np.any(np.all(distances <= tolerance_px, axis=2), axis=1))

@@ -187,9 +187,13 @@ class VisionQuery:
         if beta is None:
             return Unqueried("sector outside the field of view")
         clutter = self.settings.clutter_rate if self._clutter is None else self._clutter(d)
-        if any(_explains(sighting, sector, labels) for sighting in self.sightings(stamp_ns)):
-            return Present(beta, clutter)
-        return Absent(beta, clutter)
+        found = any(
+            sighting.moving
+            and sighting.label in labels
+            and sector.touches(sighting.azimuth_rad, sighting.width_rad)
+            for sighting in self.sightings(stamp_ns)
+        )
+        return Present(beta, clutter) if found else Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return the boxes that the filter keeps in the image at `stamp_ns`, parked ones included.
@@ -267,11 +271,6 @@ def moving_boxes(
             boxes_px = log.frames[number].boxes_px[kept[~still]]
         found.append(boxes_px)
     return found
-
-
-def _explains(sighting: Sighting, sector: Sector, labels: Collection[str]) -> bool:
-    inside = sector.touches(sighting.azimuth_rad, sighting.width_rad)
-    return inside and sighting.moving and sighting.label in labels
 
 
 def _check_size(camera: PinholeCamera, log: DetectionLog) -> None:

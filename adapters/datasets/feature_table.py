@@ -173,7 +173,7 @@ def read_features(path: str | Path) -> FeatureTable:
         raise InputFileError(path, "expected at least one window below the header")
     features, labels, t0_frames = zip(*windows, strict=True)
     classes, ids, environments, recordings = (np.array(column) for column in zip(*labels, strict=True))
-    domain = _companion(path)
+    domain = Path(f"{path}.json")
     made_with = None
     if domain.is_file():
         made_with = read_record(ModelDomain, domain, "domain")
@@ -215,13 +215,10 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
         for feature, *labels in zip(table.features.tolist(), *names, strict=True):
             writer.writerow([*feature, *labels])
     # One of an earlier table would speak of other windows.
-    _companion(path).unlink(missing_ok=True)
+    companion = Path(f"{path}.json")
+    companion.unlink(missing_ok=True)
     if table.domain is not None:
-        write_text(_companion(path), json.dumps(encode(table.domain), allow_nan=False) + "\n")
-
-
-def _companion(path: str | Path) -> Path:
-    return Path(f"{path}.json")
+        write_text(companion, json.dumps(encode(table.domain), allow_nan=False) + "\n")
 
 
 def read_ids(path: str | Path) -> frozenset[str]:

@@ -19,6 +19,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 from .atomic import write_text
+from .text_file import read_bytes
 
 Axes = Literal["acoular", "base_link"]
 
@@ -72,7 +73,7 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     [[0.0, 0.2, 1.4], [0.0, -0.2, 1.4]]
     """
     name = Path(path)
-    data = _bytes(name)
+    data = read_bytes(name, "an array file", MAX_BYTES)
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
         return _array(name, _xml_positions(name, data), axes or "acoular")
@@ -108,23 +109,13 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
     ...     print(name.read_text().splitlines()[2].strip())
     <pos Name="Point 1" x="-0.2" y="0.0" z="0.0" />
     """
+    in_file = array.positions_m[:, [1, 2, 0]] * [-1.0, 1.0, 1.0] + 0.0
     rows = [
         f'    <pos Name="Point {number}" x="{x!r}" y="{y!r}" z="{z!r}" />'
-        for number, (x, y, z) in enumerate(_to_file(array.positions_m).tolist(), start=1)
+        for number, (x, y, z) in enumerate(in_file.tolist(), start=1)
     ]
     head = f'<?xml version="1.0" encoding="utf-8"?>\n<MicArray name={quoteattr(name)}>'
     write_text(path, "\n".join([head, *rows, "</MicArray>", ""]))
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputFileError(path, f"expected an array file ({error.strerror})") from error
-    if len(data) > MAX_BYTES:
-        raise InputFileError(path, f"expected an array file of at most {MAX_BYTES} bytes")
-    return data
 
 
 def _array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> MicrophoneArray:
@@ -220,8 +211,9 @@ def _json_positions(path: Path, data: bytes) -> tuple[list[list[float]], str]:
     rows = held.get("positions_m")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
         raise InputFileError(path, "expected a list of positions [x, y, z], or one as positions_m")
-    found = [[*zip("xyz", row, strict=True)] for row in rows]
-    positions = [_numbers(path, number, row) for number, row in enumerate(found, start=1)]
+    positions = [
+        _numbers(path, number, [*zip("xyz", row, strict=True)]) for number, row in enumerate(rows, start=1)
+    ]
     return positions, held.get("axes", "base_link")
 
 
@@ -243,7 +235,3 @@ def _number(value: object) -> float | None:
     except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None
-
-
-def _to_file(in_base_link: FloatArray) -> FloatArray:
-    return in_base_link[:, [1, 2, 0]] * [-1.0, 1.0, 1.0] + 0.0

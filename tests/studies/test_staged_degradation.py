@@ -96,7 +96,7 @@ def test_what_was_seen_comes_back_for_its_origin_alone_and_damage_is_named(video
     assert sum(map(len, detections["clean"].detections.frames)) > 10
     path = tmp_path / "r.npz"
     save_staged_detections(path, detections, "one")
-    back = load_staged_detections(path, "one", rates)
+    back = load_staged_detections(path, "one")
     assert list(back) == list(detections)
     for one, other in zip(back.values(), detections.values(), strict=True):
         assert np.array_equal(one.degradation.degradation, other.degradation.degradation)
@@ -104,13 +104,13 @@ def test_what_was_seen_comes_back_for_its_origin_alone_and_damage_is_named(video
         for frame, same in zip(one.detections.frames, other.detections.frames, strict=True):
             assert np.array_equal(frame.boxes_px, same.boxes_px)
             assert (frame.labels, frame.scores.tolist()) == (same.labels, same.scores.tolist())
-    assert load_staged_detections(path, "another", rates) is None
-    assert load_staged_detections(tmp_path / "nothing.npz", "one", rates) is None
+    assert load_staged_detections(path, "another") is None
+    assert load_staged_detections(tmp_path / "nothing.npz", "one") is None
     whole = path.read_bytes()
     for size in range(0, len(whole) - 1, len(whole) // 15):
         path.write_bytes(whole[:size])
         with pytest.raises(InputFileError, match=r"r\.npz"):
-            load_staged_detections(path, "one", rates)
+            load_staged_detections(path, "one")
 
 
 def assert_the_sound_says_the_same(source, staged):

@@ -9,7 +9,6 @@ import numpy as np
 from worldstate.adapters.camera.camera_channel import Watched
 from worldstate.adapters.camera.camera_health import DegradationLog
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
-from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.files.npz_file import load_npz, save_npz
 from worldstate.ground.errors import InvalidArgumentError
 
@@ -34,14 +33,14 @@ def save_staged_detections(path: str | Path, staged: Mapping[str, Watched], orig
     save_npz(path, {"origin": np.array(origin), **values})
 
 
-def load_staged_detections(path: str | Path, origin: str, rates: MissRates) -> dict[str, Watched] | None:
+def load_staged_detections(path: str | Path, origin: str) -> dict[str, Watched] | None:
     """Return what `save_staged_detections` wrote; None where nothing of this origin stands there."""
     if not Path(path).is_file():
         return None
-    return load_npz(path, "staged detections", MAX_BYTES, lambda values: _read(values, origin, rates))
+    return load_npz(path, "staged detections", MAX_BYTES, lambda values: _read(values, origin))
 
 
-def _read(values: dict[str, np.ndarray], origin: str, rates: MissRates) -> dict[str, Watched] | None:
+def _read(values: dict[str, np.ndarray], origin: str) -> dict[str, Watched] | None:
     if str(values["origin"]) != origin:
         return None
     states, stamps_ns = values["states"].tolist(), values["stamps_ns"]
@@ -53,7 +52,6 @@ def _read(values: dict[str, np.ndarray], origin: str, rates: MissRates) -> dict[
         state: Watched(
             DetectionLog(tuple(frames[i * n : (i + 1) * n]), stamps_ns[i], "watched camera"),
             DegradationLog(values["read_ns"][i], values["degradation"][i]),
-            rates,
         )
         for i, state in enumerate(states)
     }

@@ -80,7 +80,7 @@ def _detections(
     folder: Path, settings: StagedDataset, recording: Recording, video: Video
 ) -> dict[str, Watched]:
     path, origin = folder / f"{recording.recording_id}.npz", settings.origin(recording)
-    kept = load_staged_detections(path, origin, settings.staging.rates)
+    kept = load_staged_detections(path, origin)
     if kept is None:
         # A generator of its own: no recording depends on which others were staged before.
         key = int.from_bytes(hashlib.sha256(recording.recording_id.encode()).digest()[:8], "big")

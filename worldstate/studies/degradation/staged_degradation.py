@@ -48,7 +48,15 @@ def filter_in_states(
 
     staged = {
         state: in_state(
-            seen.query(staging.camera, staging.settings, sight),
+            VisionQuery(
+                staging.camera,
+                seen.detections,
+                staging.rates.table,
+                seen.degradation,
+                staging.settings,
+                sight,
+                staging.rates.clutter_rate,
+            ),
             _found(reference, seen.detections, staging, stamps_ns),
             [seen.degradation(stamp_ns) for stamp_ns in stamps_ns],
         )
