@@ -1,6 +1,7 @@
 """A recording as users have it: one file, a file a microphone, or raw samples from a pipe."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal, TypeAlias
@@ -196,23 +197,13 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
     """
     if isinstance(sound, Path):
         return open_audio(sound, expect_channels, strict=strict)
-    audio = RawAudio(sound) if isinstance(sound, RawPcm) else _mono(sound)
-    try:
+    with ExitStack() as opened:
+        audio = (
+            RawAudio(sound)
+            if isinstance(sound, RawPcm)
+            else MonoFiles([opened.enter_context(open_audio(path, 1, strict=False)) for path in sound])
+        )
         audio.check_size(expect_channels)
         audio.check_silence(strict)
-    except BaseException:
-        audio.close()
-        raise
+        opened.pop_all()  # what is fit to be read stays open
     return audio
-
-
-def _mono(paths: Sequence[Path]) -> MonoFiles:
-    opened: list[AudioSource] = []
-    try:
-        for path in paths:
-            opened.append(open_audio(path, 1, strict=False))
-        return MonoFiles(opened)
-    except BaseException:
-        for source in opened:
-            source.close()
-        raise

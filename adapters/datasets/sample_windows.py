@@ -33,7 +33,7 @@ def sample_windows(root: str | Path) -> tuple[list[LabelledWindow], int]:
         found = _windows(recording, str(number), fronts)
         fronts += sum(window.label == FRONT for window in found)
         with recording.open_audio() as source:
-            inside = [window for window in found if _inside(window, source.duration_s)]
+            inside = [w for w in found if w.end_s and WINDOW_S <= w.end_s <= source.duration_s]
         windows += inside
         left_out += len(found) - len(inside)
     return windows, left_out
@@ -56,7 +56,3 @@ def _windows(recording: Recording, number: str, fronts: int) -> list[LabelledWin
         )
         for what, end_s in window_ends_s(label, frame / FRAME_RATE_HZ, bool(recording.moving_ego)).items()
     ]
-
-
-def _inside(window: LabelledWindow, duration_s: float) -> bool:
-    return window.end_s is not None and WINDOW_S <= window.end_s <= duration_s

@@ -110,6 +110,5 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     ...     read_checkpoint(Path(folder) / "now.json").world.stamp_ns
     300000000
     """
-    data = read_json(path, "a checkpoint")
     with refused_as_file(path):
-        return Checkpoint.from_dict(data)
+        return Checkpoint.from_dict(read_json(path, "a checkpoint"))
