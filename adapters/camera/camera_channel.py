@@ -8,7 +8,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ImageArray
 from worldstate.ground.values import nanoseconds
 
-from .camera_health import CameraHealth, DegradationLog, HealthMonitor, degradation_log
+from .camera_health import CameraHealth, DegradationLog, HealthMonitor
 from .detections import DetectionFilter, DetectionFrame, DetectionLog
 from .detector import Detector
 from .image_quality import image_quality
@@ -102,9 +102,11 @@ class Watcher:
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
     """Estimate d from every image of a video that starts with the recording."""
-    health = _scale(rates)
-    stamped = ((nanoseconds(i / video.frame_rate_hz), frame) for i, frame in enumerate(video.frames()))
-    return degradation_log(stamped, health, rates.level)
+    monitor, stamps_ns, levels = HealthMonitor(_scale(rates)), [], []
+    for number, frame in enumerate(video.frames()):
+        stamps_ns.append(nanoseconds(number / video.frame_rate_hz))
+        levels.append(rates.level(monitor.update(stamps_ns[-1], image_quality(frame))))
+    return DegradationLog(np.array(stamps_ns, dtype=np.int64), np.array(levels))
 
 
 def _scale(rates: MissRates) -> CameraHealth:

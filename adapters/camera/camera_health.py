@@ -1,7 +1,7 @@
 """Degradation of a camera, estimated from its own images."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -141,16 +141,3 @@ class DegradationLog:
         """Return d at the last stamp at or before `stamp_ns`, the first one before that."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right")) - 1
         return float(self.degradation[max(index, 0)])
-
-
-def degradation_log(
-    frames: Iterable[tuple[int, ImageArray]],
-    health: CameraHealth,
-    level: Callable[[Health], float] = lambda health: health.worst,
-) -> DegradationLog:
-    """Estimate the degradation of every image of a video."""
-    monitor, stamps, levels = HealthMonitor(health), [], []
-    for stamp_ns, frame in frames:
-        stamps.append(stamp_ns)
-        levels.append(level(monitor.update(stamp_ns, image_quality(frame))))
-    return DegradationLog(np.array(stamps, dtype=np.int64), np.array(levels))

@@ -1,6 +1,8 @@
 """Absence measured: staged degradation, the camera's own health, miss rates on disk, the command."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +12,11 @@ from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
 from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
     CameraHealth,
     DegradationLog,
     HealthMonitor,
-    degradation_log,
     learn_health,
 )
 from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, STRENGTHS, degrade, level_of, strength
@@ -216,13 +218,12 @@ def test_damaged_files_are_typed_errors(tmp_path):
 
 def test_vision_follows_the_camera_without_being_told(health):
     """The same empty log before and after the lens fails: only the images say so, and beta follows."""
-    rates = synthetic_rates()
-    stamped = []
+    rates = replace(synthetic_rates(), health=health)
+    frames = []
     for i, frame in enumerate(street(20, seed=3, car=False)):
-        stamped.append(
-            (nanoseconds(i / 10), degrade(frame, "noise", float(i >= 10), np.random.default_rng(i)))
-        )
-    d = degradation_log(stamped, health, rates.level)
+        frames.append(degrade(frame, "noise", float(i >= 10), np.random.default_rng(i)))
+    video = SimpleNamespace(frames=lambda: iter(frames), frame_rate_hz=10.0)
+    d = video_degradation(video, rates)
     empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
     box = DetectionFrame(np.array([[300.0, 100.0, 340.0, 300.0]]), np.array([0.9]), ("car",))
     camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
