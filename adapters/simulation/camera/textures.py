@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import BoolArray, Float32Array
+from worldstate.ground.typing import Float32Array
 
 Colour = tuple[float, float, float]
 
@@ -116,30 +116,18 @@ class Facade:
         x = a - (bay + 0.5) * np.float32(self.bay_m)
         y = up - storey * np.float32(STOREY_M)
         doors = (storey < 1) & (cell_noise(bay, storey, self.seed + 1) < 0.3)
+        drawn = cell_noise(bay + np.floor(1.5 * x), np.floor(0.7 * y), self.seed + 3) < 0.3
+        mirrored = 0.75 + 0.5 * np.clip((y - 0.9) / 1.4, 0.0, 1.0)
         for opening, here in ((WINDOW, ~doors), (DOOR, doors)):
-            self._fill(image, opening, here, bay, x, y)
+            half, low = opening.half_m, opening.low_m
+            image[here & (np.abs(x) < half) & (y > low) & (y < OPENING_TOP_M)] = FRAME
+            pane = here & (np.abs(x) < half - FRAME_M) & (np.abs(x) > 0.5 * FRAME_M)
+            pane &= (y > low + FRAME_M) & (y < OPENING_TOP_M - FRAME_M)
+            image[pane] = tinted(opening.colour, mirrored * np.where(drawn, 1.5, 1.0))[pane]
+            image[here & (np.abs(x) < half + 0.08) & (y > low - opening.sill_m) & (y < low)] = SILL
         # Walls are darker at their foot, where less of the sky is seen.
         light = self.brightness * (0.72 + 0.28 * np.clip(up / 1.5, 0.0, 1.0))
         return np.asarray(image * light[..., None], np.float32)
-
-    def _fill(
-        self,
-        image: Float32Array,
-        opening: "_Opening",
-        here: BoolArray,
-        bay: Float32Array,
-        x: Float32Array,
-        y: Float32Array,
-    ) -> None:
-        """Put frame, panes and sill where an opening is."""
-        half, low = opening.half_m, opening.low_m
-        image[here & (np.abs(x) < half) & (y > low) & (y < OPENING_TOP_M)] = FRAME
-        pane = here & (np.abs(x) < half - FRAME_M) & (np.abs(x) > 0.5 * FRAME_M)
-        pane &= (y > low + FRAME_M) & (y < OPENING_TOP_M - FRAME_M)
-        drawn = cell_noise(bay + np.floor(1.5 * x), np.floor(0.7 * y), self.seed + 3) < 0.3
-        mirrored = 0.75 + 0.5 * np.clip((y - 0.9) / 1.4, 0.0, 1.0)
-        image[pane] = tinted(opening.colour, mirrored * np.where(drawn, 1.5, 1.0))[pane]
-        image[here & (np.abs(x) < half + 0.08) & (y > low - opening.sill_m) & (y < low)] = SILL
 
 
 @dataclass(frozen=True, slots=True)

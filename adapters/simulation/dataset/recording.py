@@ -31,7 +31,7 @@ from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 from .truth import describe
 
@@ -114,12 +114,14 @@ def simulate_recording(
         audio = _record(settings, array, to_sound)
     camera, frames = PinholeCamera(), _frame_times(settings)
     seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
+    ego_x = settings.ego.x_m(frames)
+    sights = [line_of_sight(path, settings.site, camera, ego_x) for path in seen]
     return SimulatedRecording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
-        t0_frame=_t0_frame(settings, frames, seen, camera),
-        detections=_detections(settings, seen, frames, camera, to_camera),
-        truth=describe(settings, frames, seen, camera),
+        t0_frame=_t0_frame(len(frames), sights),
+        detections=_detections(settings, seen, len(frames), camera, to_camera),
+        truth=describe(settings, frames, seen, sights),
         array=array,
     )
 
@@ -211,29 +213,26 @@ def _to_samples(sound: Float32Array, settings: SimulationSettings, rng: np.rando
     return np.ascontiguousarray(np.clip(samples, -1.0, 1.0))
 
 
-def _t0_frame(
-    settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], camera: PinholeCamera
-) -> int:
+def _t0_frame(frames: int, sights: list[BoolArray]) -> int:
     """First frame in which any vehicle is in line of sight; the last one where none ever is."""
-    if not seen:
-        return min(round(NO_VEHICLE_T0 * len(frames_s)), len(frames_s) - 1)
-    ego_x = settings.ego.x_m(frames_s)
-    sight = np.any([line_of_sight(path, settings.site, camera, ego_x) for path in seen], axis=0)
-    return int(sight.argmax()) if sight.any() else len(frames_s) - 1
+    if not sights:
+        return min(round(NO_VEHICLE_T0 * frames), frames - 1)
+    sight = np.any(sights, axis=0)
+    return int(sight.argmax()) if sight.any() else frames - 1
 
 
 def _detections(
     settings: SimulationSettings,
     seen: list[Trajectory],
-    frames_s: FloatArray,
+    frames: int,
     camera: PinholeCamera,
     rng: np.random.Generator,
 ) -> tuple[Frame, ...]:
     if not settings.ego.stands:
         return ()
-    boxes: list[Frame] = [()] * len(frames_s)
+    boxes: list[Frame] = [()] * frames
     if settings.parked_car:
-        boxes = park(settings.site, camera, len(frames_s), rng)
+        boxes = park(settings.site, camera, frames, rng)
     for path in seen:
         passing = detect(path, settings.site, camera, rng)
         boxes = [standing + moving for standing, moving in zip(boxes, passing, strict=True)]

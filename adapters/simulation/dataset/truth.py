@@ -5,19 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
-from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.vehicle import Trajectory
-from worldstate.ground.typing import FloatArray
+from worldstate.ground.typing import BoolArray, FloatArray
 
 SCHEMA = "worldstate.simulation.truth"
 SCHEMA_VERSION = "1.1.0"
 
 
 def describe(
-    settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], camera: PinholeCamera
+    settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], sights: list[BoolArray]
 ) -> dict[str, Any]:
     """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON."""
     # Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`,
@@ -26,10 +24,9 @@ def describe(
     # rest. Without a vehicle there are no frames and `entry_s` is null. `ego` has the ego's way along its
     # street, 0 where it stops.
     ego_x = settings.ego.x_m(frames_s)
-    entries = [vehicle.entry_s for vehicle in settings.traffic]
     frames = [
-        _frames(settings, frames_s, ego_x, path, entry, camera)
-        for path, entry in zip(seen, entries, strict=True)
+        _frames(path, sight, vehicle.entry_s, ego_x)
+        for path, sight, vehicle in zip(seen, sights, settings.traffic, strict=True)
     ]
     return {
         "schema": SCHEMA,
@@ -43,27 +40,19 @@ def describe(
     }
 
 
-def _frames(
-    settings: SimulationSettings,
-    frames_s: FloatArray,
-    ego_x_m: FloatArray,
-    seen: Trajectory,
-    entry_s: float,
-    camera: PinholeCamera,
-) -> list[dict[str, Any]]:
+def _frames(seen: Trajectory, sight: BoolArray, entry_s: float, ego_x_m: FloatArray) -> list[dict[str, Any]]:
     axle_x, axle_y = seen.behind(seen.kind.axles_m[0])
     columns = {
-        "time_s": frames_s,
+        "time_s": seen.time_s,
         "speed_mps": seen.speed_mps,
         "azimuth_rad": np.arctan2(axle_y, axle_x - ego_x_m),
         "range_m": np.hypot(axle_y, axle_x - ego_x_m),
-        "time_to_visible_s": entry_s - frames_s,
+        "time_to_visible_s": entry_s - seen.time_s,
     }
     ahead = seen.behind(0.0)[0] - ego_x_m
-    sight = line_of_sight(seen, settings.site, camera, ego_x_m)
     return [
         {name: round(float(values[i]), 6) for name, values in columns.items()}
         | {"position_m": [round(float(ahead[i]), 6), round(float(seen.front_y_m[i]), 6)]}
         | {"line_of_sight": bool(sight[i])}
-        for i in range(len(frames_s))
+        for i in range(len(sight))
     ]

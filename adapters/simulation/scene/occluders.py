@@ -14,6 +14,9 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 
+# x, which may move (T,), and y.
+Place = tuple[float | FloatArray, float]
+
 MAX_CORNERS = 16
 
 
@@ -35,10 +38,7 @@ def box(near_m: float, far_m: float, right_m: float, left_m: float) -> Occluding
 
 
 def hidden_by(
-    occluders: Sequence[OccludingBody],
-    x_m: FloatArray,
-    y_m: FloatArray,
-    eye_m: tuple[float | FloatArray, float],
+    occluders: Sequence[OccludingBody], x_m: FloatArray, y_m: FloatArray, eye_m: Place
 ) -> BoolArray:
     """Tell when a body stands between an eye and a point that moves, shape (T,)."""
     hidden = np.zeros(np.shape(y_m), np.bool_)
@@ -48,13 +48,16 @@ def hidden_by(
 
 
 def detours(
-    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
+    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: Place
 ) -> tuple[FloatArray, NDArray[np.int_]]:
     """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each."""
     # The detour is negative where the line is clear; it passes through 0 where the line touches the body.
     offset, along = _offsets(occluder, x_m, y_m, end_m)
-    via = np.array([_via(x, y, x_m, y_m, end_m) for x, y in occluder.corners_m])
-    extra = np.maximum(via - np.hypot(x_m - end_m[0], y_m - end_m[1]), 0.0)
+    end_x, end_y = end_m
+    via = np.array(
+        [np.hypot(x_m - x, y_m - y) + np.hypot(end_x - x, end_y - y) for x, y in occluder.corners_m]
+    )
+    extra = np.maximum(via - np.hypot(x_m - end_x, y_m - end_y), 0.0)
     # Round a body on one side means past all of its corners there; the costliest stands for them.
     sides = np.stack([np.where(side * offset > 0.0, extra, -1.0) for side in (1.0, -1.0)])
     cost, corner = sides.max(axis=1), sides.argmax(axis=1)
@@ -68,14 +71,8 @@ def detours(
     )
 
 
-def _via(
-    x: float, y: float, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
-) -> FloatArray:
-    return np.asarray(np.hypot(x_m - x, y_m - y) + np.hypot(end_m[0] - x, end_m[1] - y))
-
-
 def _offsets(
-    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: tuple[float | FloatArray, float]
+    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: Place
 ) -> tuple[FloatArray, FloatArray]:
     """Lateral offset of every corner from the line, and how far along it is, 0..1, shape (corners, T)."""
     corners = np.array(occluder.corners_m)[:, :, None]

@@ -1,6 +1,6 @@
 """A vehicle on its way: where it is, and how loud it is by itself."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,7 +70,7 @@ class Trajectory:
         front = np.interp(time_s, self.time_s, self.front_y_m)
         speed = np.interp(time_s, self.time_s, self.speed_mps)
         driven = self.driven_m if self.route is None else np.interp(time_s, self.time_s, self.driven_m)
-        return Trajectory(time_s, front, speed, self.lane_x_m, self.heading, self.kind, self.route, driven)
+        return replace(self, time_s=time_s, front_y_m=front, speed_mps=speed, driven_m=driven)
 
 
 def drive(
@@ -107,9 +107,7 @@ def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = n
                 speed[i] = min(speed[i], _turn_speed(driven[i - 1], end_m))
                 driven[i] = min(driven[i - 1] + speed[i] * step, end_m)
     y = route.at(driven)[1]
-    return Trajectory(
-        passing.time_s, y, speed, passing.lane_x_m, passing.heading, passing.kind, route, driven
-    )
+    return replace(passing, front_y_m=y, speed_mps=speed, route=route, driven_m=driven)
 
 
 def _turn_speed(driven_m: float, end_m: float) -> float:
@@ -156,33 +154,62 @@ def emit(
     # view a wide source; engine noise, broadband and harmonics, comes from the first axle and from higher up.
     kind = trajectory.kind
     time = trajectory.time_s[0] + np.arange(samples) / sample_rate_hz
+    drawing = _Drawing(trajectory, time, sample_rate_hz, rng)
     rolling = _pressure(rolling_level_db(trajectory.speed_mps, kind) + level_offset_db)
     tyres = rolling / np.sqrt(len(kind.axles_m))
-    sources = [
-        SourceSignal(_noise(trajectory, time, tyres, sample_rate_hz, rng), behind, TYRE_M)
-        for behind in kind.axles_m
-    ]
+    sources = [SourceSignal(drawing.noise(tyres), behind, TYRE_M) for behind in kind.axles_m]
     if max(kind.propulsion_a_db) > SILENCE_DB:
         engine = _pressure(propulsion_level_db(trajectory.speed_mps, kind) + level_offset_db)
-        signal = _engine(trajectory, time, engine, sample_rate_hz, rng)
-        sources.append(SourceSignal(signal, kind.axles_m[0], kind.engine_m))
+        sources.append(SourceSignal(drawing.engine(engine), kind.axles_m[0], kind.engine_m))
     return sources
 
 
-def _noise(
-    trajectory: Trajectory,
-    time: FloatArray,
-    octave_pressure: FloatArray,
-    sample_rate_hz: float,
-    rng: np.random.Generator,
-) -> Float32Array:
-    """Gaussian noise whose octave pressures (8, T) follow the drive."""
-    bands = split_octaves(rng.standard_normal(len(time), dtype=np.float32), sample_rate_hz)
-    gains = octave_pressure / np.sqrt(_band_shares(sample_rate_hz))[:, None]
-    signal = np.zeros(len(time), np.float32)
-    for band, gain in zip(bands, gains, strict=True):
-        signal += band * np.interp(time, trajectory.time_s, gain).astype(np.float32)
-    return signal
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drawing:
+    """What one vehicle's signals are drawn for: its motion, the times of the samples, the randomness."""
+
+    trajectory: Trajectory
+    time: FloatArray
+    sample_rate_hz: float
+    rng: np.random.Generator
+
+    def noise(self, octave_pressure: FloatArray) -> Float32Array:
+        """Gaussian noise whose octave pressures (8, T) follow the drive."""
+        white = self.rng.standard_normal(len(self.time), dtype=np.float32)
+        gains = octave_pressure / np.sqrt(_band_shares(self.sample_rate_hz))[:, None]
+        signal = np.zeros(len(self.time), np.float32)
+        for band, gain in zip(split_octaves(white, self.sample_rate_hz), gains, strict=True):
+            signal += band * self._at_samples(gain)
+        return signal
+
+    def engine(self, octave_pressure: FloatArray) -> Float32Array:
+        """Noise and lines; an octave that no line falls into is noise alone."""
+        share = self.trajectory.kind.harmonic_share
+        firing = firing_frequency_hz(self.trajectory, self.time, self.rng)
+        orders = np.arange(1, HARMONICS + 1)
+        octave = np.clip(np.round(np.log2(orders * firing.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
+        crowd = np.bincount(octave, minlength=8)
+        lines = np.where(crowd > 0, share, 0.0)[:, None]
+        signal = self.noise(np.sqrt(1.0 - lines) * octave_pressure)
+        if share > 0.0:
+            shared = octave_pressure * np.sqrt(2.0 * lines / np.maximum(crowd, 1)[:, None])
+            signal += self._harmonics(shared, firing, octave)
+        return signal
+
+    def _harmonics(
+        self, octave_amplitude: FloatArray, firing_hz: FloatArray, octave: NDArray[np.int_]
+    ) -> Float32Array:
+        """Multiples 1, 2, ... of the firing frequency, each as loud as the octave it falls into."""
+        cycles = np.cumsum(firing_hz) / (len(self.time) / (self.time[-1] - self.time[0]))
+        levels = [self._at_samples(row) for row in octave_amplitude]
+        signal = np.zeros(len(self.time), np.float32)
+        for order, band in enumerate(octave.tolist(), start=1):
+            phase = 2.0 * np.pi * np.mod(order * cycles + self.rng.random(), 1.0)
+            signal += levels[band] * np.cos(phase.astype(np.float32))
+        return signal
+
+    def _at_samples(self, knots: FloatArray) -> Float32Array:
+        return np.interp(self.time, self.trajectory.time_s, knots).astype(np.float32)
 
 
 def _pressure(power_level_db: FloatArray) -> FloatArray:
@@ -194,45 +221,6 @@ def _band_shares(sample_rate_hz: float) -> FloatArray:
     """Power of white noise of unit variance in every octave band; bands beyond Nyquist stay empty."""
     masks = octave_masks(np.linspace(0.0, sample_rate_hz / 2.0, 4096))
     return np.asarray(np.maximum((masks**2).mean(axis=1), 1e-6))
-
-
-def _engine(
-    trajectory: Trajectory,
-    time: FloatArray,
-    octave_pressure: FloatArray,
-    sample_rate_hz: float,
-    rng: np.random.Generator,
-) -> Float32Array:
-    """Noise and lines; an octave that no line falls into is noise alone."""
-    share = trajectory.kind.harmonic_share
-    firing = firing_frequency_hz(trajectory, time, rng)
-    orders = np.arange(1, HARMONICS + 1)
-    octave = np.clip(np.round(np.log2(orders * firing.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
-    crowd = np.bincount(octave, minlength=8)
-    lines = np.where(crowd > 0, share, 0.0)[:, None]
-    signal = _noise(trajectory, time, np.sqrt(1.0 - lines) * octave_pressure, sample_rate_hz, rng)
-    if share > 0.0:
-        shared = octave_pressure * np.sqrt(2.0 * lines / np.maximum(crowd, 1)[:, None])
-        signal += _harmonics(trajectory, time, shared, firing, octave, rng)
-    return signal
-
-
-def _harmonics(
-    trajectory: Trajectory,
-    time: FloatArray,
-    octave_amplitude: FloatArray,
-    firing_hz: FloatArray,
-    octave: NDArray[np.int_],
-    rng: np.random.Generator,
-) -> Float32Array:
-    """Multiples 1, 2, ... of the firing frequency, each with the amplitude of the octave it falls into."""
-    cycles = np.cumsum(firing_hz) / (len(time) / (time[-1] - time[0]))
-    levels = [np.interp(time, trajectory.time_s, row).astype(np.float32) for row in octave_amplitude]
-    signal = np.zeros(len(time), np.float32)
-    for order, band in enumerate(octave.tolist(), start=1):
-        phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
-        signal += levels[band] * np.cos(phase.astype(np.float32))
-    return signal
 
 
 def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random.Generator) -> FloatArray:
