@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from worldstate.operations.training.methods import Passes
 
 Figures = dict[str, Any]
+# What fits a line of the table; the JSON object has the gains of all figures.
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
 
 EXAMPLE = """\

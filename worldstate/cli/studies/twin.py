@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 # Windows from either side at every site, and the seeds, of the comparison with real ones.
 WINDOWS = 10
 REALISM_SEEDS = (1, 2, 3)
+# A word and no path: a file of this name is given as ./default.
 DEFAULT_MODEL = "default"
 
 EXAMPLE = """\

@@ -41,12 +41,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.audio.open_sound import open_sound, path_of
+    from worldstate.adapters.files.atomic import write_text
     from worldstate.frontend.stream import FrontEnd
-    from worldstate.operations.recordings.bearing_track import (
-        track_bearings,
-        write_bearings,
-        write_bearings_figure,
-    )
+    from worldstate.operations.recordings.bearing_track import track_bearings, write_bearings_figure
 
     check_outputs(arguments, "out", figures=("figure",))
     sound, array = sound_and_array(arguments)
@@ -55,7 +52,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         front_end = FrontEnd(array, audio.sample_rate_hz, settings)
         track = track_bearings(audio, front_end, count=arguments.sources)
         silent = list(audio.silent_channels)
-    write_bearings(track, arguments.out)
+    write_text(arguments.out, track.csv())
     if arguments.figure is not None:
         write_bearings_figure(track, arguments.figure, path_of(sound).name)
     summary = {

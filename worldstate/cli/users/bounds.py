@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 AZIMUTHS_DEG = (0.0, 20.0, 40.0, 60.0, 80.0)
 ENDFIRE_DEG = tuple(float(azimuth) for azimuth in range(0, 81, 10))
 ENDFIRE_SNR_DB = 10.0
+# From below the threshold SNR, where estimators fail, to well above it.
 SNR_DB = (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
 # Every fourth microphone of the array beside all of them.
 THINNING = 4

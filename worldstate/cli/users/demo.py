@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from worldstate.adapters.simulation.scene.settings import SimulationSettings
 
+# Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
 VAN_OVER_CAR_DB = 6.0
 
 EXAMPLE = "example: worldstate demo --out out/demo --seed 7"

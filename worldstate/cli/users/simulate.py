@@ -25,6 +25,7 @@ from worldstate.cli.common.progress import progress_bar
 if TYPE_CHECKING:
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
+# Named here again: the help is built without importing the simulation. A test compares them.
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
 PRESETS = ("street-5", "street-5-calm")

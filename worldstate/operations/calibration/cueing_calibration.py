@@ -221,6 +221,7 @@ def calibrate_cueing(
     calm = _statistics(free, reference_prior, 0.0)
     blocks = sum(len(cut(stream, chosen.block_hops)) for stream in calm)
     tau = correlation_time_hops(calm)
+    fitted = "isotonic" if isinstance(policies[0].risk_map, IsotonicMap) else "platt"
     return CueingCalibration(
         policies=CueingPolicies(tuple(policies)),
         budgets=tuple(budgets),
@@ -229,7 +230,7 @@ def calibrate_cueing(
         recordings=len(free),
         blocks=blocks,
         correlation_time_s=tau * HOP_S,
-        risk=_kind(policies[0].risk_map) if approaches else "kept",
+        risk=fitted if approaches else "kept",
         warnings=tuple(_warnings(budgets, chosen, blocks, tau * HOP_S)),
     )
 
@@ -293,16 +294,12 @@ def _held_out(
     folds = min(settings.folds, len(calm))
     if folds < 2:
         return None, None
-    alarms, onsets, hours = 0.0, 0, 0.0
+    found = []
     for fold in range(folds):
         gamma = settings.threshold([s for i, s in enumerate(calm) if i % folds != fold], alpha)
-        found = false_alarm_rate(calm[fold::folds], gamma, settings.sustain_hops, HOP_S)
-        alarms, onsets, hours = (
-            alarms + found.window_rate * found.hours,
-            onsets + found.onsets,
-            hours + found.hours,
-        )
-    return alarms / hours, onsets / hours
+        found.append(false_alarm_rate(calm[fold::folds], gamma, settings.sustain_hops, HOP_S))
+    hours = sum(one.hours for one in found)
+    return sum(one.window_rate * one.hours for one in found) / hours, sum(one.onsets for one in found) / hours
 
 
 def _risk_map(calm: list[FloatArray], hazards: list[FloatArray], time_hops: float, kept: RiskMap) -> RiskMap:
@@ -328,10 +325,6 @@ def _risk_of(policies: CueingPolicies, beta: float) -> RiskMap:
     return min(policies.policies, key=lambda policy: abs(policy.miss_rate - beta)).risk_map
 
 
-def _kind(risk_map: RiskMap) -> str:
-    return "isotonic" if isinstance(risk_map, IsotonicMap) else "platt"
-
-
 def _warnings(
     budgets: list[BudgetReport], settings: CueingSettings, blocks: int, correlation_s: float
 ) -> Iterator[str]:
@@ -349,18 +342,14 @@ def _warnings(
     for report in budgets:
         count = report.counted
         if report.miss_rate == 0.0 and count.onsets < ENOUGH_ONSETS:
+            enough_h = count.hours * ENOUGH_ONSETS / max(count.onsets, 1)
             yield (
                 f"alpha {report.alpha:g}: {count.onsets} false alarms in {count.hours:.3g} h put their rate "
                 f"between {count.low_per_hour:.3g} and {count.high_per_hour:.3g} an hour; "
-                f"{_hours_for_a_rate(report):.2g} h would tell it to a factor of two"
+                f"{enough_h:.2g} h would tell it to a factor of two"
             )
     if conformal and correlation_s > settings.block_s / 2:
         yield (
             f"the statistic is correlated over {correlation_s:.3g} s: pieces of {settings.block_s:g} s "
             "depend on each other, take longer ones"
         )
-
-
-def _hours_for_a_rate(report: BudgetReport) -> float:
-    count = report.counted
-    return count.hours * ENOUGH_ONSETS / max(count.onsets, 1)

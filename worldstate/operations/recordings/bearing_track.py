@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.audio.sound_file import Audio
-from worldstate.adapters.files.atomic import write_text
 from worldstate.frontend.direction.source_count import count_sources
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.spectra.bins import band_bins
@@ -59,11 +58,6 @@ def track_bearings(audio: Audio, front_end: FrontEnd, *, count: bool = False) ->
     return BearingTrack(
         time_s, np.degrees(azimuth), np.degrees(std), prominence, sources_of if count else None
     )
-
-
-def write_bearings(track: BearingTrack, path: Path) -> None:
-    """Write the table as CSV, whole or not at all."""
-    write_text(path, track.csv())
 
 
 def write_bearings_figure(track: BearingTrack, path: Path, title: str) -> None:

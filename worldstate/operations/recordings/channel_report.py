@@ -1,6 +1,6 @@
 """What was wrong with the microphones of a recording, over all of its hops."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Fault
@@ -126,11 +126,8 @@ class HealthLog:
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
-        return tuple(
-            ChannelVerdict(v.channel, v.fault, v.share / self._n_hops, v.first_s, v.value, v.looks_like)
-            for v in ordered
-            if not self._is_other_half(v)
-        )
+        kept = [verdict for verdict in ordered if not self._is_other_half(verdict)]
+        return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in kept)
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
         """Tell a channel that was called dead while it came and went, or the other way round, mostly that."""

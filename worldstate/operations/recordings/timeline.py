@@ -47,12 +47,9 @@ class EntityTrack:
     def broken(self) -> "EntityTrack":
         """Return the track with a row of NaN in every gap, so that no line is drawn across."""
         gaps = np.flatnonzero(np.diff(self.time_s) > _GAP_S) + 1
-        return EntityTrack(
-            np.insert(self.time_s, gaps, np.nan),
-            np.insert(self.azimuth_rad, gaps, np.nan),
-            np.insert(self.std_rad, gaps, np.nan),
-            np.insert(self.hidden, gaps, False),
-        )
+        numbers = self.time_s, self.azimuth_rad, self.std_rad
+        time_s, azimuth_rad, std_rad = (np.insert(row, gaps, np.nan) for row in numbers)
+        return EntityTrack(time_s, azimuth_rad, std_rad, np.insert(self.hidden, gaps, False))
 
 
 @dataclass(frozen=True, slots=True)

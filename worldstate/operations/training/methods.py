@@ -132,3 +132,8 @@ OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "
 def row_of(method: str, protocol: Protocol) -> str:
     """Return the name in `ROWS` of what a method is under a protocol."""
     return OURS[protocol] if method == "worldstate" else method
+
+
+def method_of(method: str) -> Method:
+    """Return what a method is where the ego drives as it did in training."""
+    return METHODS[row_of(method, "cv")]

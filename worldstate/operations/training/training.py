@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
-from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
 from worldstate.abduction.signature.ensemble_training import RECIPES, SiteEnsembleClassifier
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.published_signature import hazard_statistic
@@ -20,9 +19,8 @@ from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 
-from .feature_evaluation import MakeClassifier, out_of_fold
-from .methods import site_ensemble
-from .site_references import with_site_references
+from .feature_evaluation import out_of_fold
+from .methods import method_of
 from .splits import N_FOLDS, folds_by_recording, junction_folds
 from .window_calibration import (
     ABSENT_MISS_RATE,
@@ -121,7 +119,7 @@ def train_model(
     (('front', 'left', 'none', 'right'), 'made up')
     """
     rng = np.random.default_rng(settings.seed)
-    inputs = seen_by(table, settings.method)
+    inputs = method_of(settings.method).prepare(table)
     levels = _out_of_fold_levels(table, inputs, settings, rng, on_step)
     signature = replace(fit_signature(inputs, settings.method, rng), domain=_domain(table))
     on_step()
@@ -146,7 +144,7 @@ def _out_of_fold_levels(
     on_step: Callable[[], None],
 ) -> list[list[FloatArray]]:
     """Posteriors of windows not trained on, from the most careful folds to the boldest: see `between`."""
-    make = maker_of(settings.method)
+    make = method_of(settings.method).make
     passes = []
     for _ in range(settings.repeats):
         passes.append(out_of_fold(inputs, folds_by_recording(table, rng), make, rng))
@@ -156,21 +154,11 @@ def _out_of_fold_levels(
     return [[out_of_fold(inputs, junction_folds(table), make, rng)], passes]
 
 
-def maker_of(method: TrainingMethod) -> MakeClassifier:
-    """Return what makes an untrained classifier of a method."""
-    return site_ensemble if method == "worldstate" else PublishedClassifier
-
-
 def _domain(table: FeatureTable) -> ModelDomain | None:
     """Return what the table says, the ego's motion of the windows that are left in it."""
     if table.domain is None:
         return None
     return replace(table.domain, ego_motion=ego_motion_of(np.unique(table.environments).tolist()))
-
-
-def seen_by(table: FeatureTable, method: TrainingMethod) -> FeatureTable:
-    """Return windows as the classifier of a method sees them: the ensemble with their site's reference."""
-    return with_site_references(table) if method == "worldstate" else table
 
 
 def fit_signature(inputs: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> AnySignature:
@@ -203,7 +191,7 @@ def _calibrated(
     table: FeatureTable, passes: list[FloatArray], alpha: float, miss_rate: float, settings: TrainingSettings
 ) -> WindowCalibration:
     hazards, hazard_free = (np.tile(flags, len(passes)) for flags in (table.hazards, table.hazard_free))
-    fit_map = fit_platt if settings.method == "worldstate" else fit_isotonic
+    fit_map = method_of(settings.method).fit_map
     pooled = np.concatenate(passes)
     return calibrate_windows(pooled, hazards, hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_map)
 

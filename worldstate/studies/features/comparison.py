@@ -15,7 +15,7 @@ from worldstate.operations.training.splits import Protocol
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 
 from .bootstrap import DRAWS, FigureDraws, draw_figures, recording_draws
-from .feature_report import group_figures, mean_figures, report_groups, window_figures
+from .feature_report import count_windows, mean_figures, report_groups, window_figures
 
 # The same samples for every method and run: the differences between methods are paired.
 BOOTSTRAP_SEED = 0
@@ -87,7 +87,7 @@ def comparison(
     >>> comparison(table, passes, "baseline", alpha=0.1, draws=20)["auroc_pooled"] > 0.9
     True
     """
-    chosen = {name: _of_row(passes, name) for name in ROWS if ROWS[name].method in passes}
+    chosen = {name: row_predictions(passes, name) for name in ROWS if ROWS[name].method in passes}
     if row not in chosen:
         raise InvalidArgumentError(f"method: expected passes of {row}, got {', '.join(passes)}")
     samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED), draws)
@@ -97,11 +97,8 @@ def comparison(
     return {
         **rows[row],
         "statistic": "absent" if ROWS[row].miss_rate == ABSENT_MISS_RATE else "published",
-        "n_windows": len(table),
-        "n_hazard": int(table.hazards.sum()),
-        "n_hazard_free": int(table.hazard_free.sum()),
-        "n_recordings": len(np.unique(table.recording_keys)),
-        "per_group": report_groups(table, [group_figures(table, one) for one in chosen[row]]),
+        **count_windows(table),
+        "per_group": report_groups(table, chosen[row]),
         "rows": {name: rows[name] for name in others},
         "gains": {name: _gains(rows[row], rows[name], drawn[row].gains(drawn[name])) for name in others},
     }
@@ -109,27 +106,17 @@ def comparison(
 
 def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]:
     """Return the predictions of one row, seed by seed."""
-    return _of_row(passes, row)
-
-
-def _of_row(passes: Mapping[str, Passes], name: str) -> list[Predictions]:
-    return [one[ROWS[name].miss_rate] for one in passes[ROWS[name].method]]
+    return [one[ROWS[row].miss_rate] for one in passes[ROWS[row].method]]
 
 
 def _row_figures(
     table: FeatureTable, passes: Sequence[Predictions], draws: FigureDraws, alpha: float
 ) -> dict[str, Any]:
     figures = mean_figures([window_figures(table, one) for one in passes])
-    return {
-        **figures,
-        "fpr_p_value": _budget_p_value(figures["fpr"] or 0.0, int(table.hazard_free.sum()), alpha),
-        "intervals": draws.intervals(),
-    }
-
-
-def _budget_p_value(fpr: float, n: int, alpha: float) -> float:
-    """Probability of as many false positives or more, were the true rate the budget."""
-    return float(binom.sf(round(fpr * n) - 1, n, alpha))
+    n = int(table.hazard_free.sum())
+    # Probability of as many false positives or more, were the true rate the budget.
+    p_value = float(binom.sf(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
+    return {**figures, "fpr_p_value": p_value, "intervals": draws.intervals()}
 
 
 def _gains(

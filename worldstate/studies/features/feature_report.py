@@ -12,28 +12,18 @@ from worldstate.abduction.cueing.calibration_error import (
     calibration_error_sampling,
     expected_calibration_error,
 )
+from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.atomic import atomic_path
+from worldstate.ground.typing import BoolArray
 from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate
 from worldstate.operations.training.feature_evaluation import Predictions
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.
 FLOOR_SEED = 0
 Figures = dict[str, float | None]
-COLUMNS = (
-    "seed",
-    "fold",
-    "recording",
-    "environment",
-    "class",
-    "p_front",
-    "p_left",
-    "p_none",
-    "p_right",
-    "score",
-    "risk",
-    "decision",
-)
+POSTERIORS = tuple(f"p_{label}" for label in CLASSES)
+COLUMNS = ("seed", "fold", "recording", "environment", "class", *POSTERIORS, "score", "risk", "decision")
 
 
 def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
@@ -59,20 +49,15 @@ def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
     }
 
 
-def group_figures(table: FeatureTable, predictions: Predictions) -> dict[str, Figures]:
-    """Return accuracy, area and rates of each junction; None where a label is missing there."""
-    correct = predictions.classes == table.labels
-    figures: dict[str, Figures] = {}
-    for environment in np.unique(table.environments).tolist():
-        here = table.environments == environment
-        scored = here & (table.hazards | table.hazard_free)
-        figures[environment] = {
-            "accuracy": rate(correct, here),
-            "auroc": auroc(predictions.score[scored], table.hazards[scored]),
-            "tpr": rate(predictions.decision, here & table.hazards),
-            "fpr": rate(predictions.decision, here & table.hazard_free),
-        }
-    return figures
+def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArray) -> Figures:
+    """Return accuracy, area and rates of one junction; None where a label is missing there."""
+    scored = here & (table.hazards | table.hazard_free)
+    return {
+        "accuracy": rate(predictions.classes == table.labels, here),
+        "auroc": auroc(predictions.score[scored], table.hazards[scored]),
+        "tpr": rate(predictions.decision, here & table.hazards),
+        "fpr": rate(predictions.decision, here & table.hazard_free),
+    }
 
 
 def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> dict[str, Any]:
@@ -83,11 +68,18 @@ def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> d
         **mean_figures(figures),
         **{f"{key}_absent": value for key, value in _absent_figures(table, absent).items()},
         "seed_std": _deviations(figures, ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")),
+        **count_windows(table),
+        "per_group": report_groups(table, published),
+    }
+
+
+def count_windows(table: FeatureTable) -> dict[str, int]:
+    """Return the numbers of windows, by what they hold, and of recordings."""
+    return {
         "n_windows": len(table),
         "n_hazard": int(table.hazards.sum()),
         "n_hazard_free": int(table.hazard_free.sum()),
         "n_recordings": len(np.unique(table.recording_keys)),
-        "per_group": report_groups(table, [group_figures(table, predictions) for predictions in published]),
     }
 
 
@@ -141,12 +133,11 @@ def _absent_figures(table: FeatureTable, passes: Sequence[Predictions]) -> Figur
     return figures
 
 
-def report_groups(table: FeatureTable, passes: Sequence[dict[str, Figures]]) -> dict[str, Figures]:
+def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Figures]:
     """Return the figures of each junction, mean over the passes, with its number of windows."""
-    return {
-        environment: {
-            "n_windows": int((table.environments == environment).sum()),
-            **mean_figures([one[environment] for one in passes]),
-        }
-        for environment in passes[0]
-    }
+    figures: dict[str, Figures] = {}
+    for environment in np.unique(table.environments).tolist():
+        here = table.environments == environment
+        means = mean_figures([_group_figures(table, one, here) for one in passes])
+        figures[environment] = {"n_windows": int(here.sum()), **means}
+    return figures

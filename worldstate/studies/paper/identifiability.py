@@ -21,8 +21,9 @@ from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.training.feature_evaluation import out_of_fold
+from worldstate.operations.training.methods import method_of
 from worldstate.operations.training.splits import folds_by_recording
-from worldstate.operations.training.training import TrainingMethod, maker_of, seen_by
+from worldstate.operations.training.training import TrainingMethod
 
 # A kNN estimate in more dimensions than this is far below the truth at a few hundred windows.
 _COMPONENTS = 3
@@ -121,8 +122,9 @@ def reach_on_data(
 
 def reach_on_table(table: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> ReachOnData:
     """Bound the error of any classifier of the windows of a table, beside that of a method out of fold."""
-    inputs = seen_by(table, method)
-    posteriors = out_of_fold(inputs, folds_by_recording(inputs, rng), maker_of(method), rng)
+    chosen = method_of(method)
+    inputs = chosen.prepare(table)
+    posteriors = out_of_fold(inputs, folds_by_recording(inputs, rng), chosen.make, rng)
     states = np.array([CLASSES.index(label) for label in table.labels.tolist()])
     features = np.log(table.features)
     return reach_on_data(posteriors, states, rng, features=features, groups=table.recording_keys)

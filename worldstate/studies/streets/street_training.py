@@ -14,7 +14,8 @@ from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.simulation.scene.junction import SITES
 from worldstate.adapters.simulation.scene.presets import Preset
-from worldstate.operations.training.training import TrainingMethod, fit_signature, seen_by
+from worldstate.operations.training.methods import method_of
+from worldstate.operations.training.training import TrainingMethod, fit_signature
 from worldstate.studies.origin import origin_of
 
 from .simulated_streets import VERSION
@@ -44,7 +45,7 @@ def train_on_simulation(
     else:
         table = _simulate(levels, seed, jobs, per_approach, progress)
         write_features(path, table)
-    return fit_signature(seen_by(table, method), method, np.random.default_rng(seed))
+    return fit_signature(method_of(method).prepare(table), method, np.random.default_rng(seed))
 
 
 def _simulate(
