@@ -53,7 +53,7 @@ class _Memory:
     predicted: Priors | None
     instant: _Posterior | None
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
-    bearing: Bearing | None = None
+    bearing: Bearing | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,7 @@ def memory_record(memory: Memory) -> _Memory:
         predicted=memory.predicted,
         instant=None if instant is None else _posterior_record(instant),
         threshold=memory.threshold,
+        bearing=memory.bearing,
     )
 
 
@@ -126,6 +127,7 @@ def memory_of(record: FilterRecord) -> Memory:
         predicted=kept.predicted,
         instant=None if kept.instant is None else _posterior_of(kept.instant, directions),
         threshold=kept.threshold,
+        bearing=kept.bearing,
     )
 
 
