@@ -76,6 +76,7 @@ FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
 }
 
 
+@pytest.mark.slow
 def test_no_file_within_its_limit_takes_a_gigabyte(tmp_path: Path) -> None:
     words: list[str] = []
     for number, (name, (reader, content)) in enumerate(FILES.items()):

@@ -300,6 +300,23 @@ def interrupted(words: list[str], begun, number: int) -> int:
 
 
 CODES = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+LATE = """
+import os, signal, sys
+from worldstate.adapters.files.atomic import deferred_signals
+def end(number, frame): raise SystemExit(128 + number)
+for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, end)
+with deferred_signals():
+    os.kill(os.getpid(), int(sys.argv[1]))
+    print("written", flush=True)
+print("not reached")
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), CODES)
+def test_a_signal_waits_for_files_that_belong_together(number, code):
+    command = [sys.executable, "-c", LATE, str(int(number))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (code, "written\n"), done.stderr
 
 
 @pytest.mark.parametrize(("number", "code"), CODES)

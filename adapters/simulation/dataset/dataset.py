@@ -25,7 +25,7 @@ from worldstate.adapters.datasets.ovad_layout import (
     TRUTH_NAME,
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.atomic import deferred_signals, write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
@@ -137,10 +137,11 @@ def write_dataset(
                 rows.append(row)
                 listed[row.folder] = row
                 _name_array(folder / ARRAY_NAME, listening)
-                try:
-                    _replace(folder / row.folder, Path(unlisted) / row.folder)
-                finally:
-                    write_log(folder, [one for one in listed.values() if (folder / one.folder).is_dir()])
+                with deferred_signals():
+                    try:
+                        _replace(folder / row.folder, Path(unlisted) / row.folder)
+                    finally:
+                        write_log(folder, [one for one in listed.values() if (folder / one.folder).is_dir()])
                 if progress is not None:
                     progress(row)
     return rows
