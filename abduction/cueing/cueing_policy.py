@@ -40,7 +40,7 @@ class SustainedRule:
 
     def advance(self, held: bool) -> "SustainedRule":
         """Return the state after one more hop."""
-        # ``run' = min(run + 1, k)`` if the hop held, else ``run' = 0``.
+        # `run' = min(run + 1, k)` if the hop held, else `run' = 0`.
         return replace(self, run=min(self.run + 1, self.sustain_hops) if held else 0)
 
 
@@ -218,7 +218,7 @@ def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
     >>> sustained_alarm([True, True, False, True], sustain_hops=2)
     array([False,  True, False, False])
     """
-    # ``alarm_t = held_(t-k+1) and .. and held_t``
+    # `alarm_t = held_(t-k+1) and .. and held_t`
     return sustained_statistic(np.asarray(held, dtype=bool), sustain_hops) >= 0.5
 
 

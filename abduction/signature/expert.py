@@ -27,8 +27,8 @@ class Expert:
     'mean'
     """
 
-    # ``mean``, ``median`` or ``quiet``: log-levels above that summary of the site; ``shape``: a few numbers
-    # of the window alone; ``shape_change``: how they differ from those of the site's median.
+    # `mean`, `median` or `quiet`: log-levels above that summary of the site; `shape`: a few numbers
+    # of the window alone; `shape_change`: how they differ from those of the site's median.
     view: str
     mean: FloatArray  # shape (inputs,): Standardisation; scale > 0
     scale: FloatArray

@@ -55,7 +55,7 @@ class SiteReference:
 
         Shapes: offset (features,).
         """
-        # ``r' = r + offset`` for each of the three.
+        # `r' = r + offset` for each of the three.
         return SiteReference(*(getattr(self, kind) + np.asarray(offset) for kind in KINDS))
 
 

@@ -40,7 +40,7 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
     """Read which window of which recording carries which label."""
     # Columns ID, Class, Environment and Recording ID as in the feature table, with these beside them where
     # wanted: File, relative to the data set; End, seconds from the start of the file; T0. Where no File is
-    # given, ``<Environment>/<Class>/<ID>/out_multi.wav`` and ``<ID>.wav`` are looked for.
+    # given, `<Environment>/<Class>/<ID>/out_multi.wav` and `<ID>.wav` are looked for.
     name, root = Path(path), Path(dataset)
     windows = [_labelled(name, root, line, row) for line, row in read_rows(name, REQUIRED, OPTIONAL)]
     if not windows:

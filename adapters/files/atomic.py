@@ -19,7 +19,7 @@ from worldstate.ground.errors import InputFileError
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Lend a temporary sibling of `path`; it takes the name on success and disappears on error."""
-    # The sibling keeps the suffix, because writers such as ``numpy.savez`` and ``soundfile`` look at it.
+    # The sibling keeps the suffix, because writers such as `numpy.savez` and `soundfile` look at it.
     target = check_target(path)
     temporary = target.with_name(f".{target.stem[:100]}-{uuid.uuid4().hex[:12]}{target.suffix}")
     try:

@@ -62,9 +62,9 @@ def ambiguity(positions_m: FloatArray) -> Ambiguity:
     >>> ambiguity(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]))
     'front-back'
     """
-    # A linear array measures the angle to its axis only (``cone``). A planar one does not distinguish a
-    # direction from its mirror image in the array plane: ``front-back`` if the plane is across the road,
-    # ``up-down`` if it is horizontal, ``mirror`` if it is tilted or faces sideways. A three-dimensional array
+    # A linear array measures the angle to its axis only (`cone`). A planar one does not distinguish a
+    # direction from its mirror image in the array plane: `front-back` if the plane is across the road,
+    # `up-down` if it is horizontal, `mirror` if it is tilted or faces sideways. A three-dimensional array
     # has no mirror direction.
     spread, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=True)[1:]
     thickness = np.pad(spread, (0, 3 - len(spread)))

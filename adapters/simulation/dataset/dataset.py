@@ -52,7 +52,7 @@ UNKNOWN_PLACE = 99
 class LogRow:
     """One line of `DataLog.csv`."""
 
-    # ``X_LL_NNNN``: class number (1 left, 2 none, 3 right), location number, running number.
+    # `X_LL_NNNN`: class number (1 left, 2 none, 3 right), location number, running number.
     recording_id: str
     environment: str  # Site name
     approach: str  # "left", "none" or "right"

@@ -16,7 +16,7 @@ class WarningSummary:
     t0_s: float | None
     # First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
     first_advisory_s: float | None
-    lead_time_s: float | None  # ``t0_s - first_advisory_s`` where that onset came before line-of-sight entry
+    lead_time_s: float | None  # `t0_s - first_advisory_s` where that onset came before line-of-sight entry
     # Onsets more than 5 s before `t0_s`, every onset of a hazard-free recording; None where neither is known.
     false_advisories_before: int | None
     # Onsets at or after `t0_s`: of a vehicle that can be seen, or that has just left the view. None without.

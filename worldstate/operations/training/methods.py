@@ -30,7 +30,7 @@ class Method:
     # Whether the threshold stands between junctions left out and recordings left out, where the protocol
     # leaves out junctions; else threshold and map come from folds like the outer ones.
     two_levels: bool
-    # Whether risks are shifted, under ``transfer``, until hazards are as frequent as in training.
+    # Whether risks are shifted, under `transfer`, until hazards are as frequent as in training.
     match_prevalence: bool = False
 
 

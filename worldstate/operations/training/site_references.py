@@ -16,7 +16,7 @@ def with_site_references(table: FeatureTable, chosen: BoolArray | None = None) -
     Shapes: table (n, 60), chosen (n,), returns (n, 240).
     """
     # No label is looked at, unless the caller chooses windows by their label: a commissioning drive is
-    # ``chosen=table.hazard_free``.
+    # `chosen=table.hazard_free`.
     levels = log_levels(table.features)
     allowed = np.ones(len(table), dtype=np.bool_) if chosen is None else chosen
     keys = table.recording_keys

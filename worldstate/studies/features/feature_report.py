@@ -28,7 +28,7 @@ COLUMNS = ("seed", "fold", "recording", "environment", "class", *POSTERIORS, "sc
 
 def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
     """Return the figures of one pass over the table."""
-    # Hazard windows against hazard-free ones; ``front`` counts in the 4-class accuracy only.
+    # Hazard windows against hazard-free ones; `front` counts in the 4-class accuracy only.
     scored = table.hazards | table.hazard_free
     hazards, score, risk = table.hazards[scored], predictions.score[scored], predictions.risk[scored]
     floor, floor_std = calibration_error_sampling(risk, np.random.default_rng(FLOOR_SEED))
