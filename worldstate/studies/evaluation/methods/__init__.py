@@ -1,0 +1,1 @@
+"""The rows of Table I and beyond, one file an idea."""
