@@ -10,7 +10,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import NotUsable, seconds
 from worldstate.measurement.measurement import Measurement
 
@@ -59,7 +59,10 @@ def hop_stream(
 
 def load_streams(path: str | Path) -> list[HopTable]:
     """Read the hop streams that `save_tables` wrote, and check them: a user may bring them."""
-    return load_tables(path, "hop streams", check=_check_stream)
+    streams = load_tables(path, "hop streams", check=_check_stream)
+    if not streams:
+        raise InputFileError(path, "expected at least one hop stream")
+    return streams
 
 
 def _check_stream(stream: HopTable) -> None:

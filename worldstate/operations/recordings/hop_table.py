@@ -125,10 +125,7 @@ def save_tables(path: str | Path, tables: Iterable[HopTable], origin: str = "") 
 
     `origin` names what they depend on.
     """
-    kept = list(tables)
-    about = [{name: getattr(one, name) for name in _OWN} | {"hops": len(one)} for one in kept]
-    head = {"version": VERSION, "origin": origin, "recordings": about}
-    save_npz(path, {"": np.array(json.dumps(head)), **joined(kept).columns})
+    _save(path, {"": list(tables)}, origin)
 
 
 def load_tables(
@@ -137,7 +134,7 @@ def load_tables(
     """Read what `save_tables` wrote; nothing if of another origin. `check` refuses what does not fit."""
 
     def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
-        tables = _tables(arrays, origin)
+        tables = _tables(arrays, origin).get("", [])
         for table in tables:
             check(table)
         return tables
@@ -145,7 +142,50 @@ def load_tables(
     return load_npz(path, what, MAX_BYTES, read)
 
 
-def _tables(arrays: dict[str, AnyArray], origin: str) -> list[HopTable]:
+def save_named(path: str | Path, tables: Mapping[str, HopTable]) -> None:
+    """Write tables with columns of their own as npz without objects, whole or not at all."""
+    _save(path, {name: [table] for name, table in tables.items()}, "")
+
+
+def load_named(path: str | Path, what: str) -> dict[str, HopTable]:
+    """Read what `save_named` wrote.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> boxes = HopTable({"label": np.array(["car", "bus"])})
+    >>> with TemporaryDirectory() as folder:
+    ...     save_named(f"{folder}/a.npz", {"boxes": boxes, "hops": HopTable({"time_s": np.zeros(5)})})
+    ...     [(name, len(table)) for name, table in load_named(f"{folder}/a.npz", "tables").items()]
+    [('boxes', 2), ('hops', 5)]
+    """
+    tables = load_npz(path, what, MAX_BYTES, lambda arrays: _tables(arrays, ""))
+    return {name: only for name, (only,) in tables.items()}
+
+
+def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]], origin: str) -> None:
+    """Write tables by kind: those of one kind have the same columns, which are stored end to end."""
+    # One array a recording and column would make a list of members that the reader refuses as too long.
+    about = [
+        {name: getattr(one, name) for name in _OWN} | {"kind": kind, "hops": len(one)}
+        for kind, tables in kinds.items()
+        for one in tables
+    ]
+    head = {"version": VERSION, "origin": origin, "recordings": about}
+    columns = {
+        _member(kind, name): column
+        for kind, tables in kinds.items()
+        for name, column in joined(tables).columns.items()
+    }
+    save_npz(path, {"": np.array(json.dumps(head)), **columns})
+
+
+def _member(kind: str, column: str) -> str:
+    """Name of a column in the file: columns of the nameless kind keep theirs."""
+    return f"{kind}/{column}" if kind else column
+
+
+def _tables(arrays: dict[str, AnyArray], origin: str) -> dict[str, list[HopTable]]:
     about = arrays.pop("")
     if about.nbytes > MAX_HEAD_BYTES:
         raise InvalidArgumentError(f"expected a head of at most {MAX_HEAD_BYTES >> 20} MiB")
@@ -153,14 +193,24 @@ def _tables(arrays: dict[str, AnyArray], origin: str) -> list[HopTable]:
     if head["version"] != VERSION:
         raise InvalidArgumentError(f"version: expected {VERSION}, got {head['version']}")
     if head["origin"] != origin:
-        return []
-    hops = [int(one.pop("hops")) for one in head["recordings"]]
-    if len(hops) > MAX_RECORDINGS:
-        raise InvalidArgumentError(f"hops: expected at most {MAX_RECORDINGS} recordings, got {len(hops)}")
-    if min(hops, default=-1) < 0 or any(len(column) != sum(hops) for column in arrays.values()):
+        return {}
+    if len(head["recordings"]) > MAX_RECORDINGS:
+        raise InvalidArgumentError(f"expected at most {MAX_RECORDINGS} tables, got {len(head['recordings'])}")
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for one in head["recordings"]:
+        # Files from before there were kinds hold the nameless one.
+        kinds.setdefault(one.pop("kind", ""), []).append(one)
+    columns: dict[str, dict[str, AnyArray]] = {kind: {} for kind in kinds}
+    for member, column in arrays.items():
+        kind, _, name = member.rpartition("/")
+        columns[kind][name] = column
+    return {kind: _split(tables, columns[kind]) for kind, tables in kinds.items()}
+
+
+def _split(about: Sequence[dict[str, Any]], columns: Mapping[str, AnyArray]) -> list[HopTable]:
+    """Return the tables of one kind from their columns end to end."""
+    hops = [int(one.pop("hops")) for one in about]
+    if min(hops) < 0 or any(len(column) != sum(hops) for column in columns.values()):
         raise InvalidArgumentError("hops: expected counts that sum to the number of rows")
-    parts = {name: np.split(column, np.cumsum(hops)[:-1]) for name, column in arrays.items()}
-    return [
-        HopTable({name: part[i] for name, part in parts.items()}, **one)
-        for i, one in enumerate(head["recordings"])
-    ]
+    parts = {name: np.split(column, np.cumsum(hops)[:-1]) for name, column in columns.items()}
+    return [HopTable({name: part[i] for name, part in parts.items()}, **one) for i, one in enumerate(about)]
