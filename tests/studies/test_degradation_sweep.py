@@ -8,7 +8,6 @@ import pytest
 from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.recording_folds import recording_folds
 from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERIED
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.degradation.degradation_report import sweep_report, sweep_table, write_sweep_figure
@@ -157,13 +156,6 @@ def test_what_does_not_fit_is_refused(corpus):
         )
     with pytest.raises(InvalidArgumentError, match="presence"):
         corpus[0][CLEAN].replace(presence=np.zeros(3))
-
-
-def test_folds_are_even_in_every_label():
-    labels = ["left", "none", "right", "none"] * 5
-    dealt = recording_folds(labels, 5, np.random.default_rng(1))
-    for fold in range(5):
-        assert [labels[i] for i in np.flatnonzero(dealt == fold)].count("none") == 2
 
 
 def test_missing_miss_rates_are_one_line(tmp_path, capsys):

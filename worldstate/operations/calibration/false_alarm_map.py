@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.alarm_rate import poisson_interval
 from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, rising_edges
 
 
@@ -44,15 +45,7 @@ class FalseAlarmRate:
 def false_alarm_rate(
     hazard_free: Sequence[ArrayLike], gamma: float, sustain_hops: int = 1, hop_s: float = 0.1
 ) -> FalseAlarmRate:
-    r"""Count the false alarms of a threshold.
-
-    .. math:: [\chi^2_{.025}(2n),\ \chi^2_{.975}(2n + 2)] / 2T.
-
-    Shapes: hazard_free (windows,).
-    """
-    # Garwood's exact interval of a Poisson rate, with n onsets in T hours.
-    from scipy.stats import chi2
-
+    """Count the false alarms of a threshold on hazard-free streams, each of shape (windows,)."""
     period_s = in_range("hop_s", hop_s, 0.0, np.inf, open_low=True)
     held = [sustained_statistic(stream, sustain_hops) >= gamma for stream in hazard_free]
     windows = sum(alarm.size for alarm in held)
@@ -60,7 +53,5 @@ def false_alarm_rate(
         raise InvalidArgumentError("hazard_free: expected at least one window")
     onsets = sum(rising_edges(alarm).size for alarm in held)
     hours = windows * period_s / SECONDS_PER_HOUR
-    low = chi2.ppf(0.025, 2 * onsets) / 2 if onsets else 0.0
-    high = chi2.ppf(0.975, 2 * onsets + 2) / 2
     share = sum(int(alarm.sum()) for alarm in held) / windows
-    return FalseAlarmRate(float(gamma), share, int(onsets), hours, float(low) / hours, float(high) / hours)
+    return FalseAlarmRate(float(gamma), share, onsets, hours, *poisson_interval(onsets, hours))

@@ -10,7 +10,8 @@ from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.recording_folds import recording_folds
+from worldstate.operations.metrics.recording_draws import middle
+from worldstate.operations.metrics.recording_folds import deal_folds
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
 from worldstate.operations.recordings.hop_table import HopTable
@@ -110,8 +111,8 @@ def degradation_sweep(
     Raises
     ------
     InvalidArgumentError
-        If states differ, no vehicle is ever in view after T0, or a fold is left without a hazard-free
-        recording to set thresholds on.
+        If states differ, no vehicle is ever in view after T0, or there are fewer than two approaches
+        or two hazard-free recordings.
 
     Examples
     --------
@@ -139,7 +140,8 @@ def degradation_sweep(
     clean = [one[CLEAN] for one in recordings]
     if not any(one.after_sight().any() for one in clean):
         raise InvalidArgumentError("recordings: expected an approach that comes into view")
-    folds = recording_folds([one.label for one in clean], settings.folds, rng)
+    sites = [str(one.about.get("site", "")) for one in clean]
+    folds = deal_folds([one.label for one in clean], sites, rng, settings.folds)
     judges = {
         fold: _Judge([r for r, f in zip(recordings, folds, strict=True) if f != fold], settings)
         for fold in np.unique(folds).tolist()
@@ -177,8 +179,6 @@ class _Judge:
 
     def __init__(self, others: Sequence[StagedHops], settings: SweepSettings) -> None:
         free = [one for one in others if one[CLEAN].hazard_free]
-        if not free:
-            raise InvalidArgumentError("recordings: expected hazard-free ones in more than one fold")
         self._settings = settings
         prior, alpha = settings.reference_prior, settings.alpha
         calm = [stream_statistic(one[CLEAN], prior) for one in free]
@@ -208,7 +208,7 @@ def _row(state: str, judged: Sequence[_Judged], draws: Sequence[IndexArray]) -> 
         vision_only=float(found_again.mean()),
         any_detection=float(seen.mean()),
         awareness=float(np.concatenate(aware).mean()),
-        awareness_interval=(float(np.quantile(drawn, 0.025)), float(np.quantile(drawn, 0.975))),
+        awareness_interval=middle(np.array(drawn)),
         unseen_awareness=_mean(unseen),
         detected=float(np.mean([one.detected for one in found])),
         lead_time_s=_mean(np.array(leads)),

@@ -9,12 +9,13 @@ from scipy.stats import binom
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.recording_draws import DRAWS, FigureDraws
 from worldstate.operations.training.feature_evaluation import Predictions
 from worldstate.operations.training.methods import METHODS, ROWS, Passes, evaluate_pass
 from worldstate.operations.training.splits import Protocol
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 
-from .bootstrap import DRAWS, FigureDraws, draw_figures, recording_draws
+from .bootstrap import draw_figures, recording_draws
 from .feature_report import count_windows, mean_figures, report_groups, window_figures
 
 # The same samples for every method and run: the differences between methods are paired.

@@ -16,7 +16,7 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.recording_folds import recording_folds
+from worldstate.operations.metrics.recording_folds import deal_folds
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
@@ -128,7 +128,7 @@ def evaluate_ablation(
     Raises
     ------
     InvalidArgumentError
-        If a fold has no hazard-free recording to calibrate on.
+        If there are fewer than two approaches or two hazard-free recordings.
 
     Returns
     -------
@@ -152,7 +152,8 @@ def evaluate_ablation(
     1.0
     """
     chosen = switches or AblationSwitches()
-    folds = recording_folds([stream.label for stream in streams], chosen.folds, rng)
+    sites = [str(stream.about.get("site", "")) for stream in streams]
+    folds = deal_folds([stream.label for stream in streams], sites, rng, chosen.folds)
     scored: list[_Scored] = []
     for fold in np.unique(folds):
         learned = _Learned(
@@ -190,8 +191,6 @@ class _Learned:
         self, streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
     ) -> None:
         free = [stream for stream in streams if stream.hazard_free]
-        if not free:
-            raise InvalidArgumentError("streams: expected a hazard-free recording in every calibration fold")
         approaches = [stream for stream in streams if stream.before_sight().any()]
         self._prior, self._switches = prior, switches
         self.weight = self._best_weight(free, approaches)

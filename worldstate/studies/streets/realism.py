@@ -20,6 +20,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray, IndexArray, TextArray
+from worldstate.operations.metrics.recording_draws import middle
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.training.splits import folds_by_recording
 from worldstate.studies.features.bootstrap import recording_draws
@@ -165,11 +166,15 @@ def _transfer(
     gains = [
         _area(score, test, rows) - _area(loudest, test, rows) for rows in recording_draws(test, rng, draws)
     ]
-    low, high = np.quantile(gains, [0.025, 0.975]).tolist()
     rows = np.arange(len(test))
     used = int((test.hazards | test.hazard_free).sum())
     return Transfer(
-        trained_on, tested_on, used, _area(score, test, rows), _area(loudest, test, rows), (low, high)
+        trained_on,
+        tested_on,
+        used,
+        _area(score, test, rows),
+        _area(loudest, test, rows),
+        middle(np.array(gains)),
     )
 
 
