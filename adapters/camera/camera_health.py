@@ -75,7 +75,15 @@ def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> Camer
         blurred = [image_quality(degrade(frame, "blur", d, rng)).sharpness for d in LEVELS]
         sharpness.append([np.nan if value is None else value for value in blurred])
         noise.append([image_quality(degrade(frame, "noise", d, rng)).noise for d in LEVELS])
-    if not brightness or np.isnan(sharpness).all(axis=0).any():
+    return health_scale(np.array(brightness), np.array(sharpness), np.array(noise))
+
+
+def health_scale(brightness: FloatArray, sharpness: FloatArray, noise: FloatArray) -> CameraHealth:
+    """Return the scale from what clean images measure, and their copies at each level; NaN where drowned.
+
+    Shapes: brightness (n,), sharpness and noise (n, levels).
+    """
+    if not brightness.size or np.isnan(sharpness).all(axis=0).any():
         raise InvalidArgumentError("clean: expected at least one image with a measurable sharpness")
     return CameraHealth(
         brightness=float(np.median(brightness)),

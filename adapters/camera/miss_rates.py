@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -49,6 +49,11 @@ class FamilyCounts:
         if (misses < 0).any() or (misses > looks).any() or (clutter < 0).any() or (clutter > sectors).any():
             raise InvalidArgumentError("counts: expected 0 <= misses <= looks and 0 <= clutter <= sectors")
 
+    def __add__(self, other: "FamilyCounts") -> "FamilyCounts":
+        """Return the counts of two sets of images."""
+        mine, theirs = astuple(self), astuple(other)
+        return FamilyCounts(*(_tuples(np.add(a, b)) for a, b in zip(mine, theirs, strict=True)))
+
     def miss_rates(self, repeats: float = 1.0) -> FloatArray:
         """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation."""
         # A cell without data has the prior mean of one half, as far as monotony allows.
@@ -68,6 +73,11 @@ class FamilyCounts:
     def clutter_rates(self) -> FloatArray:
         """P(a false detection in a query sector) at each level, shape (levels,), in (0, 1)."""
         return (np.array(self.clutter) + PRIOR) / (np.array(self.sectors) + 2.0 * PRIOR)
+
+
+def _tuples(values: FloatArray) -> Any:
+    rows = values.tolist()
+    return tuple(tuple(row) for row in rows) if values.ndim == 2 else tuple(rows)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -93,6 +94,23 @@ def test_the_stages_are_those_of_their_definition():
     assert noise.std() == pytest.approx(25.0, rel=0.02)
     assert abs(noise.mean()) < 0.3
     assert degrade(GREY, "all", 0.0, rng) is GREY
+
+
+@pytest.mark.parametrize("reduced", [3.025, 4.0])
+@pytest.mark.parametrize("family", [family for family in FAMILIES if family != "all"])
+def test_a_reduced_frame_comes_out_as_if_reduced_afterwards(family, reduced):
+    """Mean and spread of patches, dark and bright ones, in which clipping moves both."""
+    size, rng = (round(WIDTH / reduced), round(HEIGHT / reduced)), np.random.default_rng(2)
+    shift = np.where(np.arange(WIDTH) < WIDTH // 2, -100.0, 130.0)[:, None]
+    patches = np.clip(GREY + shift, 0, 255).astype(np.uint8)
+    for d in (0.25, 1.0):
+        after = cv2.resize(degrade(patches, family, d, rng), size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(patches, size, interpolation=cv2.INTER_AREA)
+        before = degrade(small, family, d, rng, WIDTH / size[0])
+        for columns in (slice(0, size[0] // 2 - 20), slice(size[0] // 2 + 20, None)):
+            one, other = after[:, columns].astype(float), before[:, columns].astype(float)
+            assert other.mean() == pytest.approx(one.mean(), abs=1.5)
+            assert other.std() == pytest.approx(one.std(), rel=0.04, abs=0.3)
 
 
 def test_the_same_seed_degrades_alike_and_damaged_frames_are_refused():

@@ -158,26 +158,52 @@ def measure_absence(
     chosen = settings or AbsenceSettings()
     if not scenes:
         raise InvalidArgumentError("scenes: expected at least one video")
-    edges = chosen.edges_deg(scenes[0].camera)
-    tallies = {family: _Tally(edges, chosen) for family in chosen.families}
-    clean = _Tally(edges, chosen)
+    tally = AbsenceTally(scenes[0].camera, chosen)
     for scene in scenes:
-        looks = [_Look(clean, make_detector(), "all", 0)]
-        for family, tally in tallies.items():
+        looks = [_Look(tally, make_detector(), "all", 0)]
+        for family in chosen.families:
             looks += [_Look(tally, make_detector(), family, level) for level in range(1, len(LEVELS))]
         for number, frame in enumerate(scene.video.frames()):
             for look in looks:
                 look.take(scene, number, frame, rng)
             on_frame()
-    if not clean.looks[:, 0].any():
+    if not tally.looks:
         raise InputFileError(scenes[0].reference.source, "expected moving objects in view, found none")
     return MissRates(
-        azimuth_deg=edges,
-        families={family: tally.counts(clean) for family, tally in tallies.items()},
+        azimuth_deg=tally.edges_deg,
+        families=tally.counts(),
         provenance=provenance or {},
         health=_health(scenes, rng),
         repeats=chosen.repeats,
     )
+
+
+class AbsenceTally:
+    """Counts of looks and misses, family by family, of what a detector found on staged frames."""
+
+    def __init__(self, camera: PinholeCamera, settings: AbsenceSettings | None = None) -> None:
+        self._camera, self._settings = camera, settings or AbsenceSettings()
+        self.edges_deg = self._settings.edges_deg(camera)
+        self._clean, *tallies = (
+            _Tally(self.edges_deg, self._settings) for _ in (0, *self._settings.families)
+        )
+        self._tallies = dict(zip(self._settings.families, tallies, strict=True))
+
+    @property
+    def looks(self) -> float:
+        """Reference objects on clean frames."""
+        return float(self._clean.looks[:, 0].sum())
+
+    def count(
+        self, reference: DetectionLog, number: int, found: DetectionFrame, family: Family, level: int
+    ) -> None:
+        """Count what was found in a frame at a level; level 0 is the clean frame of every family."""
+        tally = self._tallies[family] if level else self._clean
+        tally.count(self._camera, reference, number, found, level)
+
+    def counts(self) -> dict[str, FamilyCounts]:
+        """Return the counts so far by family."""
+        return {family: tally.counts(self._clean) for family, tally in self._tallies.items()}
 
 
 class _Tally:
@@ -199,16 +225,17 @@ class _Tally:
     def _all(self) -> tuple[FloatArray, ...]:
         return self.looks, self.misses, self.sectors, self.clutter
 
-    def count(self, scene: LabelledVideo, number: int, found: DetectionFrame, level: int) -> None:
+    def count(
+        self, camera: PinholeCamera, reference: DetectionLog, number: int, found: DetectionFrame, level: int
+    ) -> None:
         """Count what was found in a frame at a level."""
-        if not self._settings.warm_up <= number < len(scene.reference):
+        if not self._settings.warm_up <= number < len(reference):
             return
-        there = scene.reference.frames[number]
-        counted = _counted(scene.reference, number, self._settings)
-        boxes = there.boxes_px[counted]
+        there = reference.frames[number]
+        boxes = there.boxes_px[_counted(reference, number, self._settings)]
         hit = overlaps(boxes, found.boxes_px) >= self._settings.min_overlap
         middles = (boxes[:, 0] + boxes[:, 2]) / 2.0
-        off_axis_deg = np.degrees(np.abs(scene.camera.off_axis(scene.camera.azimuth(middles))))
+        off_axis_deg = np.degrees(np.abs(camera.off_axis(camera.azimuth(middles))))
         bins = np.clip(
             np.searchsorted(self._edges_deg, off_axis_deg, side="right") - 1, 0, len(self.looks) - 1
         )
@@ -216,7 +243,7 @@ class _Tally:
         np.add.at(self.misses[:, level], bins, ~hit.any(axis=1))
         false = ~(overlaps(found.boxes_px, there.boxes_px) >= self._settings.min_overlap).any(axis=1)
         false &= ~_inside(found.boxes_px, there.boxes_px)
-        self._count_clutter(scene.camera, there.boxes_px, found.boxes_px[false], level)
+        self._count_clutter(camera, there.boxes_px, found.boxes_px[false], level)
 
     def _count_clutter(
         self, camera: PinholeCamera, there_px: FloatArray, false_px: FloatArray, level: int
@@ -236,7 +263,7 @@ class _Tally:
 class _Look:
     """One detector on the frames of a video at one level of one family."""
 
-    tally: _Tally
+    tally: AbsenceTally
     detector: Detector
     family: Family
     level: int
@@ -244,7 +271,7 @@ class _Look:
     def take(self, scene: LabelledVideo, number: int, frame: ImageArray, rng: np.random.Generator) -> None:
         """Degrade a frame, look at it and count."""
         found = self.detector.detect(degrade(frame, self.family, LEVELS[self.level], rng))
-        self.tally.count(scene, number, found, self.level)
+        self.tally.count(scene.reference, number, found, self.family, self.level)
 
 
 def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> IntArray:
