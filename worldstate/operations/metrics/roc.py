@@ -1,6 +1,6 @@
 """Areas under the ROC curve and rates at a threshold."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +8,10 @@ from scipy.stats import rankdata
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray
+from worldstate.ground.typing import BoolArray, FloatArray
+
+# One share of false positives each; finer ones than a hundredth are not drawn.
+ROC_POINTS = 101
 
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
@@ -79,3 +82,37 @@ def rate(decisions: BoolArray, among: BoolArray) -> float | None:
     0.5
     """
     return float(decisions[among].mean()) if among.any() else None
+
+
+def rank_wins(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> FloatArray:
+    r"""Return how often windows of recording p score above those of recording q, shape (P, Q).
+
+    .. math:: W_{pq} = \sum_{i \in p, j \in q} [s_i > s_j] + [s_i = s_j] / 2
+
+    The area under the ROC curve over any choice of recordings is then a ratio of sums, ties included.
+
+    Examples
+    --------
+    >>> rank_wins([np.array([0.5, 0.9])], [np.array([0.5]), np.array([0.1, 0.7])])
+    array([[1.5, 3. ]])
+    """
+    scores = np.concatenate([np.zeros(0), *positives])
+    ends = np.cumsum([0, *map(len, positives)])
+    wins = np.zeros((len(positives), len(negatives)))
+    for q, one in enumerate(map(np.sort, negatives)):
+        below = (np.searchsorted(one, scores, "left") + np.searchsorted(one, scores, "right")) / 2.0
+        # Halves are exact in binary, so differences of the running sum are.
+        wins[:, q] = np.diff(np.concatenate([[0.0], np.cumsum(below)])[ends])
+    return wins
+
+
+def roc_points(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> FloatArray:
+    """Return the share of positives found at evenly spaced shares of false positives, shape (ROC_POINTS,)."""
+    high, low = (np.sort(np.concatenate([np.zeros(0), *some])) for some in (positives, negatives))
+    if not (high.size and low.size):
+        return np.full(ROC_POINTS, np.nan)
+    steps = np.unique(np.concatenate([high, low]))[::-1]
+    found, false = (1.0 - np.searchsorted(some, steps) / some.size for some in (high, low))
+    grid = np.linspace(0.0, 1.0, ROC_POINTS)
+    curve = np.interp(grid, np.concatenate([[0.0], false]), np.concatenate([[0.0], found]))
+    return np.asarray(curve, np.float64)

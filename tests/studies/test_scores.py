@@ -1,0 +1,299 @@
+"""From decisions to figures: closed-form cases, other people's formulas, and laws of the bootstrap."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_up_trials import alarmed, made_up, random_answer, random_study
+from scipy.stats import chi2
+from sklearn.metrics import brier_score_loss, roc_auc_score
+
+from worldstate.abduction.cueing.calibration_error import (
+    calibration_error_floor,
+    expected_calibration_error,
+    reliability_curve,
+)
+from worldstate.frontend.direction.gating import gating_curve
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.recording_draws import stratified_draws
+from worldstate.studies.evaluation.scores import Score, paired
+from worldstate.studies.evaluation.trial import Trial
+
+
+def close(ours, theirs):
+    assert ours.keys() == theirs.keys()
+    for name in ours:
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def windows(trials, answers, column, horizon_s=np.inf):
+    """Values and labels of all scored windows, gathered the plain way."""
+    values, labels = [], []
+    for trial, said in zip(trials, answers, strict=True):
+        left_s = trial.t0_s - trial.hops.time_s
+        used = np.full(len(left_s), True)
+        if not trial.hazard_free:
+            used = (left_s > -1e-6) & (left_s < horizon_s + 1e-6)
+        values.append(getattr(said, column)[used])
+        labels.append(np.full(used.sum(), not trial.hazard_free))
+    return np.concatenate(values), np.concatenate(labels)
+
+
+def test_alarms_that_are_known():
+    trials = [made_up("a", "left", t0_s=7.0), made_up("b", "right", t0_s=7.0), made_up("c"), made_up("d")]
+    left = np.ones(81, int)
+    answers = [
+        # 5.5 s and 1.7 s before T0, and once after it.
+        alarmed(trials[0], [(1.5, 1.8), (5.3, 5.6), (7.4, 7.6)], side=left),
+        alarmed(trials[1], [(7.1, 8.0)], side=left),
+        alarmed(trials[2], [(2.0, 2.9), (4.0, 4.1)]),
+        alarmed(trials[3], []),
+    ]
+    figures = Score.of(trials, [answers]).figures()
+    hours = 162 * 0.1 / 3600
+    expected = {
+        "detection": 0.5,
+        "lead_s": 1.7,
+        "lead_missed_zero_s": 0.85,
+        "early_onsets_per_approach": 0.5,
+        "false_onsets": 2.0,
+        "hazard_free_hours": hours,
+        "quantum_per_hour": 1 / hours,
+        "false_alarms_per_hour": 2 / hours,
+        "advisory_share": 10 / 162,
+        "side_correct": 1.0,
+        # Two onsets in the 2 x 6 s before T0, of which the last 5 s count.
+        "random_detection": 1 - (7 / 12) ** 2,
+        # Every hop in view has its box.
+        "hazard_awareness": 1.0,
+    }
+    for name, value in expected.items():
+        assert figures[name] == pytest.approx(value), name
+
+
+def test_the_hop_at_t0_and_the_one_five_seconds_before_it():
+    # 0.1 is no binary fraction: the hop that ends at T0 = 6.3 s must not count as a lead of 1e-15 s.
+    trials = [made_up("a", "left", t0_s=0.1 * 63), made_up("b", "left", t0_s=0.1 * 63), made_up("c")]
+    answers = [alarmed(trials[0], [(6.3, 7.0)]), alarmed(trials[1], [(1.3, 1.5)]), alarmed(trials[2], [])]
+    score = Score.of(trials, [answers])
+    assert score.figures(np.array([0]))["detection"] == 0.0
+    assert score.figures(np.array([1]))["lead_s"] == pytest.approx(5.0)
+
+
+def test_awareness_is_of_alarms_and_of_boxes():
+    trial = made_up("a", "left", t0_s=5.0)
+    blind = replace(trial, boxes=made_up("b").boxes)
+    calm = made_up("c")
+    for one, spans, expected in [(trial, [], 1.0), (blind, [], 0.0), (blind, [(5.3, 5.6)], 0.3)]:
+        figures = Score.of([one, calm], [[alarmed(one, spans), alarmed(calm, [])]]).figures()
+        assert figures["hazard_awareness"] == pytest.approx(expected)
+
+
+def test_figures_of_windows_are_those_of_other_formulas():
+    trials, (answers,) = random_study(np.random.default_rng(1))
+    score = Score.of(trials, [answers])
+    figures = score.figures()
+    for name, horizon_s in {"all": np.inf, "2s": 2.0, "1s": 1.0}.items():
+        values, labels = windows(trials, answers, "score", horizon_s)
+        assert figures[f"auroc_{name}"] == pytest.approx(roc_auc_score(labels, values))
+        false, found = score.roc_curve(name)
+        # Both count as a curve of straight pieces, here on a grid.
+        assert np.trapezoid(found, false) == pytest.approx(figures[f"auroc_{name}"], abs=0.005)
+    risk, labels = windows(trials, answers, "risk")
+    raw, _ = windows(trials, answers, "score")
+    assert figures["ece"] == pytest.approx(expected_calibration_error(risk, labels))
+    assert figures["ece_raw"] == pytest.approx(expected_calibration_error(raw, labels))
+    assert figures["hazard_share"] == pytest.approx(labels.mean())
+    skill = 1 - brier_score_loss(labels, risk) / brier_score_loss(labels, np.full(len(labels), labels.mean()))
+    assert figures["brier_skill"] == pytest.approx(skill)
+    floor = calibration_error_floor(risk, np.random.default_rng(0))
+    assert figures["ece_floor"] == pytest.approx(floor, rel=0.03)
+    ours, theirs = score.reliability(), reliability_curve(risk, labels)
+    np.testing.assert_allclose(ours.predicted, theirs.predicted)
+    np.testing.assert_allclose(ours.observed, theirs.observed)
+    pairs = [
+        (said.bearing_rad[use] - 0.3, trial.hops.prominence[use])
+        for trial, said in zip(trials, answers, strict=True)
+        for use in [np.isfinite(trial.hops.reference_rad)]
+    ]
+    error, prominence = map(np.concatenate, zip(*pairs, strict=True))
+    assert figures["bearing_deg"] == pytest.approx(np.degrees(np.median(np.abs(error))))
+    gated = gating_curve(prominence, error).at_coverage(0.16)[1]
+    assert figures["bearing_gated_deg"] == pytest.approx(np.degrees(gated))
+
+
+def test_the_floor_of_few_windows_stays_near_its_own():
+    trials = [made_up("a", "left", t0_s=1.6), made_up("b", hops=9)]
+    rng = np.random.default_rng(5)
+    answers = [random_answer(trial, rng) for trial in trials]
+    floor = calibration_error_floor(windows(trials, answers, "risk")[0], rng, draws=4000)
+    assert Score.of(trials, [answers]).figures()["ece_floor"] == pytest.approx(floor, rel=0.25)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6))
+def test_a_draw_counts_like_the_recordings_it_repeats(seed):
+    rng = np.random.default_rng(seed)
+    trials, passes = random_study(rng, approaches=4, calm=3, seeds=2, hops=45)
+    rows = rng.integers(0, len(trials), 9)
+    drawn = Score.of([trials[i] for i in rows], [[answers[i] for i in rows] for answers in passes])
+    close(Score.of(trials, passes).figures(rows), drawn.figures())
+
+
+def test_figures_are_means_over_seeds():
+    trials, passes = random_study(np.random.default_rng(2), seeds=3)
+    each = [Score.of(trials, [answers]).figures() for answers in passes]
+    close(Score.of(trials, passes).figures(), {n: np.mean([one[n] for one in each]) for n in each[0]})
+
+
+def test_the_order_of_recordings_changes_nothing():
+    rng = np.random.default_rng(3)
+    trials, passes = random_study(rng, seeds=2)
+    order = rng.permutation(len(trials))
+    turned = Score.of([trials[i] for i in order], [[answers[i] for i in order] for answers in passes])
+    straight = Score.of(trials, passes)
+    close(straight.figures(), turned.figures())
+    assert straight.worst_sites().keys() == turned.worst_sites().keys()
+    for name, worst in straight.worst_sites().items():
+        assert turned.worst_sites()[name] == (worst[0], pytest.approx(worst[1]))
+
+
+def test_a_mirrored_world_has_the_same_figures():
+    trials, (answers,) = random_study(np.random.default_rng(4))
+    other = {"left": "right", "right": "left", "none": "none"}
+    mirrored = [
+        Trial(one.hops.replace(label=other[one.label], reference_rad=-one.hops.reference_rad), one.boxes)
+        for one in trials
+    ]
+    turned = [replace(said, side=-said.side, bearing_rad=-said.bearing_rad) for said in answers]
+    ours = Score.of(trials, [answers]).figures()
+    close(ours, Score.of(mirrored, [turned]).figures())
+    # A method that does not see that the world is mirrored is right where it was wrong.
+    assert Score.of(mirrored, [answers]).figures()["side_correct"] != ours["side_correct"]
+
+
+def test_identical_recordings_have_intervals_without_width():
+    near, calm = made_up("a", "left"), made_up("c")
+    rng = np.random.default_rng(0)
+    answers = [random_answer(near, rng), random_answer(calm, rng)]
+    score = Score.of([near] * 5 + [calm] * 5, [[answers[0]] * 5 + [answers[1]] * 5])
+    figures, intervals = score.figures(), score.intervals(stratified_draws(score.strata, rng, 50))
+    del intervals["false_alarms_per_hour_poisson"]
+    close({name: (value, value) for name, value in figures.items()}, intervals)
+
+
+def test_a_method_is_as_good_as_itself():
+    trials, passes = random_study(np.random.default_rng(6), seeds=2)
+    score = Score.of(trials, passes)
+    differences = paired(score, score, stratified_draws(score.strata, np.random.default_rng(0), 40))
+    assert all(value == (0.0, 0.0, 0.0) for value in differences.values())
+
+
+def detector(trials, rate, rng):
+    """Detects each approach with a probability, a second before T0."""
+    return [
+        alarmed(trial, [(4.0, 4.5)] if not trial.hazard_free and rng.random() < rate else [])
+        for trial in trials
+    ]
+
+
+def test_intervals_hold_the_truth_in_most_experiments():
+    rng = np.random.default_rng(7)
+    trials = [made_up(f"r{i}", "left", hops=50, site=f"S{i % 2}") for i in range(40)] + [
+        made_up("c", hops=50)
+    ]
+    held, held_difference = 0, 0
+    for _ in range(50):
+        a, b = (Score.of(trials, [detector(trials, rate, rng)]) for rate in (0.7, 0.5))
+        draws = stratified_draws(a.strata, rng, 120)
+        low, high = a.intervals(draws)["detection"]
+        held += low <= 0.7 <= high
+        _, low, high = paired(a, b, draws)["detection"]
+        held_difference += low <= 0.2 <= high
+    # 95 % less what a bootstrap of 40 recordings lacks; four standard deviations of the share are .12.
+    assert 0.82 < held / 50 <= 1.0
+    assert 0.82 < held_difference / 50 <= 1.0
+
+
+def test_false_alarms_have_their_exact_interval():
+    trials, passes = random_study(np.random.default_rng(8), seeds=2)
+    score = Score.of(trials, passes)
+    figures = score.figures()
+    count, hours = round(figures["false_onsets"]), figures["hazard_free_hours"]
+    expected = (chi2.ppf(0.025, 2 * count) / 2 / hours, chi2.ppf(0.975, 2 * count + 2) / 2 / hours)
+    low_high = score.intervals(stratified_draws(score.strata, np.random.default_rng(0), 5))
+    assert low_high["false_alarms_per_hour_poisson"] == pytest.approx(expected)
+
+
+def test_sites_stand_beside_the_worst_of_them():
+    good, bad = made_up("a", "left", site="SA1"), made_up("b", "left", site="SB1")
+    calm = made_up("c", site="SC1")
+    score = Score.of([good, bad, calm], [[alarmed(good, [(4.0, 4.2)]), alarmed(bad, []), alarmed(calm, [])]])
+    rates = [figures["detection"] for figures in score.by_site().values()]
+    assert rates == pytest.approx([1.0, 0.0, np.nan], nan_ok=True)
+    assert score.worst_sites()["detection"] == ("SB1", 0.0)
+    assert score.worst_sites()["false_alarms_per_hour"] == ("SC1", 0.0)
+
+
+def test_strata_keep_the_degraded_recordings_apart():
+    clean, dirty = made_up("a", "left"), made_up("b", "left", degraded=True)
+    answers = [alarmed(clean, [(4.0, 4.2)]), alarmed(dirty, [])]
+    strata = Score.of([clean, dirty], [answers]).strata_figures()
+    assert strata["occluded"]["detection"] == 0.5
+    assert strata["vision-degraded"]["detection"] == 0.0
+    assert strata["clear"]["hazard_awareness"] == 1.0
+    assert "detection" not in strata["clear"]
+
+
+def test_what_a_method_does_not_state_is_not_there():
+    trials = [made_up("a", "left"), made_up("c")]
+    score = Score.of(trials, [[alarmed(one, []) for one in trials]])
+    figures = score.figures()
+    stated = {"detection", "false_alarms_per_hour", "advisory_share", "random_detection", "hazard_awareness"}
+    assert all(np.isfinite(figures[name]) for name in stated)
+    silent = {
+        "side_correct",
+        "auroc_all",
+        "ece",
+        "ece_raw",
+        "ece_floor",
+        "brier_skill",
+        "bearing_deg",
+        "lead_s",
+    }
+    assert all(np.isnan(figures[name]) for name in silent)
+    # Log odds are a score, but no probability.
+    odds = [alarmed(one, [], score=np.linspace(-3.0, 3.0, 81)) for one in trials]
+    figures = Score.of(trials, [odds]).figures()
+    assert np.isnan(figures["ece_raw"]) and np.isfinite(figures["auroc_all"])
+
+
+@pytest.mark.parametrize("label", ["left", "none"])
+def test_one_kind_of_recordings_alone_has_the_figures_of_its_kind(label):
+    rng = np.random.default_rng(0)
+    trials = [made_up(f"r{i}", label) for i in range(3)]
+    score = Score.of(trials, [[random_answer(one, rng) for one in trials]])
+    figures = score.figures()
+    assert np.isnan(figures["auroc_all"]) and np.isnan(figures["brier_skill"])
+    assert np.isnan(figures["false_alarms_per_hour"]) == (label == "left")
+    assert np.isnan(figures["detection"]) == (label == "none")
+    score.intervals(stratified_draws(score.strata, rng, 5))
+
+
+def test_answers_that_do_not_fit_are_refused():
+    near, calm = made_up("a", "left"), made_up("c")
+    fits = [alarmed(near, []), alarmed(calm, [])]
+    for trials, passes, told in [
+        ([], [[]], "at least one recording"),
+        ([near], [], "at least one recording"),
+        ([near, calm], [fits[:1]], "decisions of a pass"),
+        ([near], [[alarmed(made_up("x", hops=5), [])]], "a: time_s of the decisions"),
+        ([near], [[alarmed(near, [], risk=np.full(81, 1.5))]], r"a: risk: expected numbers in \[0, 1\]"),
+        ([made_up("a", "left", t0_s=np.nan)], [fits[:1]], "a: line-of-sight entry"),
+    ]:
+        with pytest.raises(InvalidArgumentError, match=told):
+            Score.of(trials, passes)
+    with pytest.raises(InvalidArgumentError, match="same recordings"):
+        paired(Score.of([near], [fits[:1]]), Score.of([calm], [fits[1:]]), np.zeros((1, 1), int))
