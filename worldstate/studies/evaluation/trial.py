@@ -11,7 +11,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 LEFT, RIGHT, NO_SIDE = 1, -1, 0
 # The columns of the three tables of a trial and of an answer.
-BOX_COLUMNS = ("frame", "time_s", "box_px", "score", "label", "azimuth_rad", "moving")
+BOX_COLUMNS = ("frame", "time_s", "box_px", "score", "class_name", "azimuth_rad", "moving")
 TRUTH_COLUMNS = ("time_s", "vehicle", "azimuth_rad", "in_view")
 TRACK_COLUMNS = ("time_s", "track", "azimuth_rad")
 
@@ -94,7 +94,7 @@ class Trial:
         `about` holds its `site` and whether the ego moves.
     boxes : HopTable
         What the camera reported, one row a box: `frame`, `time_s`, `box_px` (n, 4) as x1, y1, x2, y2,
-        `score`, `label`, `azimuth_rad` of its middle, `moving`; no rows where the recording has no camera.
+        `score`, `class_name`, `azimuth_rad` of its middle, `moving`; no rows where there is no camera.
     truth : HopTable
         Where the vehicles were, one row a camera frame and vehicle: `time_s`, `vehicle`, `azimuth_rad`,
         `in_view`. Of a real recording these are the moving boxes, all in view.
