@@ -1,0 +1,246 @@
+"""OC-SORT (Cao et al., CVPR 2023): tracks of boxes that trust observations more than predictions."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+
+from worldstate.ground.checks import in_range
+from worldstate.ground.typing import FloatArray
+
+# The state of SORT (Bewley et al., 2016): middle, area and aspect ratio of a box, and how fast the first
+# three change, an image. The noises are those of its code, which every descendant has kept.
+_F = np.eye(7) + np.eye(7, k=4)
+_H = np.eye(4, 7)
+_Q = np.diag([1.0, 1.0, 1.0, 1.0, 0.01, 0.01, 0.0001])
+_R = np.diag([1.0, 1.0, 10.0, 10.0])
+_P = np.diag([10.0] * 4 + [10_000.0] * 3)
+_TINY = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class OcSortSettings:
+    """The settings of OC-SORT, at their published values."""
+
+    min_score: float = 0.6  # Boxes below it are not looked at
+    max_age: int = 30  # Images without a box that a track survives: 3 s at 10 Hz
+    min_hits: int = 3  # Images with a box, one after the other, that make a track certain
+    min_iou: float = 0.3  # Of a box and the one it is taken for
+    inertia: float = 0.2  # Weight of the direction of motion in the association
+    delta_t: int = 3  # Images over which that direction is read
+    # The authors' code applies the box that ends a gap twice, the first time as the end of the replayed
+    # trajectory, and so did everybody who ran OC-SORT. False applies it once, as the paper has it.
+    twice: bool = True
+
+    def __post_init__(self) -> None:
+        in_range("min_score", self.min_score, 0.0, 1.0)
+        in_range("min_iou", self.min_iou, 0.0, 1.0)
+        in_range("max_age", self.max_age, 0, 1 << 16)
+        in_range("delta_t", self.delta_t, 1, 1 << 16)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedBox:
+    """One living track in one image."""
+
+    track: int  # Names the identity
+    box_px: FloatArray  # The detection where it has one, else what the filter predicts
+    detection: int  # Index among the boxes of this image, -1 where the track coasts
+    certain: bool  # Whether the published code emits it now
+    known: bool  # Whether it has been certain at least once
+
+
+class OcSort:
+    """Boxes in, living tracks out, image by image; an image without boxes is a step, too.
+
+    Examples
+    --------
+    >>> sort = OcSort()
+    >>> for shift in (0.0, 10.0, 20.0, 30.0):
+    ...     tracks = sort.step(np.array([[shift, 9.0, shift + 100.0, 89.0]]), np.array([0.9]))
+    >>> [(one.track, one.detection, one.certain) for one in tracks]
+    [(0, 0, True)]
+    >>> [coasting] = sort.step(np.empty((0, 4)), np.empty(0))
+    >>> coasting.detection, coasting.certain, coasting.box_px.round().tolist()
+    (-1, False, [40.0, 9.0, 140.0, 89.0])
+    """
+
+    def __init__(self, settings: OcSortSettings | None = None) -> None:
+        self._settings = settings or OcSortSettings()
+        self._tracks: list[_Track] = []
+        self._born = self._steps = 0
+
+    def step(self, boxes_px: FloatArray, scores: FloatArray) -> list[TrackedBox]:
+        """Take the boxes (n, 4) and scores (n,) of the next image."""
+        self._steps += 1
+        for track in self._tracks:
+            track.predict()
+        used = np.flatnonzero(scores >= self._settings.min_score)
+        boxes, taken = boxes_px[used], {}
+        pairs = self._associate(boxes, scores[used])
+        for i, j in pairs:
+            self._tracks[i].observe(boxes[j], self._settings)
+            taken[self._tracks[i].number] = int(used[j])
+        for j in np.setdiff1d(np.arange(len(used)), [j for _, j in pairs]):
+            taken[self._born] = int(used[j])
+            self._tracks.append(_Track.at(boxes[j], self._born))
+            self._born += 1
+        self._tracks = [track for track in self._tracks if track.unseen <= self._settings.max_age]
+        return [self._told(track, taken.get(track.number, -1)) for track in self._tracks]
+
+    def _told(self, track: "_Track", detection: int) -> TrackedBox:
+        # The first images are exempt from the wait, or a recording would begin with a blind spot.
+        early = self._steps <= self._settings.min_hits
+        certain = detection >= 0 and (track.streak >= self._settings.min_hits or early)
+        track.known |= certain
+        box = track.last_px if detection >= 0 else track.belief.box_px
+        return TrackedBox(track.number, box, detection, certain, track.known)
+
+    def _associate(self, boxes: FloatArray, scores: FloatArray) -> list[tuple[int, int]]:
+        """Return pairs of track and box: by prediction and direction first, then by the last box seen."""
+        tracks, least = self._tracks, self._settings.min_iou
+        predicted = np.array([track.belief.box_px for track in tracks]).reshape(-1, 4)
+        overlap = _iou(predicted, boxes)
+        toward = [track.consistency(boxes, self._settings.delta_t) for track in tracks]
+        weight = self._settings.inertia * scores * np.array(toward).reshape(overlap.shape)
+        pairs = _matched(overlap, weight, least)
+        # A vehicle that braked is where it was seen, not where it was predicted.
+        idle = np.setdiff1d(np.arange(len(tracks)), [i for i, _ in pairs])
+        free = np.setdiff1d(np.arange(len(boxes)), [j for _, j in pairs])
+        last = np.array([tracks[i].last_px for i in idle]).reshape(-1, 4)
+        again = _matched(_iou(last, boxes[free]), 0.0, least)
+        return pairs + [(int(idle[i]), int(free[j])) for i, j in again]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Belief:
+    """Mean and covariance of SORT's box state."""
+
+    mean: FloatArray
+    cov: FloatArray
+
+    @classmethod
+    def at(cls, box_px: FloatArray) -> Self:
+        return cls(np.r_[_measured(box_px), 0.0, 0.0, 0.0], _P)
+
+    @property
+    def box_px(self) -> FloatArray:
+        x, y, area, ratio = self.mean[:4].tolist()
+        width = math.sqrt(max(area * ratio, 0.0))
+        half = 0.5 * np.array([width, area / width if width else 0.0])
+        middle = np.array([x, y])
+        return np.asarray(np.r_[middle - half, middle + half])
+
+    def predict(self) -> "_Belief":
+        mean = self.mean.copy()
+        # An area that would vanish stops to shrink: the root of a negative one is no box.
+        if mean[2] + mean[6] <= 0.0:
+            mean[6] = 0.0
+        return _Belief(_F @ mean, _F @ self.cov @ _F.T + _Q)
+
+    def update(self, z: FloatArray) -> "_Belief":
+        gain = np.linalg.solve(self.cov[:4, :4] + _R, self.cov[:4]).T
+        left = np.eye(7) - gain @ _H
+        cov = left @ self.cov @ left.T + gain @ _R @ gain.T
+        return _Belief(self.mean + gain @ (z - self.mean[:4]), cov)
+
+
+@dataclass(slots=True, eq=False)
+class _Track:
+    """One track with its observations."""
+
+    number: int
+    belief: _Belief
+    last_px: FloatArray
+    age: int = 0  # Images since it began
+    unseen: int = 0  # Images since its last box
+    streak: int = 0  # Images with a box, one after the other, the first one not counted
+    known: bool = False
+    # By age. The box that began the track is left out, as in the authors' code: a direction needs two more.
+    seen: dict[int, FloatArray] = field(default_factory=dict)
+    direction: FloatArray | None = None
+    # Belief at the first image without a box: from there a gap is replayed once its end is known.
+    frozen: _Belief | None = None
+
+    @classmethod
+    def at(cls, box_px: FloatArray, number: int) -> Self:
+        return cls(number, _Belief.at(box_px), box_px)
+
+    def predict(self) -> None:
+        if self.unseen:
+            self.streak = 0
+            self.frozen = self.frozen or self.belief
+        self.belief = self.belief.predict()
+        self.age += 1
+        self.unseen += 1
+
+    def observe(self, box_px: FloatArray, settings: OcSortSettings) -> None:
+        if self.seen:
+            self.direction = _direction(self._earlier(settings.delta_t), box_px)
+        if self.frozen is not None:
+            self.belief = self._replayed(self.frozen, box_px)
+        if self.frozen is None or settings.twice:
+            self.belief = self.belief.update(_measured(box_px))
+        self.frozen, self.unseen, self.last_px = None, 0, box_px
+        self.streak += 1
+        self.seen[self.age] = box_px
+        self.seen = {age: box for age, box in self.seen.items() if age >= self.age - settings.delta_t}
+
+    def consistency(self, boxes: FloatArray, delta_t: int) -> FloatArray:
+        r"""Return :math:`(\pi/2 - \Delta\theta) / \pi`, how well each box lies in the track's direction."""
+        if self.direction is None:
+            return np.zeros(len(boxes))
+        toward = _direction(self._earlier(delta_t), boxes)
+        return np.asarray(0.5 - np.arccos(np.clip(toward @ self.direction, -1.0, 1.0)) / np.pi)
+
+    def _earlier(self, delta_t: int) -> FloatArray:
+        """Box of `delta_t` images ago, else the first one after it."""
+        ages = sorted(self.seen)
+        return self.seen[next((age for age in ages if age >= self.age - delta_t), ages[-1])]
+
+    def _replayed(self, belief: _Belief, box_px: FloatArray) -> _Belief:
+        """Filter the gap again along the straight line from the last box to this one, in middle and size."""
+        first, last = _middle_and_size(self.last_px), _middle_and_size(box_px)
+        for step in range(1, self.unseen + 1):
+            belief = belief.update(_shape(first + (last - first) * step / self.unseen))
+            if step < self.unseen:
+                belief = belief.predict()
+        return belief
+
+
+def _measured(box_px: FloatArray) -> FloatArray:
+    return _shape(_middle_and_size(box_px))
+
+
+def _shape(middle_and_size: FloatArray) -> FloatArray:
+    x, y, width, height = middle_and_size.tolist()
+    return np.array([x, y, width * height, width / (height + _TINY)])
+
+
+def _middle_and_size(box_px: FloatArray) -> FloatArray:
+    corner, size = box_px[:2], box_px[2:] - box_px[:2]
+    return np.asarray(np.r_[corner + 0.5 * size, size])
+
+
+def _direction(start_px: FloatArray, end_px: FloatArray) -> FloatArray:
+    """Return the unit vectors (..., 2) from the middle of one box to those of others."""
+    apart = 0.5 * (end_px[..., :2] + end_px[..., 2:] - start_px[:2] - start_px[2:])
+    return np.asarray(apart / (np.linalg.norm(apart, axis=-1, keepdims=True) + _TINY))
+
+
+def _iou(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return intersection over union of every pair of boxes, shape (n, m)."""
+    low = np.maximum(first[:, None, :2], second[None, :, :2])
+    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
+    shared = np.prod(np.maximum(high - low, 0.0), axis=2)
+    area = [np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (first, second)]
+    return np.asarray(shared / np.maximum(area[0][:, None] + area[1][None] - shared, _TINY))
+
+
+def _matched(overlap: FloatArray, weight: FloatArray | float, least: float) -> list[tuple[int, int]]:
+    """Return the assignment of the largest sum of overlap and weight, without pairs that hardly overlap."""
+    from scipy.optimize import linear_sum_assignment  # Slow to import
+
+    rows, columns = linear_sum_assignment(overlap + weight, maximize=True)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlap[i, j] >= least]
