@@ -1,4 +1,4 @@
-"""Calibration of risk: reliability curve, ECE with its sampling floor, Brier score."""
+"""Calibration of risk: reliability curve, ECE with its sampling floor, Brier score and skill."""
 
 from dataclasses import dataclass
 
@@ -188,6 +188,23 @@ def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
     """
     predicted, labels = _checked_sample(risk, hazards)
     return float(np.mean((predicted - labels) ** 2))
+
+
+def brier_skill(risk: ArrayLike, hazards: ArrayLike) -> float | None:
+    r"""Return the share of a constant's Brier score that the risk saves, None where a label is missing.
+
+    .. math:: 1 - B / \bar y (1 - \bar y)
+
+    Examples
+    --------
+    >>> brier_skill([0.5, 0.5], [False, True]), brier_skill([0.5, 0.0], [False, True])
+    (0.0, -1.5)
+    """
+    # The constant is the true share of hazards, which nobody knows beforehand. Said in every window, it has an
+    # ECE of 0: calibration alone is no merit.
+    _, labels = _checked_sample(risk, hazards)
+    constant = float(labels.var())
+    return 1.0 - brier_score(risk, hazards) / constant if constant else None
 
 
 def _bin_index(predicted: FloatArray, bins: int) -> IndexArray:

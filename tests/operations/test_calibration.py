@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from sklearn.calibration import calibration_curve
 from sklearn.isotonic import IsotonicRegression
-from sklearn.metrics import brier_score_loss, roc_auc_score
+from sklearn.metrics import brier_score_loss, r2_score, roc_auc_score
 
 from worldstate.abduction.cueing.calibration_error import (
     brier_score,
+    brier_skill,
     calibration_error_floor,
     expected_calibration_error,
     reliability_curve,
@@ -74,6 +75,10 @@ def test_ece_and_brier_agree_with_other_roads(sample):
     by_hand = sum(abs(risk[edges == b].sum() - labels[edges == b].sum()) for b in range(10)) / risk.size
     assert expected_calibration_error(risk, labels) == pytest.approx(by_hand, abs=1e-12)
     assert brier_score(risk, labels) == pytest.approx(brier_score_loss(labels, risk), abs=1e-12)
+    # Skill is the coefficient of determination of the labels.
+    assert brier_skill(risk, labels) == pytest.approx(r2_score(labels, risk), abs=1e-12)
+    assert brier_skill(np.full(labels.size, labels.mean()), labels) == pytest.approx(0.0, abs=1e-12)
+    assert brier_skill(risk, labels * 0) is None
 
 
 def test_reliability_curve_agrees_with_scikit_learn():

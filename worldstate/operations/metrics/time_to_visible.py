@@ -1,0 +1,77 @@
+"""Errors of a stated time to visible, beside those of the best constant."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.ground.checks import check_shape
+from worldstate.ground.typing import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleErrors:
+    """Errors of stated times, and what the constants that fit these very truths best would reach.
+
+    Examples
+    --------
+    >>> stated = np.array([[0.5, 1.0, 1.5], [1.0, 2.0, 3.0], [2.0, 3.0, 4.0]])
+    >>> errors = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
+    >>> errors.count, round(errors.median_s, 2), round(errors.coverage, 2), round(errors.constant_median_s, 2)
+    (3, 0.5, 0.67, 0.7)
+    """
+
+    count: int  # Times that were stated and can be checked
+    median_s: float  # Of the absolute error of the best value
+    rmse_s: float
+    coverage: float  # Share of truths within the stated interval
+    width_s: float  # Mean width of the stated interval
+    # Fitted to the truths themselves, so that no constant known beforehand does better.
+    constant_median_s: float
+    constant_rmse_s: float
+    constant_width_s: float  # Of the shortest fixed interval with the same coverage
+
+
+def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
+    """Compare stated times to visible, low, best and high (n, 3), with the true seconds (n,).
+
+    Rows with a NaN are not stated, or never come into view, and are left out.
+
+    Examples
+    --------
+    >>> visible_errors(np.full((2, 3), np.nan), np.ones(2)).count
+    0
+    """
+    check_shape("stated", np.shape(stated), (len(true_s), 3))
+    known = np.isfinite(stated).all(axis=1) & np.isfinite(true_s)
+    if not known.any():
+        return VisibleErrors(0, *[math.nan] * 7)
+    low, best, high = stated[known].T
+    true = true_s[known]
+    inside = (low <= true) & (true <= high)
+    return VisibleErrors(
+        count=true.size,
+        # Of an even number the upper of the two middle errors, for which the shortest half is exact.
+        median_s=float(np.quantile(np.abs(best - true), 0.5, method="higher")),
+        rmse_s=float(np.sqrt(np.mean((best - true) ** 2))),
+        coverage=float(inside.mean()),
+        width_s=float(np.mean(high - low)),
+        constant_median_s=shortest_interval(true, true.size // 2 + 1) / 2.0,
+        constant_rmse_s=float(true.std()),
+        constant_width_s=shortest_interval(true, int(inside.sum())),
+    )
+
+
+def shortest_interval(values: FloatArray, count: int) -> float:
+    """Return the width of the shortest interval that holds `count` of the values.
+
+    Half the width of the shortest half is the least median absolute error of any constant, its middle.
+
+    Examples
+    --------
+    >>> shortest_interval(np.array([0.0, 4.0, 5.0, 9.0]), 3)
+    5.0
+    """
+    # P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984, in one dimension.
+    ordered = np.sort(values)
+    return float(np.min(ordered[count - 1 :] - ordered[: ordered.size - count + 1])) if count else 0.0
