@@ -217,8 +217,9 @@ def _match_hops(
         track[ours], error[ours] = estimates.track[theirs], cost[pairs[:, 0], pairs[:, 1]]
         last = {(hop, sources[i], names[j]) for i, j in pairs.tolist()}
         rest = estimates.azimuth_rad[np.delete(said, pairs[:, 1])]
-        beside = bearing_errors(truths.azimuth_rad[idle.get(hop, _NO_ROWS)], rest)
-        false += rest.size - len(gated_pairs(beside, beside <= gate, _MISS))
+        if rest.size:
+            beside = bearing_errors(truths.azimuth_rad[idle.get(hop, _NO_ROWS)], rest)
+            false += rest.size - len(gated_pairs(beside, beside <= gate, _MISS))
     return track, error, false
 
 
