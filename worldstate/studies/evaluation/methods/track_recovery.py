@@ -42,7 +42,7 @@ class OcSortRecovery:
 
     def _decide(self, trial: Trial) -> Decisions:
         images, time_s = Images.of(trial), trial.hops.time_s
-        held = [[one for one in tracks if self._holds(one)] for tracks in _moving_tracks(trial.boxes, images)]
+        held = [[one for one in tracks if self._holds(one)] for tracks in _moving_tracks(trial, images)]
         rows = [
             (hop, one.track, self._azimuth_rad(one), _area(one))
             for hop, image in enumerate(images.of_hop)
@@ -68,19 +68,20 @@ def _area(one: TrackedBox) -> float:
     return float(np.prod(one.box_px[2:] - one.box_px[:2]))
 
 
-def _moving_tracks(boxes: HopTable, images: Images) -> Iterator[list[TrackedBox]]:
+def _moving_tracks(trial: Trial, images: Images) -> Iterator[list[TrackedBox]]:
     """Yield the tracks of moving vehicles in every image."""
-    sort, moving = OcSort(), set[int]()
+    boxes, sort, moving = trial.boxes, OcSort(), set[int]()
+    # Parked vehicles are tracked as well and left out afterwards: given moving boxes alone, a parked car
+    # would begin a track in the first second, before it is known to stand, and coast into scored time.
     counted = np.flatnonzero(vehicles(boxes)) if len(boxes) else np.empty(0, np.intp)
-    for image in range(len(images.time_s)):
-        # Parked vehicles are tracked as well and left out afterwards: given moving boxes alone, a parked car
-        # would begin a track in the first second, before it is known to stand, and coast into scored time.
-        here = counted[boxes.frame[counted] == image] if len(counted) else counted
-        tracks = sort.step(boxes.box_px[here], boxes.score[here]) if len(here) else sort.step(*_NOTHING)
+    edges = np.searchsorted(boxes.frame[counted], np.arange(len(images.time_s) + 1))
+    for image, time_s in enumerate(images.time_s):
+        here = counted[edges[image] : edges[image + 1]]
+        # A piece of a long stream begins long after its first image.
+        tracks = (
+            sort.step(boxes.box_px[here], boxes.score[here]) if time_s > trial.hops.time_s[0] - 1.5 else []
+        )
         for one in tracks:
             if one.detection >= 0:
                 (moving.add if boxes.moving[here[one.detection]] else moving.discard)(one.track)
         yield [one for one in tracks if one.track in moving]
-
-
-_NOTHING = np.empty((0, 4)), np.empty(0)
