@@ -3,7 +3,13 @@
 import numpy as np
 
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.trial import BOX_COLUMNS, Decisions, Trial
+from worldstate.studies.evaluation.trial import (
+    BOX_COLUMNS,
+    TRACK_COLUMNS,
+    TRUTH_COLUMNS,
+    Decisions,
+    Trial,
+)
 
 
 def made_up(name, label="none", *, t0_s=5.0, hops=81, site="SA1", fingerprint="", in_view_rad=0.3, **about):
@@ -20,7 +26,12 @@ def made_up(name, label="none", *, t0_s=5.0, hops=81, site="SA1", fingerprint=""
     boxes = [
         (i, time_s[i], (0.0, 0.0, 1.0, 1.0), 1.0, "car", in_view_rad, True) for i in np.flatnonzero(seen)
     ]
-    return Trial(hops_table, boxes=HopTable.of_rows(BOX_COLUMNS, boxes))
+    truth = [(moment, 0, in_view_rad, there) for moment, there in zip(time_s, seen, strict=True)]
+    return Trial(
+        hops_table,
+        boxes=HopTable.of_rows(BOX_COLUMNS, boxes),
+        truth=HopTable.of_rows(TRUTH_COLUMNS, () if label == "none" else truth),
+    )
 
 
 def alarmed(trial, spans, **columns):
@@ -53,4 +64,11 @@ def random_answer(trial, rng):
         score=score,
         risk=score**2,
         visible_s=np.stack([best_s - 1.0, best_s, best_s + 1.0], axis=1),
+        tracks=tracked(trial, rng.random(n) < 0.8, rng.integers(0, 2, n), rng.normal(0.3, 0.2, n)),
     )
+
+
+def tracked(trial, there, names, azimuth_rad):
+    """At most one track a hop."""
+    rows = zip(trial.hops.time_s[there], names[there], azimuth_rad[there], strict=True)
+    return HopTable.of_rows(TRACK_COLUMNS, rows)

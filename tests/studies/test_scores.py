@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_trials import alarmed, made_up, random_answer, random_study
+from made_up_trials import alarmed, made_up, random_answer, random_study, tracked
 from scipy.stats import chi2
 from sklearn.metrics import brier_score_loss, roc_auc_score
 
@@ -18,8 +18,9 @@ from worldstate.abduction.cueing.calibration_error import (
 from worldstate.frontend.direction.gating import gating_curve
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.recording_draws import stratified_draws
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.evaluation.scores import Score, paired
-from worldstate.studies.evaluation.trial import Trial
+from worldstate.studies.evaluation.trial import TRUTH_COLUMNS, Trial
 
 
 def close(ours, theirs):
@@ -124,12 +125,72 @@ def test_figures_of_windows_are_those_of_other_formulas():
     assert figures["bearing_gated_deg"] == pytest.approx(np.degrees(gated))
 
 
-def test_the_floor_of_few_windows_stays_near_its_own():
+def test_a_track_that_is_late_and_changes_its_name():
+    # In view for ten hops, tracked 5 degrees off from the third on, under another name in the last two.
+    trial, calm = made_up("a", "left"), made_up("c")
+    seen = np.flatnonzero(np.isfinite(trial.hops.reference_rad))
+    there, names = np.zeros(81, bool), np.zeros(81, int)
+    there[seen[2:]], names[seen[-2:]] = True, 1
+    tracks = tracked(trial, there, names, np.full(81, 0.3 + np.radians(5.0)))
+    figures = Score.of([trial, calm], [[alarmed(trial, [], tracks=tracks), alarmed(calm, [])]]).figures()
+    expected = {
+        "id_switches_per_recording": 1.0,
+        "fragmentations_per_recording": 0.0,
+        "swap_rate_hz": 1.0,
+        "fragmentation_rate_hz": 1.0,
+        "track_latency_s": 0.2,
+        "azimuth_error_deg": 5.0,
+        "gospa_deg": (8 * 5.0 + 2 * 30.0) / 10,
+    }
+    assert {name: figures[name] for name in expected} == pytest.approx(expected)
+
+
+def test_a_bearing_without_a_track_counts_while_in_alarm():
+    trial, calm = made_up("a", "left"), made_up("c")
+    off = np.full(81, 0.3 - np.radians(10.0))
+    said = [alarmed(trial, [(5.7, 8.0)], bearing_rad=off), alarmed(calm, [])]
+    figures = Score.of([trial, calm], [said]).figures()
+    assert figures["gospa_deg"] == pytest.approx((4 * 10.0 + 6 * 30.0) / 10)
+    assert figures["bearing_deg"] == pytest.approx(10.0)
+    assert np.isnan(figures["track_latency_s"])
+
+
+def test_a_time_to_visible_stands_beside_the_best_constant():
+    trial, calm = made_up("a", "left"), made_up("c")
+    true_s = 5.0 - trial.hops.time_s
+    stated = np.stack([true_s, true_s + 0.5, true_s + 1.0], axis=1)
+    stated[:10, 0] += 0.2
+    figures = Score.of(
+        [trial, calm], [[alarmed(one, [], visible_s=stated) for one in (trial, calm)]]
+    ).figures()
+    before = true_s[true_s > -1e-6]
+    assert figures["visible_error_s"] == pytest.approx(0.5)
+    assert figures["visible_error_constant_s"] == pytest.approx(before.std())
+    assert figures["visible_coverage"] == pytest.approx(1 - 10 / len(before))
+
+
+@pytest.mark.parametrize("risk", [0.002, 0.01, 0.2, 0.5])
+def test_the_floor_of_few_windows_stays_near_its_own(risk):
     trials = [made_up("a", "left", t0_s=1.6), made_up("b", hops=9)]
-    rng = np.random.default_rng(5)
-    answers = [random_answer(trial, rng) for trial in trials]
-    floor = calibration_error_floor(windows(trials, answers, "risk")[0], rng, draws=4000)
-    assert Score.of(trials, [answers]).figures()["ece_floor"] == pytest.approx(floor, rel=0.25)
+    answers = [alarmed(one, [], risk=np.full(len(one.hops), risk)) for one in trials]
+    floor = calibration_error_floor(np.full(16, risk), np.random.default_rng(5), draws=40000)
+    assert Score.of(trials, [answers]).figures()["ece_floor"] == pytest.approx(floor, rel=0.2)
+
+
+def test_angles_wrap_and_a_fast_camera_changes_nothing():
+    trial, calm = made_up("a", "left", in_view_rad=np.pi - 0.05), made_up("c")
+    behind = np.full(81, -np.pi + 0.05)
+    tracks = tracked(trial, np.ones(81, bool), np.zeros(81, int), behind)
+    answers = [alarmed(trial, [], bearing_rad=behind, tracks=tracks), alarmed(calm, [])]
+    # Three images in each hop, and a vehicle in view before the first window.
+    time_s = np.round(np.arange(0.0, 9.0, 1 / 30), 6)
+    seen = (time_s < 0.5) | (time_s > 5.05) & (time_s < 6.05)
+    rows = zip(time_s, np.zeros(len(time_s)), np.full(len(time_s), np.pi - 0.05), seen, strict=True)
+    fast = replace(trial, truth=HopTable.of_rows(TRUTH_COLUMNS, rows))
+    for one in (trial, fast):
+        figures = Score.of([one, calm], [answers]).figures()
+        for name in ("bearing_deg", "azimuth_error_deg", "gospa_deg"):
+            assert figures[name] == pytest.approx(np.degrees(0.1)), name
 
 
 @settings(max_examples=15, deadline=None)
@@ -164,10 +225,22 @@ def test_a_mirrored_world_has_the_same_figures():
     trials, (answers,) = random_study(np.random.default_rng(4))
     other = {"left": "right", "right": "left", "none": "none"}
     mirrored = [
-        Trial(one.hops.replace(label=other[one.label], reference_rad=-one.hops.reference_rad), one.boxes)
+        Trial(
+            one.hops.replace(label=other[one.label], reference_rad=-one.hops.reference_rad),
+            one.boxes,
+            one.truth.replace(azimuth_rad=-one.truth.azimuth_rad),
+        )
         for one in trials
     ]
-    turned = [replace(said, side=-said.side, bearing_rad=-said.bearing_rad) for said in answers]
+    turned = [
+        replace(
+            said,
+            side=-said.side,
+            bearing_rad=-said.bearing_rad,
+            tracks=said.tracks.replace(azimuth_rad=-said.tracks.azimuth_rad),
+        )
+        for said in answers
+    ]
     ours = Score.of(trials, [answers]).figures()
     close(ours, Score.of(mirrored, [turned]).figures())
     # A method that does not see that the world is mirrored is right where it was wrong.
@@ -187,6 +260,7 @@ def test_identical_recordings_have_intervals_without_width():
 def test_a_method_is_as_good_as_itself():
     trials, passes = random_study(np.random.default_rng(6), seeds=2)
     score = Score.of(trials, passes)
+    assert all(np.isfinite(value) for value in score.figures().values())
     differences = paired(score, score, stratified_draws(score.strata, np.random.default_rng(0), 40))
     assert all(value == (0.0, 0.0, 0.0) for value in differences.values())
 

@@ -1,6 +1,6 @@
 """What decisions are worth: the figures of every method and protocol, with intervals over recordings."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -41,13 +41,21 @@ _RATIOS = {
     "false_alarms_per_hour": ("free_onsets", "free_hops", 1.0 / _HOURS),
     "advisory_share": ("free_alarm_hops", "free_hops", 1.0),
     "hazard_awareness": ("aware_hops", "clear_hops", 1.0),
+    "id_switches_per_recording": ("id_switches", "tracked", 1.0),
+    "fragmentations_per_recording": ("fragmentations", "tracked", 1.0),
+    "swap_rate_hz": ("swap_rate_hz", "tracked", 1.0),
+    "fragmentation_rate_hz": ("fragmentation_rate_hz", "tracked", 1.0),
+    "track_latency_s": ("track_latency_s", "tracked", 1.0),
+    "azimuth_error_deg": ("azimuth_error_rad", "matched", np.degrees(1.0)),
+    "gospa_deg": ("gospa_rad", "gospa_hops", np.degrees(1.0)),
+    "visible_coverage": ("visible_inside", "visible_hops", 1.0),
 }
 # What one recording adds; a count that it does not have is zero.
-_COUNTS = (
+COUNTS = (
     *dict.fromkeys(name for ratio in _RATIOS.values() for name in ratio[:2]),
     *("onsets_before", "window_s", "before_s"),
     *(f"windows_{horizon}" for horizon in reduction.HORIZONS_S),
-    "squared_error",
+    *("squared_error", "visible_squared", "visible_true", "visible_true_squared"),
 )
 _RISK, _RAW = 0, 1
 # Occluded is all that happens before T0, clear what happens after it.
@@ -96,8 +104,8 @@ class Score:
         Share of hazard windows found at evenly spaced shares of false positives.
     bins : ndarray, shape (S, 2, R, bins, 3)
         Windows, summed probability and summed variance of labels by probability: of the risk and the score.
-    bearings, visible : tuple of HopTable, length S
-        Bearing errors in view, and stated beside true times to visible.
+    bearings : tuple of HopTable, length S
+        Bearing errors in view beside the prominence of their peaks.
 
     Examples
     --------
@@ -119,7 +127,6 @@ class Score:
     roc: FloatArray
     bins: FloatArray
     bearings: tuple[HopTable, ...]
-    visible: tuple[HopTable, ...]
 
     @classmethod
     def of(cls, trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> "Score":
@@ -130,21 +137,15 @@ class Score:
             check_shape("decisions of a pass", (len(said),), (len(trials),))
             for trial, one in zip(trials, said, strict=True):
                 reduction.check_decisions(trial, one)
-        rows = [[_counts(trial, one) for trial, one in zip(trials, said, strict=True)] for said in passes]
-        for said, row in zip(passes, rows, strict=True):
-            # A method without sides has nothing of which a share could be right.
-            if any(one.side.any() for one in said):
-                for counts in row:
-                    counts["sided"] = counts["detected"]
+        rows = [_counts(trials, said) for said in passes]
         ranked = [_ranking(trials, said) for said in passes]
         return cls(
             recordings=tuple(map(Scored.of, trials)),
-            counts={name: np.array([[one[name] for one in row] for row in rows]) for name in _COUNTS},
+            counts={name: np.array([[one[name] for one in row] for row in rows]) for name in COUNTS},
             wins=np.array([wins for wins, _ in ranked]),
             roc=np.array([points for _, points in ranked]),
             bins=np.array([_bins(trials, said) for said in passes]),
-            bearings=tuple(_samples(reduction.bearing_samples, trials, said) for said in passes),
-            visible=tuple(_samples(reduction.visible_samples, trials, said) for said in passes),
+            bearings=tuple(_bearings(trials, said) for said in passes),
         )
 
     @property
@@ -230,12 +231,12 @@ class Score:
             "quantum_per_hour": ratio(np.ones_like(hours), hours),
             "random_detection": self._random_detection(weights, sums),
         }
-        figures |= self._areas(weights, sums) | self._calibration(weights, sums)
+        figures |= self._areas(weights) | self._calibration(weights, sums) | _visible_figures(sums)
         samples = [_bearing_figures(table, weights) for table in self.bearings]
         figures |= {name: np.array([one[name] for one in samples]) for name in samples[0]}
         return {name: known_mean(values) for name, values in figures.items()}
 
-    def _areas(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    def _areas(self, weights: FloatArray) -> dict[str, FloatArray]:
         r"""Return the areas under the ROC curve: :math:`w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)`."""
         high, low = weights[:, ~self._free], weights[:, self._free]
         areas = {}
@@ -296,27 +297,27 @@ def paired_on(
     return {name: (float(gain[0]), *middle(gain[1:])) for name, gain in gains.items()}
 
 
-def _counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    risk = reduction.scored_windows(trial, said, said.risk)
-    windows = {
-        f"windows_{name}": float(reduction.scored_windows(trial, said, said.score, horizon_s).size)
-        for name, horizon_s in reduction.HORIZONS_S.items()
-    }
-    return (
-        dict.fromkeys(_COUNTS, 0.0)
-        | reduction.alarm_counts(trial, said)
-        | reduction.awareness_counts(trial, said)
-        | windows
-        | {"squared_error": float(np.sum((risk - (not trial.hazard_free)) ** 2))}
-    )
+def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str, float]]:
+    """Return the counts of every recording; a method is not judged by what it never states."""
+    sides, tracks = any(one.side.any() for one in said), any(len(one.tracks) for one in said)
+    bearings = any(np.isfinite(one.bearing_rad).any() for one in said)
+    rows = []
+    for trial, one in zip(trials, said, strict=True):
+        row = dict.fromkeys(COUNTS, 0.0) | reduction.alarm_counts(trial, one)
+        row |= reduction.awareness_counts(trial, one) | reduction.window_counts(trial, one)
+        row |= reduction.visible_counts(trial, one)
+        row |= reduction.track_counts(trial, one) if tracks else {}
+        row |= reduction.gospa_counts(trial, one, tracks) if tracks or bearings else {}
+        rows.append(row | {"sided": row["detected"] * sides})
+    return rows
 
 
 def _ranking(trials: Sequence[Trial], said: Sequence[Decisions]) -> tuple[FloatArray, FloatArray]:
     """Return wins, shape (horizons, P, Q), and points of the ROC curve, shape (horizons, points)."""
     pairs = list(zip(trials, said, strict=True))
-    calm = [reduction.scored_windows(trial, one, one.score) for trial, one in pairs if trial.hazard_free]
+    calm = [reduction.scored_windows(trial, one.score) for trial, one in pairs if trial.hazard_free]
     near = [
-        [reduction.scored_windows(trial, one, one.score, h) for trial, one in pairs if not trial.hazard_free]
+        [reduction.scored_windows(trial, one.score, h) for trial, one in pairs if not trial.hazard_free]
         for h in reduction.HORIZONS_S.values()
     ]
     wins = np.array([rank_wins(some, calm) for some in near])
@@ -326,18 +327,28 @@ def _ranking(trials: Sequence[Trial], said: Sequence[Decisions]) -> tuple[FloatA
 def _bins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
     """Return probability bins of risk and score, shape (2, R, BINS, 3)."""
     pairs = list(zip(trials, said, strict=True))
-    risks = [reduction.scored_windows(trial, one, one.risk) for trial, one in pairs]
-    raw = [reduction.scored_windows(trial, one, one.score) for trial, one in pairs]
+    risks = [reduction.scored_windows(trial, one.risk) for trial, one in pairs]
+    raw = [reduction.scored_windows(trial, one.score) for trial, one in pairs]
     # Log odds and ratios are scores as well, but they are read as a probability by nobody.
     if any(((score < 0.0) | (score > 1.0)).any() for score in raw):
         raw = [np.zeros(0)] * len(raw)
     return np.array([[reduction.probability_bins(one) for one in some] for some in (risks, raw)])
 
 
-def _samples(
-    of: Callable[[Trial, Decisions, int], HopTable], trials: Sequence[Trial], said: Sequence[Decisions]
-) -> HopTable:
-    return joined(of(trial, one, row) for row, (trial, one) in enumerate(zip(trials, said, strict=True)))
+def _bearings(trials: Sequence[Trial], said: Sequence[Decisions]) -> HopTable:
+    pairs = enumerate(zip(trials, said, strict=True))
+    return joined(reduction.bearing_samples(trial, one, row) for row, (trial, one) in pairs)
+
+
+def _visible_figures(sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return the RMSE of the stated time to visible, and that of the constant that fits these truths best."""
+    hops = sums["visible_hops"]
+    spread = ratio(sums["visible_true_squared"], hops) - ratio(sums["visible_true"], hops) ** 2
+    return {
+        "visible_error_s": np.sqrt(ratio(sums["visible_squared"], hops)),
+        # The difference of two means may be -1e-16 where all truths are equal.
+        "visible_error_constant_s": np.sqrt(np.maximum(spread, 0.0)),
+    }
 
 
 def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatArray]:
