@@ -1,0 +1,130 @@
+"""Readers of roadside corpora, on small folders written in their published layouts."""
+
+import re
+from itertools import product
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.datasets.idmt_traffic import VEHICLES, idmt_traffic
+from worldstate.adapters.datasets.melaudis import CLIPS_A_FILE, KINDS, melaudis
+from worldstate.adapters.datasets.traffic_clips import BACKGROUND, CLIP_S, read_clip
+from worldstate.ground.errors import InputFileError
+
+CAR = "2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR"
+EMPTY = "2019-11-19-13-10_Langewiesener-Strasse_unknownKmh_10077440"
+IDMT_NAMES = [f"{CAR}_ME_CH12", f"{CAR}_SE_CH34", f"{EMPTY}_SE_CH34-BG", f"{EMPTY}_ME_CH12-BG"]
+PASSAGE = "2024-02-09_13-62-1.8-Fitzroy1_FF_1V-{}_L1_2Lanes_LR_stereo"
+
+
+def write_sound(path, seconds=CLIP_S, rate_hz=8000):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(len(path.name)).uniform(-0.1, 0.1, (round(seconds * rate_hz), 2))
+    soundfile.write(path, noise, rate_hz)
+
+
+def write_idmt(root, names=IDMT_NAMES, test=IDMT_NAMES[2:]):
+    (root / "annotation").mkdir(parents=True)
+    lists = {"idmt_traffic_all": names, "eusipco_2021_test": test}
+    lists["eusipco_2021_train"] = [name for name in names if name not in test]
+    for name, lines in lists.items():
+        (root / "annotation" / f"{name}.txt").write_text("".join(f"{line}.wav\n" for line in lines))
+    for name in names:
+        write_sound(root / "audio" / f"{name}.wav")
+    return root
+
+
+def write_melaudis(root):
+    for token in KINDS:
+        write_sound(root / "MELAUDIS_Vehicles" / "Final_Veh" / "Fit1" / f"{PASSAGE.format(token)}.wav")
+    write_sound(root / "MELAUDIS_BG" / "night.wav", seconds=61.0)
+    write_sound(root / "MELAUDIS_BG" / "2023-08-03_15-1-2.0-Swanston.wav", seconds=1.4)
+    return root
+
+
+def test_idmt_clips_carry_what_their_names_say(tmp_path):
+    clips = idmt_traffic(write_idmt(tmp_path))
+    labels = [clip.labels for clip in clips]
+    assert [one.kind for one in labels] == ["car", "car", BACKGROUND, BACKGROUND]
+    assert [one.microphone for one in labels] == ["mems", "studio", "studio", "mems"]
+    assert [one.split for one in labels] == ["train", "train", "test", "test"]
+    assert [one.site for one in labels[::2]] == ["Fraunhofer-IDMT", "Langewiesener-Strasse"]
+    # Both microphones heard one passage: a fold that parted them would test on what it learned.
+    assert labels[0].recording == labels[1].recording != labels[2].recording == labels[3].recording
+    samples, rate_hz = read_clip(clips[0])
+    assert samples.shape == (16_000, 2)
+    assert rate_hz == 8000.0
+
+
+def test_every_name_of_the_documented_form_is_read(tmp_path):
+    sites, limits = ("Schleusinger-Allee", "Hohenwarte", "Fraunhofer-IDMT"), ("30", "70", "unknown")
+    form = "2019-11-12-15-30_{}_{}Kmh_650690_A_W_{}{}_ME_CH12".format
+    wanted = {form(*one): one for one in product(sites, limits, VEHICLES, "LR")}
+    clips = idmt_traffic(write_idmt(tmp_path, list(wanted), list(wanted)[:9]))
+    assert len(clips) == len(wanted)
+    for clip in clips:
+        site, limit, vehicle, _ = wanted[clip.path.stem]
+        assert (clip.labels.kind, clip.labels.site) == (VEHICLES[vehicle], site)
+        assert clip.labels.recording.endswith(limit)
+
+
+@pytest.mark.parametrize(
+    ("lost", "named"),
+    [
+        ("annotation/eusipco_2021_test.txt", "annotation/eusipco_2021_test.txt"),
+        ("annotation/idmt_traffic_all.txt", "annotation/idmt_traffic_all.txt"),
+        (f"audio/{IDMT_NAMES[1]}.wav", IDMT_NAMES[1]),
+    ],
+)
+def test_a_partial_idmt_folder_is_refused_with_what_is_missing(tmp_path, lost, named):
+    (write_idmt(tmp_path) / lost).unlink()
+    with pytest.raises(InputFileError, match=re.escape(named)):
+        idmt_traffic(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["car_01", f"{CAR}_SE_CH34-BG", EMPTY + "_SE_CH34", "../../etc/passwd"])
+def test_a_name_that_is_no_label_is_refused(tmp_path, name):
+    (write_idmt(tmp_path) / "annotation" / "idmt_traffic_all.txt").write_text(f"{name}.wav\n")
+    if "/" not in name:
+        write_sound(tmp_path / "audio" / f"{name}.wav")
+    with pytest.raises(InputFileError, match=re.escape(name)):
+        idmt_traffic(tmp_path)
+
+
+def test_melaudis_keeps_one_vehicle_in_free_flow_and_no_vehicle(tmp_path):
+    folder = write_melaudis(tmp_path) / "MELAUDIS_Vehicles"
+    others = ["FF_2V-TruckCar_LR", "TJN_1V-Car_Idling", "FF_NoV_LR", "oddly named"]
+    for other in others:
+        write_sound(folder / f"2023-08-04_10-0-0.4-Swanston6_{other}_mono.wav")
+    clips = [clip for clip in melaudis(tmp_path) if clip.path.is_relative_to(folder)]
+    assert sorted(clip.labels.kind for clip in clips) == sorted([*KINDS.values(), BACKGROUND])
+    assert {clip.labels.recording for clip in clips} == {"2024-02-09_Fitzroy1", "2023-08-04_Swanston6"}
+
+
+def test_melaudis_background_is_cut_into_clips_that_lie_within_it(tmp_path):
+    clips = [clip for clip in melaudis(write_melaudis(tmp_path)) if "MELAUDIS_BG" in clip.path.parts]
+    night = [clip for clip in clips if clip.path.name == "night.wav"]
+    assert len(night) == CLIPS_A_FILE
+    assert {len(read_clip(clip)[0]) for clip in night} == {16_000}
+    starts = np.array([clip.start_s for clip in night])
+    assert np.diff(starts).min() >= CLIP_S, "clips of one recording do not overlap"
+    (short,) = set(clips) - set(night)
+    assert len(read_clip(short)[0]) == 11_200
+    assert short.labels.recording == "2023-08-03"
+
+
+@pytest.mark.parametrize("lost", ["MELAUDIS_Vehicles", "MELAUDIS_BG"])
+def test_a_partial_melaudis_folder_is_refused_with_what_is_missing(tmp_path, lost):
+    write_melaudis(tmp_path)
+    (tmp_path / lost).rename(tmp_path / "elsewhere")
+    with pytest.raises(InputFileError, match=rf"missing: {lost}"):
+        melaudis(tmp_path)
+
+
+def test_vehicles_with_other_names_are_refused(tmp_path):
+    write_melaudis(tmp_path)
+    (tmp_path / "MELAUDIS_Vehicles" / "Final_Veh").rename(tmp_path / "elsewhere")
+    write_sound(tmp_path / "MELAUDIS_Vehicles" / "car_01.wav")
+    with pytest.raises(InputFileError, match=r"car_01\.wav"):
+        melaudis(tmp_path)
