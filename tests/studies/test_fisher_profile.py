@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import ttest_ind
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.studies.paper.fisher_profile import (
+from worldstate.studies.signatures.fisher_profile import (
     discriminative_range_hz,
     fisher_profile,
     level_invariant_shape,

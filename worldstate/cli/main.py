@@ -28,6 +28,7 @@ COMMANDS = (
     "users.measure_absence",
     "studies.evaluate_degradation",
     "studies.evaluate_features",
+    "studies.evaluate_signatures",
     "users.extract_features",
     "studies.twin",
     "studies.ablations",

@@ -3,7 +3,7 @@ from .degradation.degradation_sweep import degradation_sweep as degradation_swee
 from .features.comparison import comparison as comparison
 from .paper.ablations import AblationSwitches as AblationSwitches
 from .paper.ablations import evaluate_ablation as evaluate_ablation
-from .paper.fisher_profile import fisher_profile as fisher_profile
 from .paper.identifiability import reach_of_array as reach_of_array
 from .paper.identifiability import reach_on_data as reach_on_data
+from .signatures.fisher_profile import fisher_profile as fisher_profile
 from .streets.realism import realism_over_seeds as realism_over_seeds

@@ -26,8 +26,8 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
-    from worldstate.studies.paper.fisher_profile import BandProfile
     from worldstate.studies.paper.identifiability import ReachOfArray, ReachOnData
+    from worldstate.studies.signatures.fisher_profile import BandProfile
 
 # Both ways to endfire of an array across the vehicle, where the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
@@ -108,7 +108,7 @@ def _bands(arguments: argparse.Namespace) -> "BandProfile | None":
 
     from worldstate.adapters.datasets.feature_extraction import read_windows
     from worldstate.adapters.datasets.sample_windows import sample_windows
-    from worldstate.studies.paper.fisher_profile import band_profile
+    from worldstate.studies.signatures.fisher_profile import band_profile
 
     windows = sample_windows(arguments.recordings)[0]
     vehicle = np.array([window.label != "none" for window in windows], dtype=bool)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldstate.operations.figure_style import figure_file, legend_beside
+from worldstate.studies.signatures.fisher_profile import BandProfile
 
-from .fisher_profile import BandProfile
 from .identifiability import ReachOfArray, ReachOnData
 
 if TYPE_CHECKING:

@@ -39,7 +39,11 @@ def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArr
         rows.append(meter.push(samples))
     if edges_hz is None:
         raise InvalidArgumentError("windows: expected at least two with a vehicle and two without")
-    energy = np.array(rows)
+    return profile_of(np.array(rows), vehicle, edges_hz)
+
+
+def profile_of(energy: FloatArray, vehicle: BoolArray, edges_hz: FloatArray) -> BandProfile:
+    """Compare log-energies (n, B) with a vehicle and without one."""
     shape = level_invariant_shape(energy)
     by_level, by_shape = (fisher_profile(one[vehicle], one[~vehicle]) for one in (energy, shape))
     return BandProfile(edges_hz, by_level, by_shape, discriminative_range_hz(by_shape, edges_hz))
