@@ -10,9 +10,6 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 
-# One share of false positives each; finer ones than a hundredth are not drawn.
-ROC_POINTS = 101
-
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
     r"""Return the area under the ROC curve, None where a label is missing altogether.
@@ -104,15 +101,3 @@ def rank_wins(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) 
         # Halves are exact in binary, so differences of the running sum are.
         wins[:, q] = np.diff(np.concatenate([[0.0], np.cumsum(below)])[ends])
     return wins
-
-
-def roc_points(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> FloatArray:
-    """Return the share of positives found at evenly spaced shares of false positives, shape (ROC_POINTS,)."""
-    high, low = (np.sort(np.concatenate([np.zeros(0), *some])) for some in (positives, negatives))
-    if not (high.size and low.size):
-        return np.full(ROC_POINTS, np.nan)
-    steps = np.unique(np.concatenate([high, low]))[::-1]
-    found, false = (1.0 - np.searchsorted(some, steps) / some.size for some in (high, low))
-    grid = np.linspace(0.0, 1.0, ROC_POINTS)
-    curve = np.interp(grid, np.concatenate([[0.0], false]), np.concatenate([[0.0], found]))
-    return np.asarray(curve, np.float64)

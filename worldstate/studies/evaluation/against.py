@@ -57,19 +57,24 @@ _PLAIN = tuple(one.name for one in fields(Score) if one.name not in ("recordings
 
 
 def save_scores(
-    folder: Path, scores: Mapping[tuple[str, str], Score], settings: Mapping[str, Any]
+    folder: Path, scores: Mapping[str, Mapping[str, Score]], settings: Mapping[str, Any]
 ) -> list[Path]:
-    """Write every score, by protocol and method, in place of those of an earlier evaluation.
+    """Write every score, by protocol and by method, in place of those of an earlier evaluation.
 
     `settings`, ready for JSON, is what a comparison refuses to differ in.
     """
     into = folder / FOLDER
     into.mkdir(parents=True, exist_ok=True)
-    names = [
-        f"{i:03d}-{re.sub('[^A-Za-z0-9.]+', '-', '-'.join(key))[:80]}.npz" for i, key in enumerate(scores)
+    every = [
+        SavedScore(protocol, method, settings, score)
+        for protocol, methods in scores.items()
+        for method, score in methods.items()
     ]
-    for name, ((protocol, method), score) in zip(names, scores.items(), strict=True):
-        save_npz(into / name, _arrays(SavedScore(protocol, method, settings, score)))
+    names = [
+        f"{i:03d}-{_file_part(one.protocol)}-{_file_part(one.method)}.npz" for i, one in enumerate(every)
+    ]
+    for name, one in zip(names, every, strict=True):
+        save_npz(into / name, _arrays(one))
     # A method that is no longer asked must not be compared as if it were.
     for stale in set(into.glob("*.npz")) - {into / name for name in names}:
         stale.unlink()
@@ -149,6 +154,10 @@ def _nothing_shared(pairs: list[tuple[Score, Score]]) -> str:
         return f"expected shared recordings, but {_some(map('/'.join, same))} differ in their content"
     told = (_some(map("/".join, sorted(names))) for names in (ours, other))
     return "expected shared recordings, but one has {} and the other {}".format(*told)
+
+
+def _file_part(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9.]+", "-", name)[:60]
 
 
 def _some(names: Iterable[str]) -> str:

@@ -6,13 +6,13 @@ from typing import Literal
 
 import numpy as np
 
-from worldstate.abduction.cueing.calibration_error import BINS, ReliabilityCurve
+from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.alarm_rate import poisson_interval, random_detection
 from worldstate.operations.metrics.recording_draws import middle, worst_group
-from worldstate.operations.metrics.roc import rank_wins, roc_points
+from worldstate.operations.metrics.roc import rank_wins
 from worldstate.operations.metrics.weighted_figures import (
     draw_weights,
     highest_share,
@@ -88,7 +88,7 @@ class Scored:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """What one method scored under one protocol, once for every seed.
+    """What one method scored under one protocol, once for every seed that changes its answers.
 
     S seeds, R recordings of which P are approaches and Q hazard-free.
 
@@ -100,8 +100,6 @@ class Score:
         Sums over the hops of each recording.
     wins : ndarray, shape (S, horizons, P, Q)
         How often windows of an approach score above those of a hazard-free recording.
-    roc : ndarray, shape (S, horizons, points)
-        Share of hazard windows found at evenly spaced shares of false positives.
     bins : ndarray, shape (S, 2, R, bins, 3)
         Windows, summed probability and summed variance of labels by probability: of the risk and the score.
     bearings : tuple of HopTable, length S
@@ -124,7 +122,6 @@ class Score:
     recordings: tuple[Scored, ...]
     counts: Mapping[str, FloatArray]
     wins: FloatArray
-    roc: FloatArray
     bins: FloatArray
     bearings: tuple[HopTable, ...]
 
@@ -137,13 +134,14 @@ class Score:
             check_shape("decisions of a pass", (len(said),), (len(trials),))
             for trial, one in zip(trials, said, strict=True):
                 reduction.check_decisions(trial, one)
+        # What no seed changes is scored once: a fixed chain hands out the very same answers.
+        if all(one is first for said in passes for one, first in zip(said, passes[0], strict=True)):
+            passes = passes[:1]
         rows = [_counts(trials, said) for said in passes]
-        ranked = [_ranking(trials, said) for said in passes]
         return cls(
             recordings=tuple(map(Scored.of, trials)),
             counts={name: np.array([[one[name] for one in row] for row in rows]) for name in COUNTS},
-            wins=np.array([wins for wins, _ in ranked]),
-            roc=np.array([points for _, points in ranked]),
+            wins=np.array([_wins(trials, said) for said in passes]),
             bins=np.array([_bins(trials, said) for said in passes]),
             bearings=tuple(_bearings(trials, said) for said in passes),
         )
@@ -199,19 +197,6 @@ class Score:
             "occluded": {name: value for name, value in figures.items() if name not in _CLEAR},
             "vision-degraded": self.figures(degraded),
         }
-
-    def roc_curve(self, horizon: str) -> tuple[FloatArray, FloatArray]:
-        """Return shares of false and of true positives, mean over seeds, for "all", "2s" or "1s"."""
-        found = self.roc[:, list(reduction.HORIZONS_S).index(horizon)].mean(axis=0)
-        return np.linspace(0.0, 1.0, found.size), found
-
-    def reliability(self, raw: bool = False) -> ReliabilityCurve:
-        """Return the curve of the risk, or of the score read as a probability, all seeds together."""
-        windows, risk, _ = np.moveaxis(self.bins[:, _RAW if raw else _RISK].sum(axis=0), -1, 0)
-        hazards, counts = windows[~self._free].sum(axis=0), windows.sum(axis=0)
-        kept = counts > 0.0
-        mean_risk = risk.sum(axis=0)[kept] / counts[kept]
-        return ReliabilityCurve(mean_risk, hazards[kept] / counts[kept], counts[kept].astype(np.intp))
 
     @property
     def _free(self) -> BoolArray:
@@ -312,16 +297,14 @@ def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str
     return rows
 
 
-def _ranking(trials: Sequence[Trial], said: Sequence[Decisions]) -> tuple[FloatArray, FloatArray]:
-    """Return wins, shape (horizons, P, Q), and points of the ROC curve, shape (horizons, points)."""
+def _wins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
+    """Return how often windows of approaches outrank hazard-free ones, shape (horizons, P, Q)."""
     pairs = list(zip(trials, said, strict=True))
     calm = [reduction.scored_windows(trial, one.score) for trial, one in pairs if trial.hazard_free]
-    near = [
-        [reduction.scored_windows(trial, one.score, h) for trial, one in pairs if not trial.hazard_free]
-        for h in reduction.HORIZONS_S.values()
-    ]
-    wins = np.array([rank_wins(some, calm) for some in near])
-    return wins, np.array([roc_points(some, calm) for some in near])
+    near = [(trial, one.score) for trial, one in pairs if not trial.hazard_free]
+    horizons_s = reduction.HORIZONS_S.values()
+    hazards = [[reduction.scored_windows(trial, score, h) for trial, score in near] for h in horizons_s]
+    return np.array([rank_wins(some, calm) for some in hazards])
 
 
 def _bins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
