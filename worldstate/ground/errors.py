@@ -58,6 +58,10 @@ class InputFileError(WorldstateError):
         self.path = path
         self.problem = problem
 
+    def __reduce__(self) -> tuple[type, tuple[object, str]]:
+        # Pickle would call the class with the one text that it made, and break the pool of processes.
+        return type(self), (self.path, self.problem)
+
 
 class SchemaVersionError(InputFileError):
     """A file was written by another major version of its schema.
@@ -87,3 +91,6 @@ class MissingExtraError(WorldstateError):
         super().__init__(f"{package} is not installed: pip install 'worldstate[{extra}]'")
         self.package = package
         self.extra = extra
+
+    def __reduce__(self) -> tuple[type, tuple[str, str]]:
+        return type(self), (self.package, self.extra)

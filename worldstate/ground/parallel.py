@@ -28,12 +28,14 @@ def in_processes(
     [2, 1]
     """
     # Processes are spawned, not forked: threads of a numerical library do not survive a fork.
+    # Not joblib's (1.6): it ends its workers with SIGKILL where an error or a signal ends the loop, so that
+    # half-written files stay, and the workers of a parent that was terminated went on for five minutes.
     if jobs == 1 or len(items) <= 1:
         yield from map(work, items)
         return
     context = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(min(jobs, len(items)), context, signal.signal, _ON_TERMINATION) as pool:
+    with ProcessPoolExecutor(min(jobs, len(items)), context, _begin) as pool:
         try:
             with _without_interrupts():
                 waiting = deque(pool.submit(_work_or_leave, work, item) for item in items)
@@ -48,11 +50,23 @@ def in_processes(
             raise
 
 
+def _begin() -> None:
+    """Let a worker end on SIGTERM, unfinished files removed, and when the process that started it is gone."""
+    # In this order: a signal in the middle of `start` would print a traceback.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGTERM, _terminate)
+
+
 def _terminate(number: int, frame: object) -> None:
     raise SystemExit(128 + number)
 
 
-_ON_TERMINATION = (signal.SIGTERM, _terminate)
+def _end_with_parent() -> None:
+    # After a SIGKILL nobody tells the workers: they would wait for work until the machine is switched off.
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _work_or_leave(work: Callable[[Item], Result], item: Item) -> Result:

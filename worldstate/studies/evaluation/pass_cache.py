@@ -69,7 +69,7 @@ def _known(path: Path) -> dict[str, str]:
 
 
 def _stamp(path: Path) -> str:
-    # Taken before the file is read: one that changes meanwhile has another stamp next time, and is read again.
+    # Taken before the file is read: one that changes meanwhile has another stamp, and is read again.
     state = path.stat()
     return f"{path.name} {state.st_size} {state.st_mtime_ns}"
 

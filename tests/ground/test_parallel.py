@@ -1,0 +1,71 @@
+"""Work over processes: in order, with errors as they were raised, and nobody left behind."""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from worldstate.adapters.files.model_file import read_model
+from worldstate.ground.errors import InputFileError, MissingExtraError, SchemaVersionError, WorldstateError
+from worldstate.ground.parallel import in_processes
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_results_come_in_the_order_of_the_items(jobs):
+    items = [-3, 1, 0, -2, 5]
+    assert list(in_processes(abs, items, jobs)) == [3, 1, 0, 2, 5]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_the_work_arrives_as_it_was_raised(jobs):
+    with pytest.raises(InputFileError, match=r"^missing\.json: ") as caught:
+        list(in_processes(read_model, ["missing.json"] * 2, jobs))
+    assert caught.value.path == "missing.json"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [InputFileError("a.wav", "bad"), SchemaVersionError("a", "old"), MissingExtraError("cv2", "vision")],
+)
+def test_an_error_may_be_sent_to_another_process(error):
+    sent = pickle.loads(pickle.dumps(error))
+    assert (type(sent), str(sent), vars(sent)) == (type(error), str(error), vars(error))
+
+
+def test_the_end_of_a_worker_is_an_error():
+    with pytest.raises(WorldstateError, match="ended before its work was done"):
+        list(in_processes(os._exit, [1, 1], 2))
+
+
+SLEEPERS = """
+import time
+from worldstate.ground.parallel import in_processes
+for _ in in_processes(time.sleep, [0.0, 0.0, 60.0, 60.0], 2): print("one", flush=True)
+"""
+
+
+def alive(session):
+    """Return how many processes of a session still run."""
+    listed = subprocess.run(["ps", "-o", "pid=", "--sid", str(session)], capture_output=True, check=False)
+    return len(listed.stdout.split())
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_worker_outlives_the_process_that_started_it(number):
+    command = [sys.executable, "-c", SLEEPERS]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as run:
+        run.stdout.readline()
+        run.stdout.readline()
+        assert alive(run.pid) >= 3
+        run.send_signal(number)
+        assert run.wait(timeout=20.0) != 0
+        deadline = time.monotonic() + 20.0
+        while alive(run.pid) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert alive(run.pid) == 0
