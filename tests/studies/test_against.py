@@ -35,7 +35,7 @@ def test_a_file_gives_the_figures_and_draws_of_the_run(tmp_path, silent):
     if silent:
         score = Score.of(trials, [[alarmed(one, []) for one in trials]])
     (saved,) = load_scores(evaluated(tmp_path / "a", score)).values()
-    draws = stratified_draws(score.strata, np.random.default_rng(0), 30)
+    draws = stratified_draws(score.draw_strata, np.random.default_rng(0), 30)
     # To the last bit: nothing is rounded on the way.
     assert_equal(saved.score.draws(draws), score.draws(draws))
     assert_equal(saved.score.intervals(draws), score.intervals(draws))
@@ -65,7 +65,7 @@ def test_a_comparison_is_the_paired_one_on_the_shared_recordings(tmp_path):
     rows = [i for i in range(15) if i not in (4, 5, 6)]
     few = [trials[i] for i in rows]
     a, b = (Score.of(few, [[answers[i] for i in rows] for answers in some]) for some in (passes, others))
-    expected = paired(a, b, stratified_draws(a.strata, np.random.default_rng(5), 60))
+    expected = paired(a, b, stratified_draws(a.draw_strata, np.random.default_rng(5), 60))
     for name, values in expected.items():
         np.testing.assert_allclose(said.differences[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
 

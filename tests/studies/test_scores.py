@@ -254,7 +254,7 @@ def test_identical_recordings_have_intervals_without_width():
     rng = np.random.default_rng(0)
     answers = [random_answer(near, rng), random_answer(calm, rng)]
     score = Score.of([near] * 5 + [calm] * 5, [[answers[0]] * 5 + [answers[1]] * 5])
-    figures, intervals = score.figures(), score.intervals(stratified_draws(score.strata, rng, 50))
+    figures, intervals = score.figures(), score.intervals(stratified_draws(score.draw_strata, rng, 50))
     del intervals["false_alarms_per_hour_poisson"]
     close({name: (value, value) for name, value in figures.items()}, intervals)
 
@@ -263,7 +263,7 @@ def test_a_method_is_as_good_as_itself():
     trials, passes = random_study(np.random.default_rng(6), seeds=2)
     score = Score.of(trials, passes)
     assert all(np.isfinite(value) for value in score.figures().values())
-    differences = paired(score, score, stratified_draws(score.strata, np.random.default_rng(0), 40))
+    differences = paired(score, score, stratified_draws(score.draw_strata, np.random.default_rng(0), 40))
     assert all(value == (0.0, 0.0, 0.0) for value in differences.values())
 
 
@@ -283,7 +283,7 @@ def test_intervals_hold_the_truth_in_most_experiments():
     held, held_difference = 0, 0
     for _ in range(50):
         a, b = (Score.of(trials, [detector(trials, rate, rng)]) for rate in (0.7, 0.5))
-        draws = stratified_draws(a.strata, rng, 120)
+        draws = stratified_draws(a.draw_strata, rng, 120)
         low, high = a.intervals(draws)["detection"]
         held += low <= 0.7 <= high
         _, low, high = paired(a, b, draws)["detection"]
@@ -299,7 +299,7 @@ def test_false_alarms_have_their_exact_interval():
     figures = score.figures()
     count, hours = round(figures["false_onsets"]), figures["hazard_free_hours"]
     expected = (chi2.ppf(0.025, 2 * count) / 2 / hours, chi2.ppf(0.975, 2 * count + 2) / 2 / hours)
-    low_high = score.intervals(stratified_draws(score.strata, np.random.default_rng(0), 5))
+    low_high = score.intervals(stratified_draws(score.draw_strata, np.random.default_rng(0), 5))
     assert low_high["false_alarms_per_hour_poisson"] == pytest.approx(expected)
 
 
@@ -316,7 +316,7 @@ def test_sites_stand_beside_the_worst_of_them():
 def test_strata_keep_the_degraded_recordings_apart():
     clean, dirty = made_up("a", "left"), made_up("b", "left", degraded=True)
     answers = [alarmed(clean, [(4.0, 4.2)]), alarmed(dirty, [])]
-    strata = Score.of([clean, dirty], [answers]).strata_figures()
+    strata = Score.of([clean, dirty], [answers]).strata()
     assert strata["occluded"]["detection"] == 0.5
     assert strata["vision-degraded"]["detection"] == 0.0
     assert strata["clear"]["hazard_awareness"] == 1.0
@@ -355,7 +355,7 @@ def test_one_kind_of_recordings_alone_has_the_figures_of_its_kind(label):
     assert np.isnan(figures["auroc_all"]) and np.isnan(figures["brier_skill"])
     assert np.isnan(figures["false_alarms_per_hour"]) == (label == "left")
     assert np.isnan(figures["detection"]) == (label == "none")
-    score.intervals(stratified_draws(score.strata, rng, 5))
+    score.intervals(stratified_draws(score.draw_strata, rng, 5))
 
 
 def test_answers_that_do_not_fit_are_refused():

@@ -63,6 +63,7 @@ def save_scores(
 
     `settings`, ready for JSON, is what a comparison refuses to differ in.
     """
+    # In a folder of its own, in which whatever is no score of this evaluation may be removed.
     into = folder / FOLDER
     into.mkdir(parents=True, exist_ok=True)
     every = [
@@ -115,7 +116,8 @@ def compare(ours: Path, other: Path, rng: np.random.Generator, draws: int = DRAW
 
 def _compare(a: SavedScore, b: SavedScore, rng: np.random.Generator, draws: int) -> Comparison:
     rows, others = _shared_rows(a.score, b.score)
-    strata = [a.score.strata[row] for row in rows]
+    # Strata of the shared recordings alone: a stratum that lost some is drawn at the size that is left.
+    strata = [a.score.draw_strata[row] for row in rows]
     samples = stratified_draws(strata, rng, draws)
     return Comparison(
         protocol=a.protocol,
@@ -129,6 +131,7 @@ def _compare(a: SavedScore, b: SavedScore, rng: np.random.Generator, draws: int)
 
 def _shared_rows(a: Score, b: Score) -> tuple[IndexArray, IndexArray]:
     """Return the rows of the recordings that both have, in the order of the first."""
+    # A recording that was cut or edited since keeps its name: its content has to be the same as well.
     place = {(one.site, one.name, one.fingerprint): row for row, one in enumerate(b.recordings)}
     keys = [(one.site, one.name, one.fingerprint) for one in a.recordings]
     pairs = [(row, place[key]) for row, key in enumerate(keys) if key in place]

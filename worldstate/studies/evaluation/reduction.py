@@ -20,6 +20,7 @@ from .trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 
 # Stamps are whole nanoseconds and T0 is a camera frame: a lead is exact to this many digits of a second.
 _DIGITS = 6
+# The paper's, before line-of-sight entry.
 HORIZONS_S = {"all": np.inf, "2s": 2.0, "1s": 1.0}
 BEARING_COLUMNS = ("recording", "error_rad", "prominence")
 _SIDES = {"left": LEFT, "right": RIGHT}
@@ -37,6 +38,7 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
         return {name: float(count) for name, count in spent.items()}
     t0_s = in_range(f"{trial.name}: line-of-sight entry", trial.t0_s, -np.inf, np.inf)
     lead_s = np.round(t0_s - said.time_s, _DIGITS)
+    # Relative to T0, so that the difference is not rounded a second time.
     outcome = detection((-lead_s[onsets]).tolist(), 0.0)
     first = onsets[lead_s[onsets] == outcome.lead_time_s]
     named = int(said.side[first[0]]) if outcome.detected else NO_SIDE
@@ -56,6 +58,7 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
 def awareness_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     """Count hops after T0 with a vehicle in view, and those with an alarm or any moving box."""
     clear = in_view(trial, said)
+    # Any moving box: which vehicle a box shows is known of no real recording.
     seen = np.zeros(len(said.time_s), bool)
     at = hop_of(trial.boxes.time_s, said.time_s)
     seen[at[(at >= 0) & np.asarray(trial.boxes.moving, bool)]] = True

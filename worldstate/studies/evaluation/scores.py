@@ -31,7 +31,8 @@ from .trial import Decisions, Trial
 Interval = tuple[float, float]
 
 _HOURS = HOP_S / SECONDS_PER_HOUR
-# Figure: numerator, denominator and unit of a ratio of sums over recordings; see `reduction`.
+# Figure: numerator, denominator and unit of a ratio of sums over recordings; see `reduction`. A mean of the
+# rates of single recordings would let one of ten seconds weigh as much as a stream of an hour.
 _RATIOS = {
     "detection": ("detected", "approaches", 1.0),
     "lead_s": ("lead_s", "detected", 1.0),
@@ -41,6 +42,7 @@ _RATIOS = {
     "false_alarms_per_hour": ("free_onsets", "free_hops", 1.0 / _HOURS),
     "advisory_share": ("free_alarm_hops", "free_hops", 1.0),
     "hazard_awareness": ("aware_hops", "clear_hops", 1.0),
+    # The challenge's means are of recordings, so here each recording with a vehicle in view counts once.
     "id_switches_per_recording": ("id_switches", "tracked", 1.0),
     "fragmentations_per_recording": ("fragmentations", "tracked", 1.0),
     "swap_rate_hz": ("swap_rate_hz", "tracked", 1.0),
@@ -58,8 +60,12 @@ COUNTS = (
     *("squared_error", "visible_squared", "visible_true", "visible_true_squared"),
 )
 _RISK, _RAW = 0, 1
-# Occluded is all that happens before T0, clear what happens after it.
-_CLEAR = ("hazard_awareness", "bearing_deg", "bearing_gated_deg")
+# Measured after T0 with a vehicle in view; the other figures are of the time before it or without any.
+_CLEAR = (
+    *("hazard_awareness", "bearing_deg", "bearing_gated_deg", "gospa_deg", "azimuth_error_deg"),
+    *("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz"),
+    *("fragmentation_rate_hz", "track_latency_s"),
+)
 # Whether the greater or the smaller value is the worse one, where junctions are compared.
 _WORSE: dict[str, Literal["low", "high"]] = {
     "detection": "low",
@@ -70,7 +76,7 @@ _WORSE: dict[str, Literal["low", "high"]] = {
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """Which recording one row stands for."""
+    """Which recording one row stands for; what two evaluations compare to find the ones they share."""
 
     name: str
     label: str
@@ -147,7 +153,7 @@ class Score:
         )
 
     @property
-    def strata(self) -> list[tuple[str, str]]:
+    def draw_strata(self) -> list[tuple[str, str]]:
         """Label and site of every recording: what `stratified_draws` keeps the numbers of."""
         return [(one.label, one.site) for one in self.recordings]
 
@@ -188,15 +194,15 @@ class Score:
             for name, worse in _WORSE.items()
         }
 
-    def strata_figures(self) -> dict[str, dict[str, float]]:
+    def strata(self) -> dict[str, dict[str, float]]:
         """Return the figures before T0, after it in view, and of recordings with degraded images."""
         figures = self.figures()
         degraded = np.array([row for row, one in enumerate(self.recordings) if one.degraded], np.intp)
-        return {
+        strata = {
             "clear": {name: figures[name] for name in _CLEAR},
             "occluded": {name: value for name, value in figures.items() if name not in _CLEAR},
-            "vision-degraded": self.figures(degraded),
         }
+        return strata | ({"vision-degraded": self.figures(degraded)} if degraded.size else {})
 
     @property
     def _free(self) -> BoolArray:
@@ -223,6 +229,7 @@ class Score:
 
     def _areas(self, weights: FloatArray) -> dict[str, FloatArray]:
         r"""Return the areas under the ROC curve: :math:`w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)`."""
+        # Between recordings wins are counted once; a draw then weighs them instead of ranking its windows.
         high, low = weights[:, ~self._free], weights[:, self._free]
         areas = {}
         for i, horizon in enumerate(reduction.HORIZONS_S):
@@ -278,6 +285,7 @@ def paired_on(
     """Compare two scores on the recordings in these rows of each; draws (D, n) are of places in the rows."""
     every = np.vstack([np.arange(len(ours_rows)), draws])
     a, b = ours.draws(ours_rows[every]), other.draws(other_rows[every])
+    # Both stumble over the same hard recordings: on the same draws those cancel, apart they would not.
     gains = {name: a[name] - b[name] for name in a}
     return {name: (float(gain[0]), *middle(gain[1:])) for name, gain in gains.items()}
 
@@ -337,6 +345,7 @@ def _visible_figures(sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
 def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatArray]:
     """Return the median error of all bearings and of the most prominent ones, shape (D,) each."""
     times = weights[:, samples.recording.astype(np.intp)]
+    # The threshold of prominence is that of each draw, as it would be set on those recordings.
     gated = times * highest_share(samples.prominence, times, PUBLISHED_COVERAGE)
     kinds = {"bearing_deg": times, "bearing_gated_deg": gated}
     return {name: np.degrees(weighted_median(samples.error_rad, kept)) for name, kept in kinds.items()}
