@@ -157,7 +157,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, 
     # The pipe closes when the last process of the run is gone, its workers among them.
     run.communicate(timeout=20.0)
     assert run.returncode != 0
-    assert time.monotonic() - asked < 5.0
+    assert time.monotonic() - asked < 10.0
     assert not list(tmp_path.rglob(".*"))
     kept = len(list((tmp_path / "cache" / "levels").iterdir()))
     assert 3 <= kept < 8
