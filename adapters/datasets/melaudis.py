@@ -15,7 +15,7 @@ stereo, which tells the two models of phone apart::
 
 Only free flow with one vehicle is used (1V-Car, -Truck, -Bus, -MC, -Tram, -Bic), and NoV as background. How
 the files of MELAUDIS_BG are named is not documented: any WAV there is background, cut into clips where it is
-longer, of the day with which its name begins, else a recording of its own.
+longer, of the day and place with which its name begins, else a recording of its own.
 """
 
 import re
@@ -33,12 +33,14 @@ KINDS = {"Car": "car", "Truck": "truck", "Bus": "bus", "MC": "motorcycle", "Tram
 # Neighbouring clips of a long recording say the same; so many of them, evenly apart, tell its spread.
 CLIPS_A_FILE = 20
 # Minutes of 60 to 62 occur: the time is not read as one.
+_WHERE = r"(?P<date>\d{4}-\d{2}-\d{2})_\d+-\d+-[\d.]+-(?P<place>[A-Za-z]+)(?P<spot>\d*[A-Za-z]?)"
 _NAME = re.compile(
-    r"(?P<date>\d{4}-\d{2}-\d{2})_\d+-\d+-[\d.]+-(?P<place>[A-Za-z]+)(?P<spot>\w*?)_(?P<state>[A-Z]+)_"
-    r"(?P<what>NoV|\dV-\w+?)(?:_\w+)?_(?:mono|stereo)",
+    _WHERE + r"_(?P<state>[A-Z]+)_(?P<what>NoV|\dV-\w+?)(?:_\w+)?_(?:mono|stereo)",
     re.ASCII,
 )
-_DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
+# A stray file does no harm; many are a release with other names, of which a part would be used unsaid.
+_MOST_UNREAD = 0.01
+_BEGINNING = re.compile(_WHERE + r"(?![A-Za-z\d])", re.ASCII)
 
 
 def melaudis(root: str | Path) -> list[TrafficClip]:
@@ -48,24 +50,29 @@ def melaudis(root: str | Path) -> list[TrafficClip]:
     missing = [f"{name}/**/*.wav" for name, files in found.items() if not files]
     refuse_missing(folder, "MELAUDIS (both archives unpacked side by side)", missing)
     check_number(folder, found[VEHICLES_NAME] + found[BACKGROUND_NAME])
-    vehicles = [clip for path in found[VEHICLES_NAME] for clip in _vehicle_clips(path)]
-    if not any(clip.labels.kind != BACKGROUND for clip in vehicles):
-        problem = "expected names such as 2024-02-09_13-0-1.8-Fitzroy1_FF_1V-Car_2Lanes_LR_stereo.wav, got {}"
-        raise InputFileError(folder / VEHICLES_NAME, problem.format(found[VEHICLES_NAME][0].name[:100]))
-    return vehicles + [clip for path in found[BACKGROUND_NAME] for clip in _background_clips(folder, path)]
+    vehicles = [(path, _NAME.fullmatch(path.stem)) for path in found[VEHICLES_NAME]]
+    unread = [path.name for path, name in vehicles if name is None]
+    if len(unread) > _MOST_UNREAD * len(vehicles):
+        example = "2024-02-09_13-0-1.8-Fitzroy1_FF_1V-Car_2Lanes_LR_stereo.wav"
+        got = f"{len(unread)} of {len(vehicles)} others, the first {unread[0][:100]!r}"
+        raise InputFileError(folder / VEHICLES_NAME, f"expected names such as {example}, got {got}")
+    clips = [clip for path, name in vehicles if name is not None for clip in _vehicle_clips(path, name)]
+    return clips + [clip for path in found[BACKGROUND_NAME] for clip in _background_clips(folder, path)]
 
 
-def _vehicle_clips(path: Path) -> list[TrafficClip]:
-    """Return the clip of a file; none where it holds a jam, several vehicles, or its name does not read."""
-    found = _NAME.fullmatch(path.stem)
-    if found is None:
-        return []
+def _vehicle_clips(path: Path, found: re.Match[str]) -> list[TrafficClip]:
+    """Return the clip of a file; none where it holds a jam or several vehicles."""
     single = KINDS.get(found["what"].removeprefix("1V-"))
     kind = BACKGROUND if found["what"] == "NoV" else single
     if kind is None or found["state"] != "FF":
         return []
-    recording = f"{found['date']}_{found['place']}{found['spot']}"
-    return [TrafficClip(path, ClipLabels(kind, "phone", recording, found["place"]))]
+    return [TrafficClip(path, _labels(kind, found))]
+
+
+def _labels(kind: str, found: re.Match[str]) -> ClipLabels:
+    # Start and end of the original recordings are not published. A day at a spot is the least that shares
+    # its background, so what is learned on one clip of it is not tested on the next.
+    return ClipLabels(kind, "phone", f"{found['date']}_{found['place']}{found['spot']}", found["place"])
 
 
 def _background_clips(root: Path, path: Path) -> list[TrafficClip]:
@@ -79,6 +86,7 @@ def _background_clips(root: Path, path: Path) -> list[TrafficClip]:
 
 
 def _background(root: Path, path: Path) -> ClipLabels:
-    dated = _DATE.match(path.name)
-    recording = dated.group() if dated else path.relative_to(root).with_suffix("").as_posix()
-    return ClipLabels(BACKGROUND, "phone", recording, "")
+    found = _BEGINNING.match(path.stem)
+    if found is not None:
+        return _labels(BACKGROUND, found)
+    return ClipLabels(BACKGROUND, "phone", path.relative_to(root).with_suffix("").as_posix(), "")

@@ -48,7 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--idmt", type=Path, metavar="DIR", help="IDMT-Traffic")
     add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, both archives unpacked")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(NAMES)}")
-    recordings = "simulated ones of each corpus, 2 s of work each (default: %(default)s)"
+    recordings = "simulated ones of each corpus, 1 s of work each (default: %(default)s)"
     add("--recordings", type=int, default=12, metavar="N", help=recordings)
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--seed", type=int, default=0, help="simulation, folds and bootstrap (default: %(default)s)")
@@ -68,9 +68,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.studies.signatures.signature_study import QUESTIONS, signature_study
 
     in_range("--jobs", arguments.jobs, 1, 256)
+    # Two for training and two for the test: fewer cannot fill a row.
     in_range("--recordings", arguments.recordings, 4, 10_000)
     if arguments.out is not None:
         output_folder(arguments.out, *NAMES)
+    # Apart, so that more recordings leave the folds and draws of a row as they are.
     simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
     given = arguments.idmt is not None or arguments.melaudis is not None
     corpora, stated = (_published(arguments), []) if given else _simulated(arguments, simulation)

@@ -53,6 +53,7 @@ def study_lines(study: SignatureStudy) -> list[str]:
 def write_signature_figure(path: Path, study: SignatureStudy) -> None:
     """Draw the rows that have a value as bars, and the Fisher profile below them."""
     bars = [row for row in study.rows if row.value is not None and row.figure != "Hz"]
+    # A row keeps its height however many there are, or labels of two lines would overlap.
     heights = [0.3 * max(len(bars), 1), 2.4] if study.profile is not None else [0.3 * max(len(bars), 1)]
     with figure_file(path, 9.0, sum(heights) + 1.6) as figure:
         figure.suptitle("Signatures of single clips" + (", SIMULATED sound" if study.simulated else ""))
@@ -76,7 +77,7 @@ def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
             )
     axes.set_yticks(places, [f"{row.name}\n{row.corpus}" for row in rows], fontsize=7.0)
     axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
-    axes.set(xlim=(0.0, 1.02), xlabel="AUROC; balanced accuracy where the bar is orange")
+    axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy where the bar is orange")
     axes.margins(y=0.01)
     legend_beside(axes)
 
@@ -85,9 +86,8 @@ def _draw_profile(axes: "Axes", profile: "BandProfile") -> None:
     axes.axvspan(*PAPER_RANGE_HZ, color=RED, alpha=0.12, linewidth=0, label="paper's range")
     axes.stairs(profile.by_level, profile.edges_hz, label="level", baseline=None)
     axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None, color=GREEN)
-    axes.set(
-        xscale="log", yscale="symlog", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none"
-    )
+    axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none")
+    # Decades alone would leave a span of two of them with three labels.
     axes.set_xlim(profile.edges_hz[0], profile.edges_hz[-1])
     axes.set_xticks([50, 100, 300, 1000, 1800, 4000, 8000], ["50", "100", "300", "1k", "1.8k", "4k", "8k"])
     axes.minorticks_off()
