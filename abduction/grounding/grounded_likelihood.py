@@ -85,7 +85,8 @@ class GroundedSettings:
     visible : AzimuthPrior
         Of a source in plain view.
     without : frozenset of str
-        Observables whose coupling is switched off, for ablations.
+        Observables that are left out, for ablations: of a coupling, or of the approach rate,
+        `radial_speed_m_s` and `inverse_tta_hz`.
     backgrounds : mapping of str to Background
         One for every observable that a descriptor couples.
 
@@ -246,10 +247,10 @@ def _log_couplings(
 def _log_approach(observation: GroundedObservation, settings: GroundedSettings) -> FloatArray:
     """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
-    if isinstance(speed, Observable):
+    if isinstance(speed, Observable) and "radial_speed_m_s" not in settings.without:
         background = settings.backgrounds["radial_speed_m_s"].log_density(speed.value)
         return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - background
-    if isinstance(inverse_tta, Observable):
+    if isinstance(inverse_tta, Observable) and "inverse_tta_hz" not in settings.without:
         background = settings.backgrounds["inverse_tta_hz"].log_density(inverse_tta.value)
         ranges = _SPEED_CELL_M_S / _RANGES_M
         over_range = _log_normal(inverse_tta, _SPEEDS_M_S[:, None] / _RANGES_M, ranges)

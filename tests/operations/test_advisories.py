@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
+from worldstate.operations.recordings.hop_table import HopTable
 
 
 @given(st.lists(st.booleans(), max_size=50))
@@ -38,3 +39,12 @@ def test_the_static_set_s_quantum():
 def test_a_hop_must_last():
     with pytest.raises(InvalidArgumentError, match="hop_s"):
         false_alarms_per_hour([[True]], hop_s=0.0)
+
+
+def test_an_onset_at_line_of_sight_is_no_warning():
+    # At 47,998 Hz the hop that ends at T0 = 7 s ends at sample 335,986: 6.3 us before it.
+    at_t0_s = round(7.0 * 47_998) / 47_998 - 6.3e-6
+    assert not detection([at_t0_s], 7.0).detected
+    assert detection([at_t0_s - 0.1], 7.0).detected
+    table = HopTable({"time_s": np.array([7.0 + 9e-6, 7.1])}, label="left", t0_s=7.0)
+    assert table.before_sight().tolist() == [True, False]

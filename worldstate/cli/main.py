@@ -26,6 +26,7 @@ COMMANDS = (
     "users.model",
     "users.calibrate",
     "users.measure_absence",
+    "studies.evaluate",
     "studies.evaluate_degradation",
     "studies.evaluate_features",
     "studies.evaluate_signatures",

@@ -15,6 +15,8 @@ from worldstate.ground.typing import IndexArray
 
 LONGEST_LEAD_S = 5.0
 SECONDS_PER_HOUR = 3600.0
+# A hop ends with a whole sample, T0 is a camera frame: one that ends at T0 misses it by 10 us and more.
+SLACK_S = 1e-3
 # With fewer, one recording moves a rate by more than 5 % and most intervals span what is of interest.
 FEWEST_RECORDINGS = 20
 
@@ -73,9 +75,9 @@ def detection(onsets_s: Sequence[float], t0_s: float) -> ApproachOutcome:
     """
     onsets = finite_array("onsets_s", np.asarray(onsets_s, dtype=np.float64), (None,))
     lead_s = in_range("t0_s", t0_s, -np.inf, np.inf) - onsets
-    counted = lead_s[(lead_s > 0.0) & (lead_s <= LONGEST_LEAD_S)]
+    counted = lead_s[(lead_s > SLACK_S) & (lead_s <= LONGEST_LEAD_S + SLACK_S)]
     longest_s = float(counted.max()) if counted.size else None
-    return ApproachOutcome(longest_s, int((lead_s > LONGEST_LEAD_S).sum()))
+    return ApproachOutcome(longest_s, int((lead_s > LONGEST_LEAD_S + SLACK_S).sum()))
 
 
 def false_alarms_per_hour(alarms: Sequence[ArrayLike], hop_s: float = 0.1) -> float:

@@ -13,14 +13,14 @@ from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray
 
+from .advisories import SLACK_S
+
 # An hour of hops with a feature of 60 values each takes 20 MB.
 MAX_BYTES = 512 << 20
 MAX_RECORDINGS = 100_000
 MAX_HEAD_BYTES = 64 << 20
 # Files of other versions are caches of other code: they are refused, and made again where they can be.
 VERSION = 3
-# Stamps are whole nanoseconds, T0 a camera frame: a hop that ends at T0 may miss it by round-off.
-_SLACK_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class HopTable:
     def before_sight(self, horizon_s: float = float("inf")) -> BoolArray:
         """Hops of an approach that end within `horizon_s` before T0, T0 included, shape (n,)."""
         left_s = self.t0_s - self.time_s
-        inside = (left_s >= -_SLACK_S) & (left_s <= horizon_s + _SLACK_S)
+        inside = (left_s >= -SLACK_S) & (left_s <= horizon_s + SLACK_S)
         return np.asarray(inside & (not self.hazard_free))
 
     def after_sight(self) -> BoolArray:

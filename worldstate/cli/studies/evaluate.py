@@ -1,0 +1,211 @@
+"""`worldstate evaluate`: every row of Table I on a data set, as one report.
+
+Listen to every recording once, then let every method decide: vision alone, radar, track recovery, the
+published acoustic classifier, the proposed method at three budgets, and this library's own advisory. What is
+fitted is fitted on other recordings than it is scored on: five folds, one junction left out with the
+classifier fixed, and with the classifier retrained without it.
+
+DATASET is a folder in OVAD's layout: the real data set, or recordings of your own with DataLog.csv. Without
+one, streets are simulated into OUT/streets (12 GB) and the report says so. The tested recordings are those
+of the official lists where they lie in the folder (or --static-ids, --dynamic-ids), else all.
+
+The published classifier is trained on --features, a table of windows such as the released one, whose windows
+of tested recordings are left out; else on the recordings that are not tested; on simulated streets on other
+simulated recordings; else on the calibration recordings of each fold.
+
+What was heard is kept in OUT/cache by the content of each recording: an interrupted run goes on where it
+stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for
+leaving junctions out two junctions that have both; what a protocol lacks is said before anything is heard.
+"""
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.output import CommandResult, write_report
+from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.progress import Bar, progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.studies.evaluation.classification import Classifiers
+    from worldstate.studies.evaluation.evaluation import Evaluation
+    from worldstate.studies.evaluation.takes import TakeList
+
+EXAMPLE = """\
+examples:
+  worldstate evaluate --smoke --out smoke
+  worldstate evaluate --out streets --jobs 2
+  worldstate evaluate ovad_dataset --features extracted_features.csv --out report --jobs 2
+  worldstate evaluate mine --hazard-free quiet_hour.wav --out report --against before"""
+
+# Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
+STATIC, DYNAMIC = 83, 59
+SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
+FULL_SEEDS = 5
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("dataset", type=Path, nargs="?", metavar="DATASET", help="recordings (default: simulated streets)")
+    add("--out", type=Path, default=Path("evaluation"), metavar="DIR", help="(default: %(default)s)")
+    add("--features", type=Path, metavar="CSV", help="windows to train the published classifier on")
+    add("--model", type=Path, metavar="FILE", help="this library's model (default: the one that ships)")
+    add("--static-ids", type=Path, metavar="CSV", help="tested recordings of a standing ego")
+    add("--dynamic-ids", type=Path, metavar="CSV", help="tested recordings of a moving ego")
+    add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="more time without a vehicle")
+    add("--hazard-free-hours", type=float, metavar="H", help="score so many hours of it (default: all)")
+    add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
+    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times")
+    add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
+    add("--jobs", type=int, default=1, help="processes (default: %(default)s)")
+    add_choice(parser, "--engine", "where the work is done", "local", "dask")
+    add("--scheduler", metavar="ADDRESS", help="of the Dask cluster, which sees the same paths")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.studies.evaluation.engine import Engine
+    from worldstate.studies.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
+    from worldstate.studies.evaluation.hearing import Hearing
+
+    _check(arguments)
+    output_folder(arguments.out, "evaluation.json")
+    takes = _takes(arguments)
+    lacking_data(takes)
+    classifiers = _classifiers(arguments, takes)
+    seeds = tuple(range(arguments.seed, arguments.seed + (FULL_SEEDS if arguments.full else 1)))
+    with ExitStack() as stack:
+        found = evaluate(
+            takes,
+            Hearing(arguments.out / "cache", arguments.model),
+            classifiers,
+            Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
+            _Bars(stack),
+            EvaluationSettings(seeds, arguments.hazard_free_hours),
+        )
+    report = _report(found)
+    write_report(arguments.out / "evaluation.json", report)
+    return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from worldstate.ground.checks import in_range
+    from worldstate.ground.errors import InvalidArgumentError
+
+    in_range("--jobs", arguments.jobs, 1, 256)
+    if (arguments.engine == "dask") != (arguments.scheduler is not None):
+        raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
+    if arguments.dataset is not None and arguments.smoke:
+        raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
+
+
+class _Bars:
+    """One progress bar a step, each in the place of the last."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self._bar: Bar | None = None
+
+    def begin(self, description: str, parts: int) -> None:
+        self._stack.pop_all().close()
+        self._bar = self._stack.enter_context(progress_bar(description, parts))
+
+    def advance(self) -> None:
+        if self._bar is not None:
+            self._bar.advance()
+
+
+def _takes(arguments: argparse.Namespace) -> "TakeList":
+    from worldstate.studies.evaluation.takes import find_takes
+
+    root = arguments.dataset or _simulated(arguments)
+    return find_takes(
+        root,
+        static_ids=arguments.static_ids,
+        dynamic_ids=arguments.dynamic_ids,
+        hazard_free=arguments.hazard_free,
+    )
+
+
+def _simulated(arguments: argparse.Namespace) -> Path:
+    """Simulate the streets that are not there yet."""
+    from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+    from worldstate.adapters.simulation.dataset.dataset import write_dataset
+    from worldstate.adapters.simulation.dataset.plan import DatasetSettings
+
+    root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
+    if (root / LOG_NAME).is_file():
+        return root
+    static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
+    # A moving ego has no video: its camera moves, and every box with it.
+    parts = [DatasetSettings(n_static=static, seed=arguments.seed, video=True, duration_s=length_s)]
+    if dynamic:
+        parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
+    with progress_bar("simulating streets", static + dynamic) as bar:
+        for part in parts:
+            write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance())
+    return root
+
+
+def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifiers":
+    from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
+    from worldstate.studies.evaluation import training_windows as windows
+    from worldstate.studies.evaluation.classification import Classifiers
+
+    if arguments.features is not None:
+        return Classifiers(*windows.windows_from_table(arguments.features, takes))
+    folder = arguments.out / "cache"
+    folder.mkdir(parents=True, exist_ok=True)
+    found = windows.windows_from_recordings(takes, folder)
+    if found is None and takes.simulated:
+        count = SMOKE_WINDOWS if arguments.smoke else windows.PER_APPROACH
+        sites = sorted({take.site for take in (*takes.static, *takes.dynamic)} & {*SITES, *MOVING_SITES})
+        with progress_bar("simulating windows", 4 * count * len(sites)) as bar:
+            found = windows.windows_from_simulation(
+                folder,
+                arguments.seed,
+                per_approach=count,
+                sites=sites,
+                jobs=arguments.jobs,
+                progress=bar.advance,
+            )
+    return Classifiers(*(found or (None, "the calibration recordings of each fold")))
+
+
+def _report(found: "Evaluation") -> dict[str, object]:
+    import math
+
+    def known(values: "dict[str, float]") -> dict[str, float | None]:
+        return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+    return {
+        "data": found.takes.origin,
+        "recordings": len(found.trials),
+        "failed": {one.name: one.problem for one in found.failed},
+        "lacking": dict(found.lacking),
+        "protocols": {
+            name: {method: known(score.figures()) for method, score in scores.items()}
+            for name, scores in found.scores.items()
+        },
+        "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
+    }
+
+
+def _lines(found: "Evaluation") -> list[str]:
+    lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
+    lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
+    for name, scores in found.scores.items():
+        run = found.runs[name]
+        lines += ["", f"{run.protocol.title}, {len(run.trials)} recordings"]
+        lines.append(f"{'':34}{'lead s':>8}{'detected':>10}{'FA/h':>8}{'bearing deg':>13}")
+        for method, score in scores.items():
+            if not method.startswith("curve"):
+                figures = score.figures()
+                shown = ("lead_s", "detection", "false_alarms_per_hour", "bearing_deg")
+                cells = [figures[key] for key in shown]
+                texts = ["-" if cell != cell else f"{cell:.3g}" for cell in cells]
+                lines.append(f"{method:34}{texts[0]:>8}{texts[1]:>10}{texts[2]:>8}{texts[3]:>13}")
+    return lines

@@ -1,0 +1,140 @@
+"""What a signature classifier says of the features of trials, and which windows it is trained on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.datasets.sample_windows import FRONT, FRONT_LATER_S
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+from worldstate.operations.training.methods import method_of
+from worldstate.operations.training.training import TrainingMethod, fit_signature
+
+from .trial import Trial
+
+# By the name of their evidence: the classifier of the paper, and the ensemble that this library ships, both
+# trained on the same windows.
+TRAINED: dict[str, TrainingMethod] = {"published": "baseline", "ensemble": "worldstate"}
+# Hidden left and hidden right among the explanations.
+SIDE_COLUMNS = slice(0, 2)
+# All of the windows; those of other junctions than the tested one; or, where nothing but the tested
+# recordings is at hand, windows cut from the calibration recordings of the fold.
+TrainedOn = Literal["all", "other junctions", "calibration"]
+
+
+def classified(trial: Trial, name: str, signature: AnySignature) -> Trial:
+    """Add the log-likelihoods that a classifier gives, and its prior, under a name."""
+    model = SiteSignature(signature) if isinstance(signature, EnsembleModel) else signature
+    evidence = np.stack([model.evidence(feature).log_likelihoods for feature in trial.hops.features])
+    priors = {**trial.hops.about.get("prior", {}), name: list(signature.reference_prior)}
+    about = {**trial.hops.about, "prior": priors}
+    return replace(trial, hops=trial.hops.replace(**{name: evidence}, about=about))
+
+
+def posteriors(trial: Trial, evidence: str) -> FloatArray:
+    """Return the posteriors of hidden left, hidden right, visible and none at the classifier's own prior."""
+    joint = trial.hops.columns[evidence] + np.log(trial.hops.about["prior"][evidence])
+    return np.asarray(np.exp(joint - np.logaddexp.reduce(joint, axis=1, keepdims=True)))
+
+
+@dataclass(slots=True)
+class Classifiers:
+    """The published classifier, trained for each fold on what that fold may know; each is trained once."""
+
+    windows: FeatureTable | None  # Released, simulated or extracted ones; none of a tested recording
+    told: str = ""  # Where they come from, for the report
+    _trained: dict[tuple[str, ...], dict[str, AnySignature]] = field(default_factory=dict)
+    _heard: dict[tuple[tuple[str, ...], str], Trial] = field(default_factory=dict)
+
+    def trained_on(self, kind: TrainedOn) -> TrainedOn:
+        """Return what is trained on: without windows the calibration recordings, whatever was asked for."""
+        return "calibration" if self.windows is None else kind
+
+    def classify(
+        self,
+        trials: Sequence[Trial],
+        kind: TrainedOn,
+        calibration: Sequence[Trial],
+        tested: Sequence[Trial],
+        seed: int,
+    ) -> list[Trial]:
+        """Return trials with the posteriors of the classifier that belongs to a fold."""
+        key = self._key(kind, calibration, tested, seed)
+        if key not in self._trained:
+            table = self._table(kind, calibration, tested)
+            self._trained[key] = {
+                name: fit_signature(method_of(method).prepare(table), method, np.random.default_rng(seed))
+                for name, method in TRAINED.items()
+            }
+        done = []
+        for trial in trials:
+            # The same classifiers hear the same trial in many folds and protocols.
+            if (key, trial.name) not in self._heard:
+                heard = trial
+                for name, signature in self._trained[key].items():
+                    heard = classified(heard, name, signature)
+                self._heard[key, trial.name] = heard
+            done.append(self._heard[key, trial.name])
+        return done
+
+    def _key(
+        self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial], seed: int
+    ) -> tuple[str, ...]:
+        if self.trained_on(kind) == "calibration":
+            return ("calibration", str(seed), *(trial.name for trial in calibration))
+        ego = "moving" if tested[0].hops.about["moving"] else "standing"
+        left_out = sorted({junction_of(trial.site) for trial in tested}) if kind == "other junctions" else []
+        return (kind, ego, str(seed), *left_out)
+
+    def _table(self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial]) -> FeatureTable:
+        if self.windows is None:
+            return windows_of(calibration)
+        table = self.windows.group("dynamic" if tested[0].hops.about["moving"] else "static")
+        shared = {trial.name for trial in tested} & set(table.ids.tolist())
+        if shared:
+            raise InvalidArgumentError(
+                f"windows: expected none of a tested recording, got those of {', '.join(sorted(shared)[:5])}"
+            )
+        if kind == "other junctions":
+            left_out = {junction_of(trial.site) for trial in tested}
+            table = table.select(
+                np.array([junction_of(place) not in left_out for place in table.environments.tolist()])
+            )
+        return table
+
+
+def junction_of(site: str) -> str:
+    """Return the junction of a site, whatever the ego does there.
+
+    Examples
+    --------
+    >>> junction_of("SA1"), junction_of("DA1")
+    ('A1', 'A1')
+    """
+    return site[1:]
+
+
+def windows_of(trials: Sequence[Trial]) -> FeatureTable:
+    """Cut labelled windows out of recordings that were heard: at T0, 1.5 s later, and amid quiet ones."""
+    rows = []
+    for trial in trials:
+        time_s = trial.hops.time_s
+        if trial.hazard_free:
+            wanted = {"none": float(np.median(time_s))}
+        else:
+            wanted = {trial.label: trial.t0_s, FRONT: trial.t0_s + FRONT_LATER_S}
+        for label, end_s in wanted.items():
+            hop = int(np.abs(time_s - end_s).argmin())
+            # A window that ends elsewhere than it should is another window.
+            if abs(time_s[hop] - end_s) <= 0.051:
+                rows.append((trial.hops.features[hop], label, trial.name, trial.site))
+    if not rows:
+        raise InvalidArgumentError("trials: expected windows at T0 or in hazard-free time to train on")
+    features, labels, names, sites = (np.array(column) for column in zip(*rows, strict=True))
+    return FeatureTable(features, labels, names, sites, names, (None,) * len(rows))

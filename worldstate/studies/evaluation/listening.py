@@ -1,0 +1,272 @@
+"""Passes over the sound of one recording: what the front-end reads, and what the whole chain says."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, sustained_alarm
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
+from worldstate.adapters.acoustic_grounding import Grounding, observe
+from worldstate.adapters.audio.sound_file import AudioSource, open_audio
+from worldstate.adapters.camera.static_boxes import kept_and_parked
+from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.listen import ListenSettings, Source, Step, listen_steps, measure_steps, open_source
+from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
+from worldstate.frontend.approach.engine_line import track_fundamental
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.music import music_spectrum, signal_subspace
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.stream import AcousticFrame
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
+from worldstate.operations.recordings.hop_stream import HOP_S, hop_stream
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.operations.recordings.stream_statistic import stream_statistic
+from worldstate.operations.recordings.true_track import read_true_tracks
+from worldstate.state import RiskCue, WorldState
+
+from .takes import Take
+from .trial import BOX_COLUMNS, LEFT, NO_SIDE, RIGHT, TRACK_COLUMNS, TRUTH_COLUMNS, Decisions
+
+# Changes whenever a pass over the same recording would give other numbers.
+VERSION = 1
+# How the library listens: at its first guess of the site, learning the site, and hearing past the own engine.
+CHAINS = {
+    "plain": ListenSettings(site_adaptation=False, uncalibrated=True),
+    "adapted": ListenSettings(uncalibrated=True),
+    "ego_noise": ListenSettings(uncalibrated=True, ego_noise=True),
+}
+# The grounded likelihood without its approach rate, for the ablation that drops it.
+RATELESS = Grounding(settings=GroundedSettings(without=frozenset({"radial_speed_m_s", "inverse_tta_hz"})))
+SIDES = {"left": LEFT, "right": RIGHT}
+# An entity counts as a track where it more likely exists than not.
+LIKELY = 0.5
+# The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
+DOPPLER = DopplerSettings(min_partials=2)
+# The tone of a pass-by is looked for this long around line-of-sight entry, so that a stream of an hour is
+# not read into memory for it.
+AROUND_S = 15.0
+# Vehicles move evenly over a second: the tangent of the azimuth is a straight line over so many images.
+LAST_IMAGES, LONGEST_FORECAST_S = 10, 5.0
+
+
+class _Silent:
+    """A classifier that favours nothing: the features are classified later."""
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+
+
+def front_end_tables(take: Take) -> dict[str, HopTable]:
+    """Return `hops`, `boxes` and `truth` of a recording, as a `Trial` has them; no model is asked.
+
+    `hops` has an `approach` score and a `log_slope_hz` of looming, `srp_rad` and `music_rad` beside the
+    `reference_rad` of the camera's moving box; `about` says when the vehicle passes and why the tone of the
+    pass-by cannot be used, if so.
+    """
+    source = open_source(take.path, settings=ListenSettings(alpha=None, uncalibrated=True))
+    vision = source.camera_channel()
+    boxes = _boxes(source, vision)
+    truth = _truth(take, boxes)
+    pairs = list(measure_steps(source, signature=_Silent()))
+    frames = [_slim(frame) for frame, _ in pairs]
+    stream = hop_stream((m for _, m in pairs), name=take.name)
+    reference = np.array([_reference(frame, vision) for frame, _ in pairs])
+    seen = np.isfinite(reference)
+    with open_audio(source.audio_path, strict=False) as audio:
+        music = _music(audio, source.array, [frame for frame, _ in pairs], seen)
+        doppler = "no vehicle" if take.t0_s is None else _doppler(audio, source.array, take.t0_s)
+    measured = ("time_s", "answer", "miss_rate", "clutter_rate", "approach", "seen")
+    columns = {
+        **{name: stream.columns[name] for name in measured},
+        **HopTable.of_rows(("features", "prominence", "log_slope_hz", "bearing_rad"), frames).columns,
+        "reference_rad": reference,
+        "music_rad": music,
+    }
+    columns["srp_rad"] = np.where(seen, columns["bearing_rad"], np.nan)
+    about = {
+        "site": take.site,
+        "moving": take.moving,
+        "camera": source.detections is not None,
+        "pass_s": None if take.t0_s is None else pass_time_s(truth),
+        "doppler": doppler,
+    }
+    t0_s = np.nan if take.t0_s is None else take.t0_s
+    hops = HopTable(columns, take.name, take.label, t0_s, about)
+    return {"hops": hops, "boxes": boxes, "truth": truth}
+
+
+def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str, HopTable]:
+    """Return what the whole chain said of a recording: `decisions`, `tracks` and its hop `stream`."""
+    source = open_source(take.path, model=model, settings=CHAINS[chain])
+    rows, tracks, measured, grounded = [], [], [], []
+    identities: dict[str, int] = {}
+    for step in listen_steps(source):
+        measured.append(step.measurement)
+        grounded.append([_grounded(step, grounding) for grounding in (Grounding(), RATELESS)])
+        rows.append(_decided(step.state))
+        for entity in step.state.entities:
+            if entity.moving and entity.existence_probability >= LIKELY:
+                number = identities.setdefault(entity.id, len(identities))
+                tracks.append((seconds(step.state.stamp_ns), number, entity.azimuth_rad))
+    names = ("time_s", "alarm", "side", "bearing_rad", "score", "risk", "visible_s")
+    stream = hop_stream(measured, name=take.name)
+    return {
+        "decisions": HopTable.of_rows(names, rows),
+        "tracks": HopTable.of_rows(TRACK_COLUMNS, tracks),
+        "stream": stream.replace(**HopTable.of_rows(("grounded", "rateless"), grounded).columns),
+    }
+
+
+def _grounded(step: Step, grounding: Grounding) -> FloatArray:
+    """Weigh the model's scores with bearing, approach rate and engine line, eq. (5)."""
+    heard = step.measurement
+    observation = observe(step.frame, heard.bearing, heard.approach)
+    return grounding.answer(heard.signature, observation).evidence.log_likelihoods
+
+
+def filtered_decisions(tables: Mapping[str, HopTable]) -> Decisions:
+    """Return what the filter said, from `chain_tables`, in the form that every method answers in."""
+    return Decisions(**tables["decisions"].columns, tracks=tables["tracks"])
+
+
+def unfiltered_decisions(tables: Mapping[str, HopTable], policy: CueingPolicy) -> Decisions:
+    """Return what the model's scores and its policy say, hop by hop, without the filter behind them."""
+    stream = tables["stream"]
+    score = stream_statistic(stream, policy.reference_prior)
+    left, right = stream.log_likelihoods[:, 0], stream.log_likelihoods[:, 1]
+    return Decisions.of(
+        stream.time_s,
+        sustained_alarm(score >= policy.gamma, policy.sustain_hops),
+        side=np.where(left >= right, LEFT, RIGHT),
+        score=score,
+        risk=policy.risk_map(score),
+    )
+
+
+def pass_time_s(truth: HopTable) -> float | None:
+    """Return when the first vehicle crosses the ego's axis; None where that cannot be told.
+
+    Beyond the last image the tangent of its azimuth, which is linear in time at constant speed, is extended.
+    """
+    chosen = truth.vehicle == 0 if len(truth) else np.zeros(0, bool)
+    time_s, azimuth = truth.time_s[chosen], truth.azimuth_rad[chosen]
+    crossed = np.flatnonzero(np.diff(np.sign(azimuth)) != 0)
+    if crossed.size:
+        i = int(crossed[0])
+        share = azimuth[i] / (azimuth[i] - azimuth[i + 1])
+        return float(time_s[i] + share * (time_s[i + 1] - time_s[i]))
+    late = slice(-LAST_IMAGES, None)
+    if time_s[late].size < 3:
+        return None
+    slope, offset = np.polyfit(time_s[late], np.tan(azimuth[late]), 1)
+    when = -offset / slope if slope else np.inf
+    return float(when) if 0.0 < when - time_s[-1] < LONGEST_FORECAST_S else None
+
+
+def _slim(frame: AcousticFrame) -> tuple[Any, ...]:
+    """Keep of a hop what methods read, so that an hour of sound stays within some ten megabytes."""
+    slope = np.nan if isinstance(frame.looming, NotUsable) else frame.looming.log_slope_hz
+    # Of the decision window, not of the shorter one that the bearing is read from: the paper's prominence.
+    prominence = float(frame.srp.max() / np.median(frame.srp))
+    return frame.feature, prominence, slope, frame.bearing_rad
+
+
+def _decided(state: WorldState) -> tuple[Any, ...]:
+    raised = [cue for cue in state.cues if cue.advisory]
+    told = max(raised or state.cues, key=lambda cue: cue.risk, default=None)
+    score = max((cue.statistic for cue in state.cues), default=np.nan)
+    side = SIDES.get(told.direction, NO_SIDE) if raised and told is not None else NO_SIDE
+    bearing = np.nan if told is None else told.azimuth_rad
+    return seconds(state.stamp_ns), bool(raised), side, bearing, score, state.risk, _visible(told)
+
+
+def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
+    """Return the stated time to visible; a cue names no interval."""
+    horizon_s = None if cue is None else cue.horizon_s
+    return (np.nan, np.nan if horizon_s is None else horizon_s, np.nan)
+
+
+def _boxes(source: Source, vision: VisionQuery) -> HopTable:
+    log, settings = source.detections, vision.settings
+    rows: list[tuple[Any, ...]] = []
+    for number, frame in enumerate(() if log is None else log.frames):
+        assert log is not None
+        kept, still = kept_and_parked(log, number, settings.keep, settings.still)
+        moving = set(kept[~still].tolist())
+        for i, box in enumerate(frame.boxes_px):
+            sighting = source.camera.sighting(box, frame.labels[i], float(frame.scores[i]))
+            time_s = seconds(int(log.stamps_ns[number]))
+            found = frame.scores[i], frame.labels[i], sighting.azimuth_rad, i in moving
+            rows.append((number, time_s, box, *found))
+    if not rows:
+        return HopTable.of_rows(BOX_COLUMNS, ()).replace(
+            box_px=np.empty((0, 4)), class_name=np.empty(0, "U1")
+        )
+    return HopTable.of_rows(BOX_COLUMNS, rows)
+
+
+def _truth(take: Take, boxes: HopTable) -> HopTable:
+    """Return the simulation's tracks, or the widest moving box of each image where nothing else is known."""
+    rows: list[tuple[float, int, float, bool]] = []
+    for vehicle, track in enumerate(read_true_tracks(take.path)):
+        moments = zip(track.time_s, track.azimuth_rad, track.in_view, strict=True)
+        rows += [(time_s, vehicle, azimuth, seen) for time_s, azimuth, seen in moments]
+    if not rows and take.t0_s is not None:
+        rows = _widest_moving(boxes)
+    return HopTable.of_rows(TRUTH_COLUMNS, rows)
+
+
+def _widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
+    widest: dict[float, tuple[float, float]] = {}
+    for i in np.flatnonzero(boxes.moving):
+        width = float(boxes.box_px[i, 2] - boxes.box_px[i, 0])
+        known = widest.get(float(boxes.time_s[i]), (0.0, 0.0))
+        widest[float(boxes.time_s[i])] = max(known, (width, float(boxes.azimuth_rad[i])))
+    return [(time_s, 0, azimuth, True) for time_s, (_, azimuth) in sorted(widest.items())]
+
+
+def _reference(frame: AcousticFrame, vision: VisionQuery) -> float:
+    """Azimuth of the moving box that is nearest to the acoustic bearing, NaN without one."""
+    # Half a camera period on: the image nearest in time to the middle of the bearing's window.
+    stamp = nanoseconds(seconds(frame.stamp_ns) - frame.bearing_age_s + 0.5 * HOP_S)
+    moving = [seen.azimuth_rad for seen in vision.sightings(stamp) if seen.moving]
+    return min(moving, key=lambda azimuth: abs(azimuth - frame.bearing_rad), default=np.nan)
+
+
+def _doppler(audio: AudioSource, array: MicrophoneArray, t0_s: float) -> str:
+    """Why the tone of the pass-by cannot be used, at the microphone nearest to the centre; else nothing."""
+    middle = int(np.argmin(np.linalg.norm(array.centred_m, axis=1)))
+    rate = audio.sample_rate_hz
+    first = round(max(t0_s - AROUND_S, 0.0) * rate)
+    count = min(round(2.0 * AROUND_S * rate), audio.frames - first)
+    track = track_fundamental(np.ascontiguousarray(audio.span(first, count)[:, middle]), rate)
+    found = radial_speed(track, DOPPLER)
+    return found.reason if isinstance(found, NotUsable) else ""
+
+
+def _music(
+    audio: AudioSource, array: MicrophoneArray, frames: Iterable[AcousticFrame], wanted: BoolArray
+) -> FloatArray:
+    """MUSIC bearings of the very samples that the SRP bearings were read from, NaN where not wanted."""
+    chosen, rate = FrontEndSettings(), audio.sample_rate_hz
+    bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)
+    azimuths = chosen.azimuths_rad()
+    steering = array.steering(bin_frequencies_hz(bins, rate, chosen.nfft), azimuths).astype(np.complex64)
+    length = round(chosen.bearing_hops * rate / chosen.hop_rate_hz)
+    bearings = np.full(wanted.size, np.nan)
+    with one_blas_thread():
+        for i, frame in enumerate(frames):
+            if wanted[i]:
+                start = max(frame.sample_index - length, 0)
+                stft = StreamingStft(array.n_microphones, chosen.nfft, bins)
+                spectra = stft.push(audio.span(start, frame.sample_index - start))
+                bearings[i] = azimuths[music_spectrum(signal_subspace(spectra, 1), steering).argmax()]
+    return bearings
