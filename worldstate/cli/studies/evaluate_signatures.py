@@ -108,16 +108,12 @@ def _heard(name: str, clips: "list[TrafficClip] | None", jobs: int) -> "ClipSign
 
 
 def _simulated(arguments: argparse.Namespace, rng: "np.random.Generator") -> "tuple[Corpora, list[str]]":
-    from worldstate.studies.signatures.simulated_corpora import CITY_STREET, TOWN_ROAD, simulated_corpus
+    from worldstate.studies.signatures.simulated_corpora import STREETS, simulated_corpora
 
-    number, streets = arguments.recordings, (TOWN_ROAD, CITY_STREET)
-    with progress_bar("simulating passages", number * len(streets)) as bar:
-        roads, city = (
-            simulated_corpus(street, number, one, arguments.jobs, bar.advance)
-            for street, one in zip(streets, rng.spawn(len(streets)), strict=True)
-        )
-    stated = ["SIMULATED sound: no published corpus was given", *(one.assumptions() for one in streets)]
-    return (roads, city), stated
+    with progress_bar("simulating passages", arguments.recordings * len(STREETS)) as bar:
+        corpora = simulated_corpora(arguments.recordings, rng, arguments.jobs, bar.advance)
+    stated = ["SIMULATED sound: no published corpus was given", *(one.assumptions() for one in STREETS)]
+    return corpora, stated
 
 
 def _left_out(problems: tuple[str, ...]) -> list[str]:

@@ -71,10 +71,8 @@ def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
         axes.barh(place, value, color=colour, alpha=0.75, label=row.figure)
         axes.plot([low, high], [place, place], color="black", linewidth=1.2, label="95 % over recordings")
         if row.paper is not None:
-            label = "paper"
-            axes.plot(
-                row.paper, [place, place], color=RED, marker="|", markersize=11, linewidth=3, label=label
-            )
+            # A single number is a span of no length: only its marker shows.
+            axes.plot(row.paper, [place, place], "|-", color=RED, ms=11, mew=2.5, lw=2.5, label="paper")
     axes.set_yticks(places, [f"{row.name}\n{row.corpus}" for row in rows], fontsize=7.0)
     axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
     axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy where the bar is orange")

@@ -102,14 +102,29 @@ class Roadside:
 # Roads of 30 to 70 km/h at the edge of a small town, and streets of several lanes and trams in a large one.
 TOWN_ROAD = Roadside("SIMULATED roads", (STUDIO, MEMS), -8.0, 0.6, (30.0, 70.0), (4.0, 10.0), 10.0, True)
 CITY_STREET = Roadside("SIMULATED city", (PHONE,), 2.0, 2.0, (20.0, 50.0), (4.0, 14.0))
+STREETS = (TOWN_ROAD, CITY_STREET)
 
 
-def simulated_corpus(
-    street: Roadside,
+def simulated_corpora(
     recordings: int,
     rng: np.random.Generator,
     jobs: int = 1,
     on_recording: Callable[[], None] = lambda: None,
+) -> tuple[ClipSignatures, ClipSignatures]:
+    """Return the stand-ins of both published corpora, each of so many recordings, for `signature_study`."""
+    roads, city = (
+        _corpus(street, recordings, one, jobs, on_recording)
+        for street, one in zip(STREETS, rng.spawn(len(STREETS)), strict=True)
+    )
+    return roads, city
+
+
+def _corpus(
+    street: Roadside,
+    recordings: int,
+    rng: np.random.Generator,
+    jobs: int,
+    on_recording: Callable[[], None],
 ) -> ClipSignatures:
     """Return the signatures of recordings, each with one passage of every kind and `BACKGROUNDS` without."""
     items = [(street, number, one) for number, one in enumerate(rng.spawn(recordings))]
