@@ -82,6 +82,20 @@ def test_the_hop_at_t0_and_the_one_five_seconds_before_it():
     assert score.figures(np.array([1]))["lead_s"] == pytest.approx(5.0)
 
 
+def test_stamps_half_a_sample_off_change_nothing():
+    # At 47,998 Hz a window ends up to 10 us beside its tenth of a second, before or after T0.
+    rng = np.random.default_rng(10)
+    trials, (answers,) = random_study(rng)
+    shifted, said = [], []
+    for trial, answer in zip(trials, answers, strict=True):
+        time_s = trial.hops.time_s + rng.uniform(-1e-5, 1e-5, len(trial.hops))
+        shifted.append(replace(trial, hops=trial.hops.replace(time_s=time_s)))
+        said.append(replace(answer, time_s=time_s))
+    figures, expected = Score.of(shifted, [said]).figures(), Score.of(trials, [answers]).figures()
+    for name, value in expected.items():
+        assert figures[name] == pytest.approx(value, abs=1e-4, nan_ok=True), name
+
+
 def test_awareness_is_of_alarms_and_of_boxes():
     trial = made_up("a", "left", t0_s=5.0)
     blind = replace(trial, boxes=made_up("b").boxes)

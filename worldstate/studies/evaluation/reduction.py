@@ -12,14 +12,12 @@ from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.gospa import gospa_bearing
 from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.metrics.track_measures import TrackRows, TruthRows, track_measures
-from worldstate.operations.recordings.advisories import LONGEST_LEAD_S, detection, rising_edges
+from worldstate.operations.recordings.advisories import LONGEST_LEAD_S, SLACK_S, detection, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 
 from .trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 
-# Stamps are whole nanoseconds and T0 is a camera frame: a lead is exact to this many digits of a second.
-_DIGITS = 6
 # The paper's, before line-of-sight entry.
 HORIZONS_S = {"all": np.inf, "2s": 2.0, "1s": 1.0}
 BEARING_COLUMNS = ("recording", "error_rad", "prominence")
@@ -37,8 +35,9 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
         }
         return {name: float(count) for name, count in spent.items()}
     t0_s = in_range(f"{trial.name}: line-of-sight entry", trial.t0_s, -np.inf, np.inf)
-    lead_s = np.round(t0_s - said.time_s, _DIGITS)
-    # Relative to T0, so that the difference is not rounded a second time.
+    lead_s = t0_s - said.time_s
+    before = lead_s > SLACK_S
+    # Relative to T0, so that the lead comes back to the last bit and finds its hop.
     outcome = detection((-lead_s[onsets]).tolist(), 0.0)
     first = onsets[lead_s[onsets] == outcome.lead_time_s]
     named = int(said.side[first[0]]) if outcome.detected else NO_SIDE
@@ -48,10 +47,10 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
         "lead_s": outcome.lead_time_s or 0.0,
         "early_onsets": float(outcome.false_advisories_before),
         "side_right": float(named != NO_SIDE and named == _SIDES.get(trial.label)),
-        "onsets_before": float((lead_s[onsets] > 0.0).sum()),
+        "onsets_before": float(before[onsets].sum()),
         # Hops at which an onset would be counted: an alarm at random has one of them with equal chances.
-        "window_s": float(((lead_s > 0.0) & (lead_s <= LONGEST_LEAD_S)).sum()) * HOP_S,
-        "before_s": float((lead_s > 0.0).sum()) * HOP_S,
+        "window_s": float((before & (lead_s <= LONGEST_LEAD_S + SLACK_S)).sum()) * HOP_S,
+        "before_s": float(before.sum()) * HOP_S,
     }
 
 
@@ -81,7 +80,7 @@ def hop_of(time_s: FloatArray, hops_s: FloatArray) -> IndexArray:
     """
     middles = (hops_s[1:] + hops_s[:-1]) / 2.0
     nearest = np.searchsorted(middles, time_s)
-    far = np.abs(hops_s[nearest] - time_s) > HOP_S / 2.0 + 10.0**-_DIGITS
+    far = np.abs(hops_s[nearest] - time_s) > HOP_S / 2.0 + SLACK_S
     return np.where(far, -1, nearest)
 
 
