@@ -1,3 +1,5 @@
+from .degradation.degradation_study import DegradationSettings as DegradationSettings
+from .degradation.degradation_study import degradation_study as degradation_study
 from .degradation.degradation_sweep import SweepSettings as SweepSettings
 from .degradation.degradation_sweep import degradation_sweep as degradation_sweep
 from .features.comparison import comparison as comparison

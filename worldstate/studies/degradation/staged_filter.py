@@ -1,0 +1,168 @@
+"""Filter one recording in every condition: its sound heard dry and in the rain, its camera as it was seen."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.camera.camera_health import DegradationLog
+from worldstate.adapters.camera.detector import overlaps
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings, moving_boxes
+from worldstate.adapters.listen import Source, measure_steps, unoccluded_sector
+from worldstate.core.filter import WorldFilter
+from worldstate.frontend.stream import AcousticFrame
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.measurement.measurement import Measurement
+from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings
+from worldstate.operations.recordings.hop_stream import hop_stream
+from worldstate.operations.recordings.hop_table import HopTable, joined
+
+from .conditions import OFF, Condition, all_conditions
+from .looks import READINGS, StagedDetector, degradation_in, detections_in
+from .rain import rained
+
+# Changes whenever the same sound and looks would give other beliefs.
+VERSION = 1
+Heard = tuple[AcousticFrame, Measurement]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """One detector behind the camera of one recording."""
+
+    detector: StagedDetector
+    rates: MissRates  # Of this detector, measured on other recordings
+    boxes: HopTable  # What it reported; see `looks.look`
+    readings: HopTable  # Quality of the images
+
+    def look(self, source: Source, images: str, d: DegradationLog) -> VisionQuery:
+        """Return the channel that is asked in a condition of the camera."""
+        return VisionQuery(
+            source.camera,
+            detections_in(self.boxes, images),
+            self.rates.table,
+            d,
+            VisionSettings(keep=self.detector.keep),
+            unoccluded_sector(source.context),
+            self.rates.clutter_rate,
+        )
+
+
+def cameras(
+    detectors: Iterable[StagedDetector], rates: Mapping[str, MissRates], looks: Mapping[str, HopTable]
+) -> list[Camera]:
+    """Return every detector with what it reported of one recording."""
+    return [Camera(one, rates[one.name], looks[one.name], looks[READINGS]) for one in detectors]
+
+
+def filter_in_conditions(
+    source: Source,
+    behind: Sequence[Camera],
+    seed: Sequence[int],
+    conditions: Sequence[Condition] = all_conditions(),
+) -> dict[str, HopTable]:
+    """Return what the filter made of one recording with each detector, all conditions end to end.
+
+    Columns are those of a hop stream and `condition`; `degradation`, d as it was estimated; `presence`,
+    P(hidden) + P(visible) of the filter; and `found`, whether a moving object that is in view was detected,
+    where `seen` takes any detection.
+    """
+    with one_blas_thread():
+        # The same drops at every level, only louder: what differs between levels is no draw of the noise.
+        heard = {
+            level: list(
+                measure_steps(rained(source, level, np.random.default_rng(seed)) if level else source)
+            )
+            for level in sorted({state.sound_level for state in conditions})
+        }
+        reference = _reference(source, [frame.stamp_ns for frame, _ in next(iter(heard.values()))])
+        return {
+            one.detector.name: joined(
+                _filtered(source, one, heard[state.sound_level], reference, state) for state in conditions
+            )
+            for one in behind
+        }
+
+
+def by_condition(filtered: HopTable) -> dict[str, HopTable]:
+    """Take the conditions apart that `filter_in_conditions` put end to end."""
+    names = filtered.columns["condition"]
+    first = np.sort(np.unique(names, return_index=True)[1])
+    parts = {
+        key: np.split(column, first[1:]) for key, column in filtered.columns.items() if key != "condition"
+    }
+    return {
+        str(names[start]): replace(filtered, columns={key: split[i] for key, split in parts.items()})
+        for i, start in enumerate(first)
+    }
+
+
+def _filtered(
+    source: Source,
+    camera: Camera,
+    measured: Sequence[Heard],
+    reference: Sequence[FloatArray],
+    state: Condition,
+) -> HopTable:
+    stamps_ns = [frame.stamp_ns for frame, _ in measured]
+    query, found, d = None, np.zeros(len(measured), bool), np.ones(len(measured))
+    if state.family != OFF:
+        read = degradation_in(camera.readings, state.camera.name, camera.rates)
+        query = camera.look(source, state.camera.name, read)
+        found, d = _found(reference, query, stamps_ns), np.array([read(stamp_ns) for stamp_ns in stamps_ns])
+    asked = list(_asked(source, measured, query))
+    there = [any(sighting.moving for sighting in m.sightings) for _, m in measured]
+    return hop_stream(asked, name=state.name, there=there).replace(
+        presence=np.array(_presence(source, asked)),
+        found=found,
+        degradation=d,
+        condition=np.full(len(asked), state.name),
+    )
+
+
+def _reference(source: Source, stamps_ns: Sequence[int]) -> list[FloatArray]:
+    """Return the moving boxes that are there at each stamp."""
+    if source.detections is None:
+        return [np.empty((0, 4))] * len(stamps_ns)
+    return moving_boxes(source.detections, stamps_ns)
+
+
+def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Sequence[int]) -> BoolArray:
+    """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
+    least = AbsenceSettings().min_overlap
+    detected = moving_boxes(query.detections, stamps_ns, query.settings) if query.detections else []
+    found = [
+        (overlaps(there, boxes) >= least).any() for there, boxes in zip(reference, detected, strict=True)
+    ]
+    return np.array(found, dtype=bool)
+
+
+class _Again:
+    """Repeats the evidence of every hop in the same order."""
+
+    def __init__(self, measured: Sequence[Heard]) -> None:
+        self._said = iter([measurement.signature for _, measurement in measured])
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return next(self._said)
+
+
+def _asked(source: Source, measured: Sequence[Heard], query: VisionQuery | None) -> Iterator[Measurement]:
+    """Query the camera again at every hop."""
+    # Frames are only interpreted, so the rate of the sound does not matter here.
+    adapter = AcousticAdapter(source.array, 48_000.0, _Again(measured), vision=query)
+    return (adapter.interpret(frame) for frame, _ in measured)
+
+
+def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float]:
+    """P(hidden) + P(visible) of the filter at every hop."""
+    world, presence = WorldFilter(context=source.context, policy=source.policy), []
+    for measurement in measurements:
+        world = world.predict_to(measurement.stamp_ns).update(measurement)
+        presence.append(1.0 - world.explanation.none)
+    return presence
