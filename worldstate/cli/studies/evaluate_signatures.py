@@ -13,9 +13,9 @@ bicycles and trams are rows of their own, by models that never heard them.
   --idmt      the folder of IDMT-Traffic, with audio/ and annotation/ (doi:10.5281/zenodo.7551553)
   --melaudis  a folder with MELAUDIS_Vehicles/ and MELAUDIS_BG/ (doi:10.6084/m9.figshare.27115870)
 
-Without either, two stand-ins are made from the simulator's emission models, --recordings each: one passage of
-every kind of road user and three clips without one a recording. Their rows say SIMULATED, and the rows of the
-published corpora are listed with the command that would fill them.
+Without either, two stand-ins are made from the simulator's emission models, --recordings each: a passage of
+every kind of road user (on the roads: of cars and trucks) and three clips without one a recording. Their rows
+say SIMULATED, and the rows of the published corpora are listed with the command that would fill them.
 """
 
 import argparse

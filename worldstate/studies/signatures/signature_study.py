@@ -188,7 +188,7 @@ class _Corpora:
     def _scores(self, question: _Question) -> _Scored | None:
         key = question.by, question.train, question.test, question.microphone
         if key not in self.scored:
-            # A fold of 9,000 clips takes longer to learn than all kinds take to be counted.
+            # Vehicles and quiet road users of a corpus are scored by one and the same model.
             self.scored[key] = self._new_scores(question)
         return self.scored[key]
 

@@ -15,7 +15,7 @@ from worldstate.adapters.simulation.scene.junction import site
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
 from worldstate.adapters.simulation.scene.octave_bands import REFERENCE_PA
 from worldstate.adapters.simulation.scene.presets import Preset, preset
-from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, drive, emit
+from worldstate.adapters.simulation.scene.vehicle import SourceSignal, drive, emit
 from worldstate.adapters.simulation.sound.air import air_gain, ground_gain
 from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES, add_delayed, emission_times
@@ -31,9 +31,7 @@ from .clip_signatures import ClipSignatures, signature
 # Twice the highest band and some, at half the cost of 48 kHz.
 RATE_HZ = 24_000.0
 KNOTS_S = np.arange(CLIP_S * RATE_HZ / KNOT_SAMPLES + 1) * KNOT_SAMPLES / RATE_HZ
-# Emission begins .3 s before the clip, longer than sound needs from where the fastest vehicle is then; 57
-# and 375 blocks are 432, a length whose Fourier transform is twice as fast as that of 427.
-HEAD_BLOCKS = 57
+HEAD_BLOCKS = 57  # Emission begins .3 s earlier, longer than sound needs from where the fastest vehicle is
 MICROPHONE_HEIGHT_M = 1.5
 # The corpora's words for the simulator's kinds.
 WORDS = {
@@ -45,10 +43,10 @@ WORDS = {
     "tram": "tram",
 }
 SLOW_KMH = {"bicycle": (12.0, 25.0), "tram": (15.0, 40.0)}
-BACKGROUNDS = 3  # Clips without a vehicle a recording: as many as of cars and trucks
-# Single vehicles of one category scatter so about its mean (CNOSSOS states the mean).
+BACKGROUNDS = 3  # Clips without a vehicle in a recording: as many as of cars and trucks
+# Assumed: CNOSSOS states the mean of a category and not how single vehicles scatter about it.
 VEHICLE_SPREAD_DB = 3.0
-# A background differs from day to day in level and in colour: birds, leaves, building sites, the far road.
+# Assumed, per octave: backgrounds differ from day to day by birds, leaves, building sites, the far road.
 COLOUR_SPREAD_DB = 3.0
 JITTER_S = 0.2  # Clips are centred by hand
 
@@ -58,15 +56,16 @@ class MicrophoneGrade:
     """What a recorder makes of the pressure before it."""
 
     name: str
-    self_noise_db: float  # White, of the whole band, dB re 20 uPa: about the data sheet's dB(A) plus 3
+    # White up to 12 kHz, dB re 20 uPa; A-weighted it is .5 dB less, so the data sheet's dB(A) are taken.
+    self_noise_db: float
     low_cut_hz: float
     gain_db: float = 0.0  # Against full scale at `FULL_SCALE_PA`
     gain_spread_db: float = 0.0  # Of the gain between recordings
 
 
 # sE8: 13 dB(A). ICS-43434: 65 dB(A) below 94 dB SPL, -3 dB at 60 Hz.
-STUDIO = MicrophoneGrade("studio", 16.0, 20.0)
-MEMS = MicrophoneGrade("mems", 32.0, 60.0)
+STUDIO = MicrophoneGrade("studio", 13.0, 20.0)
+MEMS = MicrophoneGrade("mems", 29.0, 60.0)
 # No data sheet: a MEMS capsule behind the high-pass and the automatic gain of a phone.
 PHONE = MicrophoneGrade("phone", 36.0, 120.0, gain_db=14.0, gain_spread_db=4.0)
 
@@ -81,6 +80,7 @@ class Roadside:
     far_rate: float  # Distant vehicles in ten seconds
     speed_kmh: tuple[float, float]
     distance_m: tuple[float, float]  # Of the lanes from the microphone
+    kinds: tuple[str, ...]  # Who drives past in every recording
     windshield_db: float = 0.0  # What it takes from the simulator's wind
     official_split: bool = False  # Every second recording is for training
 
@@ -100,8 +100,26 @@ class Roadside:
 
 
 # Roads of 30 to 70 km/h at the edge of a small town, and streets of several lanes and trams in a large one.
-TOWN_ROAD = Roadside("SIMULATED roads", (STUDIO, MEMS), -8.0, 0.6, (30.0, 70.0), (4.0, 10.0), 10.0, True)
-CITY_STREET = Roadside("SIMULATED city", (PHONE,), 2.0, 2.0, (20.0, 50.0), (4.0, 14.0))
+TOWN_ROAD = Roadside(
+    name="SIMULATED roads",
+    microphones=(STUDIO, MEMS),
+    ambient_db=-8.0,
+    far_rate=0.6,
+    speed_kmh=(30.0, 70.0),
+    distance_m=(4.0, 10.0),
+    kinds=("light", "medium", "heavy"),  # IDMT-Traffic has no quiet road users either
+    windshield_db=10.0,
+    official_split=True,
+)
+CITY_STREET = Roadside(
+    name="SIMULATED city",
+    microphones=(PHONE,),
+    ambient_db=2.0,
+    far_rate=2.0,
+    speed_kmh=(20.0, 50.0),
+    distance_m=(4.0, 14.0),
+    kinds=(*WORDS,),
+)
 STREETS = (TOWN_ROAD, CITY_STREET)
 
 
@@ -126,7 +144,7 @@ def _corpus(
     jobs: int,
     on_recording: Callable[[], None],
 ) -> ClipSignatures:
-    """Return the signatures of recordings, each with one passage of every kind and `BACKGROUNDS` without."""
+    """Return the signatures of recordings, each with a passage of every kind and some without."""
     items = [(street, number, one) for number, one in enumerate(rng.spawn(recordings))]
     rows = []
     for heard in in_processes(_signatures, items, jobs):
@@ -146,7 +164,7 @@ def simulated_recording(
     levels = _levels(street, rng)
     gains_db = [one.gain_db + one.gain_spread_db * rng.standard_normal() for one in street.microphones]
     split = ("train", "test")[number % 2] if street.official_split else ""
-    for kind in (*WORDS, *(BACKGROUND,) * BACKGROUNDS):
+    for kind in (*street.kinds, *(BACKGROUND,) * BACKGROUNDS):
         pressure = _ambience(levels, rng)
         if kind != BACKGROUND:
             pressure += _passage(street, kind, rng)
@@ -159,9 +177,8 @@ def simulated_recording(
 def _levels(street: Roadside, rng: np.random.Generator) -> Preset:
     """Draw the ambience of a recording."""
     usual = preset()
-    octaves = (
-        np.array(usual.ambient_octaves_db) + street.ambient_db + COLOUR_SPREAD_DB * rng.standard_normal(8)
-    )
+    drawn_db = street.ambient_db + COLOUR_SPREAD_DB * rng.standard_normal(8)
+    octaves = np.array(usual.ambient_octaves_db) + drawn_db
     # Direction is lost on one microphone: the fewest waves will do. Its own noise is added by its grade.
     return replace(
         usual,
@@ -195,24 +212,24 @@ def _passage(street: Roadside, kind: str, rng: np.random.Generator) -> Float32Ar
     )
     samples = (len(knots) - 1) * KNOT_SAMPLES
     parts = emit(path, samples, RATE_HZ, VEHICLE_SPREAD_DB * rng.standard_normal(), rng)
-    # One source in the middle: seen from the kerb, 2 s of a car's axles and engine differ from it by less
-    # than a decibel, at a quarter of the cost. A tram of 30 m is heard some 2 dB too loud.
-    x, y = path.behind(0.5 * (what.axles_m[0] + what.axles_m[-1]))
-    return _heard_from(np.sum([one.signal for one in parts], axis=0), knots, np.hypot(x, y))
-
-
-def _heard_from(signal: Float32Array, knots_s: FloatArray, ground_m: FloatArray) -> Float32Array:
-    """Carry a signal over a changing distance: air, the road's reflection, delay and spreading."""
-    length = np.hypot(ground_m, MICROPHONE_HEIGHT_M - SOURCE_HEIGHT_M)
-    gain = air_gain(length) * ground_gain(length, SOURCE_HEIGHT_M, MICROPHONE_HEIGHT_M)
+    # Axles and engine each by themselves: one source in the middle, at the height of an engine, is 4 dB too
+    # quiet between .7 and 2 kHz, where the road's reflection cancels what comes from that height.
     out = np.zeros((len(KNOTS_S) - 1) * KNOT_SAMPLES, np.float32)
-    made = Emission.of(signal, knots_s[0], RATE_HZ).table(gain)
+    for part in parts:
+        _add_heard(out, part, knots, np.hypot(*path.behind(part.behind_m)))
+    return out
+
+
+def _add_heard(out: Float32Array, part: SourceSignal, knots_s: FloatArray, ground_m: FloatArray) -> None:
+    """Carry a signal over a changing distance: air, the road's reflection, delay and spreading."""
+    length = np.hypot(ground_m, MICROPHONE_HEIGHT_M - part.height_m)
+    gain = air_gain(length) * ground_gain(length, part.height_m, MICROPHONE_HEIGHT_M)
+    made = Emission.of(part.signal, knots_s[0], RATE_HZ).table(gain)
     if made is not None:
         table, span = made
         emitted = emission_times(KNOTS_S, knots_s[span], length[span], SPEED_OF_SOUND_MPS)
         travelled = np.interp(np.nan_to_num(emitted), knots_s[span], length[span])
         add_delayed(out, table, emitted, 1.0 / np.maximum(travelled, NEAREST_M))
-    return out
 
 
 def _recorded(
