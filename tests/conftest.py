@@ -1,5 +1,6 @@
 """Fixtures that cost seconds, made once a session."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from hypothesis import settings
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
 from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.cli.main import main
 from worldstate.cli.users.demo import simulate_approach
 from worldstate.frontend.array.ovad_array import ovad_array
 
@@ -38,3 +40,11 @@ def approach(tmp_path_factory) -> Approach:
     root = tmp_path_factory.mktemp("approach")
     write_array_xml(root / "mics.xml", ovad_array())
     return Approach(simulate_approach(root / "recording", seed=1), root / "mics.xml")
+
+
+@pytest.fixture(scope="session")
+def smoke(tmp_path_factory):
+    """The folder of a smoke evaluation, and its report; a minute: its tests are of one group."""
+    out = tmp_path_factory.mktemp("evaluation")
+    assert main(["evaluate", "--smoke", "--out", str(out)]) == 0
+    return out, json.loads((out / "evaluation.json").read_text())

@@ -38,12 +38,8 @@ def _seen(trial: Trial) -> Decisions:
         # In the order of width, so that the widest box of an image is the one that stays.
         chosen = moving[np.argsort(widths, kind="stable")]
         azimuth[boxes.frame[chosen]] = boxes.azimuth_rad[chosen]
-    return _in_sight(trial, images.at_hops(azimuth))
-
-
-def _in_sight(trial: Trial, bearing_rad: FloatArray) -> Decisions:
-    found = np.isfinite(bearing_rad)
-    return Decisions.of(trial.hops.time_s, found, side=sides(bearing_rad), bearing_rad=bearing_rad)
+    bearing = images.at_hops(azimuth)
+    return Decisions.of(trial.hops.time_s, np.isfinite(bearing), side=sides(bearing), bearing_rad=bearing)
 
 
 def seen_early_s(trials: Iterable[Trial]) -> FloatArray:
@@ -76,7 +72,8 @@ def _early_s(trial: Trial) -> float:
 class RadarFieldOfView:
     """A forward radar that finds a vehicle in line of sight and within its field of view, scan by scan.
 
-    It raises no false alarm, so that none can be counted, and its bearing is the true one.
+    It raises no false alarm, so that none can be counted, and names a side only: its bearing would be the
+    true one, whose error says nothing.
     """
 
     # Field of view and range of the near scan of a common 77 GHz front radar (Continental ARS 408-21: 60 deg
@@ -110,4 +107,4 @@ class RadarFieldOfView:
             hop = np.searchsorted(hop_s + SLACK_S, time_s)
             near = (hop < len(hop_s)) & (hop_s[np.minimum(hop, len(hop_s) - 1)] - time_s < HOP_S - SLACK_S)
             bearing[hop[near]] = trial.truth.azimuth_rad[found][near]
-        return _in_sight(trial, bearing)
+        return Decisions.of(trial.hops.time_s, np.isfinite(bearing), side=sides(bearing))
