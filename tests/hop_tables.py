@@ -3,7 +3,6 @@
 import numpy as np
 
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.streets.recording_features import decisions
 
 
 def blank_stream(name, hops):
@@ -20,19 +19,4 @@ def blank_stream(name, hops):
             "there": np.zeros(hops, dtype=bool),
         },
         name=name,
-    )
-
-
-def blank_recording(name, hops):
-    """What the front-end keeps of a hazard-free simulated recording, classified as nothing."""
-    unknown = np.full(hops, np.nan)
-    return blank_stream(name, hops).replace(
-        features=np.zeros((hops, 60)),
-        prominence=np.ones(hops),
-        log_slope_hz=unknown,
-        reference_rad=unknown,
-        srp_rad=unknown,
-        music_rad=unknown,
-        about={"site": "SA1", "pass_s": None, "doppler": "no vehicle"},
-        **decisions(np.full((hops, 4), 0.25), np.zeros(hops)),
     )

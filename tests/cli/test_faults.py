@@ -101,7 +101,8 @@ def files(tmp_path, monkeypatch) -> Path:
         ("bounds --out a.wav", "a.wav"),
         ("demo --out a.wav/demo", "a.wav"),
         ("simulate --out a.wav", "a.wav"),
-        ("twin --out a.wav", "a.wav"),
+        ("evaluate --out a.wav", "a.wav"),
+        ("realism t.csv --out a.wav", "a.wav"),
         ("evaluate-degradation set --miss-rates m.json --out a.wav", "a.wav"),
     ],
 )

@@ -1,13 +1,16 @@
 """The comparison of simulated with real windows, on sets whose answer is known."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.simulation import SITES
+from worldstate.cli.main import main
+from worldstate.cli.studies import realism as command
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InvalidArgumentError
@@ -133,3 +136,25 @@ def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
     later = [found[1] - found[0] for found in ends.values() if len(found) == 2]
     assert len(later) == 80
     np.testing.assert_allclose(later, 1.5, atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("group", "sites"), [("static", ("SA1", "SB1")), ("dynamic", ("DA1", "DB1"))])
+def test_the_command_compares_the_windows_of_a_table(group, sites, tmp_path, capsys, monkeypatch):
+    """Simulated windows of one seed against those of another, which take the part of the real ones."""
+    monkeypatch.setattr(command, "WINDOWS", 8)
+    monkeypatch.setattr(command, "SEEDS", (1,))
+    write_features(tmp_path / "real.csv", simulated_windows(8, seed=9, sites=sites))
+    words = ["realism", str(tmp_path / "real.csv"), "--group", group, "--out", str(tmp_path / "r"), "--json"]
+    assert main(words) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / "r" / "realism.json").read_text()) == report
+    assert set(report["realism"]) == {"1"}
+    assert set(report["realism"]["1"]) == {"medians", "transfers", "c2st"}
+    assert report["realism"]["1"]["c2st"]["all"] < 0.75
+
+
+def test_a_table_without_the_group_is_refused_before_the_work(tmp_path, capsys):
+    write_features(tmp_path / "real.csv", windows(np.random.default_rng(0), n=2))
+    assert main(["realism", str(tmp_path / "real.csv"), "--group", "dynamic"]) == 2
+    assert "dynamic" in capsys.readouterr().err

@@ -31,7 +31,7 @@ COMMANDS = (
     "studies.evaluate_features",
     "studies.evaluate_signatures",
     "users.extract_features",
-    "studies.twin",
+    "studies.realism",
     "studies.ablations",
     "studies.identifiability",
     "users.bench",

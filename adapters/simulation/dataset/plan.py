@@ -108,8 +108,3 @@ class DatasetSettings:
         if number % 2:
             return "none"
         return "left" if number % 4 == 0 or self.scene != JUNCTION else "right"
-
-
-def plan_static(n_static: int, seed: int) -> list[Plan]:
-    """Plan recordings at junctions: every other one an approach, left and right in turn, site after site."""
-    return DatasetSettings(n_static=n_static, seed=seed).plans()

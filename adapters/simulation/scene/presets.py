@@ -9,8 +9,8 @@ involved. The rest comes from `street-4` and `street-3`, which were set on the s
 too early.
 
 Distant vehicles are the free knob of false alarms. The published rule, trained on the same simulated
-junctions as in the twin, made on 40 hazard-free recordings of another seed than the twin's: 158 false
-alarms an hour with 0.4 in ten seconds at +4 dB, 227 with 0.7, 208 with 1.2 (the classifier learns to live
+junctions as in the evaluation, made on 40 hazard-free recordings of another seed: 158 false alarms
+an hour with 0.4 in ten seconds at +4 dB, 227 with 0.7, 208 with 1.2 (the classifier learns to live
 with them), and 336 with 0.6 at +8 dB, which is nearest to the published 350 and was taken.
 
 `street-5-calm` is the first of those four settings under a name of its own: a street that
@@ -18,8 +18,9 @@ the published rule finds half as busy.
 
 The history is not all clean: `street-2` was chosen among candidates after one look at a classifier's scores
 on simulated windows; what was kept of it (ambient octaves) is older than that look. And before this knob
-was set, the twin had been run on `street-4`, whose areas were too high and false alarms too few. Earlier
-presets are not offered: the physics that they were set with is gone. A change is a new name.
+was set, the published figures had been counted on `street-4`, whose areas were too high and false alarms
+too few. Earlier presets are not offered: the physics that they were set with is gone. A change is a new
+name.
 """
 
 from dataclasses import dataclass

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from hop_tables import blank_recording
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +13,6 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.operations.recordings.bearing_gating import bearing_curve, bearing_figures, check_bearings
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.streets.published_figures import checked_bearings
 
 PAIRS = st.lists(
     st.tuples(st.sampled_from([1.0, 1.1, 1.4, 2.0, 3.5]), st.floats(-7, 7)), min_size=1, max_size=40
@@ -97,20 +95,6 @@ def test_nothing_in_view_is_no_accuracy() -> None:
         None,
     )
     assert found["prominence_without"] == 1.2
-
-
-def test_simulated_recordings_are_pooled() -> None:
-    """Errors of 1 and 3 degrees at prominences 2 and 1.2; the window without a box counts as neither."""
-    quiet = blank_recording("a", 3)
-    sure = quiet.replace(prominence=np.full(3, 2.0), reference_rad=np.zeros(3), srp_rad=np.radians([1, 1, 1]))
-    unsure = sure.replace(
-        prominence=np.array([1.2, 1.2, 9.0]), srp_rad=np.radians([3, -3, 50]),
-        reference_rad=np.array([0.0, 0.0, np.nan]),
-    )  # fmt: skip
-    curve = bearing_curve(checked_bearings([unsure, sure]))
-    np.testing.assert_allclose(curve.coverage, [1.0, 0.6])
-    np.testing.assert_allclose(np.degrees(curve.median_error_rad), [1.0, 1.0])
-    np.testing.assert_allclose(curve.threshold, [1.2, 2.0])
 
 
 @pytest.mark.xdist_group("approach")

@@ -186,6 +186,7 @@ def _report(found: "Evaluation") -> dict[str, object]:
         "recordings": len(found.trials),
         "failed": {one.name: one.problem for one in found.failed},
         "lacking": dict(found.lacking),
+        "cautions": {name: run.cautions for name, run in found.runs.items()},
         "protocols": {
             name: {method: known(score.figures()) for method, score in scores.items()}
             for name, scores in found.scores.items()
@@ -199,7 +200,7 @@ def _lines(found: "Evaluation") -> list[str]:
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
     for name, scores in found.scores.items():
         run = found.runs[name]
-        lines += ["", f"{run.protocol.title}, {len(run.trials)} recordings"]
+        lines += ["", f"{run.protocol.title}, {len(run.trials)} recordings", *run.cautions]
         lines.append(f"{'':34}{'lead s':>8}{'detected':>10}{'FA/h':>8}{'bearing deg':>13}")
         for method, score in scores.items():
             if not method.startswith("curve"):

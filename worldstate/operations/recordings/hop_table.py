@@ -120,21 +120,18 @@ def joined(tables: Iterable[HopTable]) -> HopTable:
     return HopTable({name: np.concatenate([one.columns[name] for one in kept]) for name in kept[0].columns})
 
 
-def save_tables(path: str | Path, tables: Iterable[HopTable], origin: str = "") -> None:
-    """Write recordings with the same columns as npz without objects, whole or not at all.
-
-    `origin` names what they depend on.
-    """
-    _save(path, {"": list(tables)}, origin)
+def save_tables(path: str | Path, tables: Iterable[HopTable]) -> None:
+    """Write recordings with the same columns as npz without objects, whole or not at all."""
+    _save(path, {"": list(tables)})
 
 
 def load_tables(
-    path: str | Path, what: str, origin: str = "", check: Callable[[HopTable], None] = lambda table: None
+    path: str | Path, what: str, check: Callable[[HopTable], None] = lambda table: None
 ) -> list[HopTable]:
-    """Read what `save_tables` wrote; nothing if of another origin. `check` refuses what does not fit."""
+    """Read what `save_tables` wrote; `check` refuses what does not fit."""
 
     def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
-        tables = _tables(arrays, origin).get("", [])
+        tables = _tables(arrays).get("", [])
         for table in tables:
             check(table)
         return tables
@@ -144,7 +141,7 @@ def load_tables(
 
 def save_named(path: str | Path, tables: Mapping[str, HopTable]) -> None:
     """Write tables with columns of their own as npz without objects, whole or not at all."""
-    _save(path, {name: [table] for name, table in tables.items()}, "")
+    _save(path, {name: [table] for name, table in tables.items()})
 
 
 def load_named(path: str | Path, what: str) -> dict[str, HopTable]:
@@ -159,11 +156,11 @@ def load_named(path: str | Path, what: str) -> dict[str, HopTable]:
     ...     [(name, len(table)) for name, table in load_named(f"{folder}/a.npz", "tables").items()]
     [('boxes', 2), ('hops', 5)]
     """
-    tables = load_npz(path, what, MAX_BYTES, lambda arrays: _tables(arrays, ""))
+    tables = load_npz(path, what, MAX_BYTES, _tables)
     return {name: only for name, (only,) in tables.items()}
 
 
-def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]], origin: str) -> None:
+def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]]) -> None:
     """Write tables by kind: those of one kind have the same columns, which are stored end to end."""
     # One array a recording and column would make a list of members that the reader refuses as too long.
     about = [
@@ -171,7 +168,7 @@ def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]], origin: str
         for kind, tables in kinds.items()
         for one in tables
     ]
-    head = {"version": VERSION, "origin": origin, "recordings": about}
+    head = {"version": VERSION, "recordings": about}
     columns = {
         _member(kind, name): column
         for kind, tables in kinds.items()
@@ -185,15 +182,13 @@ def _member(kind: str, column: str) -> str:
     return f"{kind}/{column}" if kind else column
 
 
-def _tables(arrays: dict[str, AnyArray], origin: str) -> dict[str, list[HopTable]]:
+def _tables(arrays: dict[str, AnyArray]) -> dict[str, list[HopTable]]:
     about = arrays.pop("")
     if about.nbytes > MAX_HEAD_BYTES:
         raise InvalidArgumentError(f"expected a head of at most {MAX_HEAD_BYTES >> 20} MiB")
     head = json.loads(str(about))
     if head["version"] != VERSION:
         raise InvalidArgumentError(f"version: expected {VERSION}, got {head['version']}")
-    if head["origin"] != origin:
-        return {}
     if len(head["recordings"]) > MAX_RECORDINGS:
         raise InvalidArgumentError(f"expected at most {MAX_RECORDINGS} tables, got {len(head['recordings'])}")
     kinds: dict[str, list[dict[str, Any]]] = {}

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.operations.recordings.advisories import caution
+
 from .classification import Classifiers
 from .protocols import Protocol
 from .trial import Decisions, Method, Trial
@@ -20,6 +22,14 @@ class ProtocolRun:
     decisions: Mapping[str, tuple[tuple[Decisions, ...], ...]]
     seeds: tuple[int, ...]
     trained_on: str  # What the published classifier was trained on
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """What to say beside figures from so few approaches or hazard-free recordings."""
+        calm = sum(trial.hazard_free for trial in self.trials)
+        # Either kind by itself: no number of approaches makes the false alarms of three recordings readable.
+        kinds = {"approaches": len(self.trials) - calm, "hazard-free recordings": calm}
+        return tuple(said for what, count in kinds.items() if (said := caution(count, what)) is not None)
 
 
 def run_protocol(

@@ -1,1 +1,1 @@
-"""Published figures on simulated streets, and how far these are from real ones."""
+"""Simulated feature windows of junctions, and how far they are from real ones."""
