@@ -13,6 +13,9 @@ The published classifier is trained on --features, a table of windows such as th
 of tested recordings are left out; else on the recordings that are not tested; on simulated streets on other
 simulated recordings; else on the calibration recordings of each fold.
 
+OUT/report.html and OUT/report.md hold every table and figure beside the paper's, OUT/report_files the same as
+PNG and CSV.
+
 What was heard is kept in OUT/cache by the content of each recording: an interrupted run goes on where it
 stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for
 leaving junctions out two junctions that have both; what a protocol lacks is said before anything is heard.
@@ -70,6 +73,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.studies.evaluation.engine import Engine
     from worldstate.studies.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
     from worldstate.studies.evaluation.hearing import Hearing
+    from worldstate.studies.evaluation.report.contents import evaluation_document
+    from worldstate.studies.evaluation.report.writing import write_document
 
     _check(arguments)
     output_folder(arguments.out, "evaluation.json")
@@ -88,6 +93,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         )
     report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
+    write_document(evaluation_document(found), arguments.out)
     return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
 
 

@@ -36,6 +36,8 @@ class Decisions:
         Stated time to visible: low end, best value and high end of its interval; NaN where not stated.
     tracks : HopTable
         One row a hop and track: `time_s`, `track` (a number that names the identity), `azimuth_rad`.
+    threshold : ndarray, shape (1,) or (0,)
+        What the score is held against, if a method holds it against anything.
 
     Examples
     --------
@@ -52,6 +54,7 @@ class Decisions:
     risk: FloatArray
     visible_s: FloatArray
     tracks: HopTable
+    threshold: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @classmethod
     def of(
@@ -65,6 +68,7 @@ class Decisions:
         risk: FloatArray | None = None,
         visible_s: FloatArray | None = None,
         tracks: HopTable | None = None,
+        threshold: FloatArray | None = None,
     ) -> "Decisions":
         """Return the decisions of a method that states only some of the columns."""
         n = len(time_s)
@@ -78,6 +82,7 @@ class Decisions:
             unknown if risk is None else risk,
             np.full((n, 3), np.nan) if visible_s is None else visible_s,
             HopTable.of_rows(TRACK_COLUMNS, ()) if tracks is None else tracks,
+            np.empty(0) if threshold is None else threshold,
         )
 
 

@@ -52,6 +52,7 @@ class CalibratedCue:
                 bearing_rad=trial.hops.bearing_rad,
                 score=score,
                 risk=risk_map(score),
+                threshold=np.array([gamma]),
             )
 
         return decide
