@@ -15,6 +15,14 @@ from worldstate.ground.errors import InputFileError
 from worldstate.operations.metrics.recording_draws import stratified_draws
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.studies.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
+from worldstate.studies.degradation.beta_curves import Band, BetaCurves
+from worldstate.studies.degradation.conditions import CLEAN, FAMILIES, Condition
+from worldstate.studies.degradation.degradation_study import (
+    DegradationSettings,
+    DegradationStudy,
+    DetectorSweep,
+)
 from worldstate.studies.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate.studies.evaluation.front_end_study import front_end_study
 from worldstate.studies.evaluation.methods.calibrated_cue import CalibratedCue
@@ -245,8 +253,8 @@ def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(eva
     assert detected.low <= detected.value <= detected.high
     rate = cells["false alarms (1/h)"]
     assert (rate.low, rate.high) == evaluation.scores["static"]["proposed .02"].poisson()
-    array = {row[0].split(": ")[1]: row[1:3] for row in blocks["array"].rows}
-    for here, paper in array.values():
+    assert len(blocks["array"].rows) == 7
+    for _, here, paper, _ in blocks["array"].rows:
         assert here.value == pytest.approx(paper.value, rel=0.025), "the bounds need no sound"
     write_document(document, tmp_path)
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -268,3 +276,50 @@ def test_an_approach_without_video_is_drawn_without_images_and_says_so():
     assert "left out" in figure.caption
     # The boxes of one image are counted at its hop, each once.
     assert sum(row[3] for row in figure.numbers.rows) == 2
+
+
+def degradation(detectors):
+    """A sweep in which beta is .1 a level and awareness .98 less .01 a level."""
+    shape = (len(FAMILIES), 5)
+    overall = np.broadcast_to(0.05 + 0.1 * np.arange(5), shape)
+    wide = np.broadcast_to(overall[:, None], (shape[0], 3, shape[1]))
+    by_azimuth = wide + np.array([0.0, 0.01, 0.02])[:, None]
+    conditions = [Condition(CLEAN), *(Condition(f, level) for f in FAMILIES for level in range(1, 5))]
+    rows = tuple(
+        AwarenessRow(
+            one, one.degradation, 0.1, Estimate(0.95 - 0.1 * one.level, 0.4, 1.0), 0.9,
+            Estimate(0.98 - 0.01 * one.level, 0.9, 1.0), None, 0.8, None,
+            Estimate(10.0, 1.0, 40.0), Estimate(10.0, 1.0, 40.0), 0.1,
+        )
+        for one in conditions
+    )  # fmt: skip
+    half = Estimate(0.5, 0.4, 0.6)
+    sweeps = tuple(
+        DetectorSweep(
+            name,
+            BetaCurves(
+                (0.0, 10.0, 20.0, 36.0), np.full(by_azimuth.shape, 30.0), Band(*[by_azimuth] * 3),
+                Band(*[overall] * 3), (),
+            ),
+            Awareness(rows, (CommonCause(1, 6.0, half, half, half, half, half),), 100, 0.03),
+        )
+        for name in detectors
+    )  # fmt: skip
+    return DegradationStudy(sweeps, ("a", "b"), ("c", "d"), {}, (), DegradationSettings())
+
+
+def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation, tmp_path):
+    document = evaluation_document(evaluation, degradation=degradation(("first", "<b>second")))
+    names = [block.name for block in document.all_blocks]
+    assert len(set(names)) == len(names)
+    assert {"cueing_awareness_1", "cueing_awareness_2", "degradation_2", "rain_2"} <= set(names)
+    paper = {row[2]: row[3:6] for block in document.all_blocks if block.name == "paper" for row in block.rows}
+    least, _, found = paper["after line-of-sight entry: least hazard awareness"]
+    assert (least.value, found.value) == (0.87, pytest.approx(0.94))
+    _, _, found = paper["miss rate of the camera: clean, 20 to 30 deg"]
+    assert found.value == pytest.approx(0.07)
+    (panel,) = (block for block in document.all_blocks if block.name == "cueing_awareness_1")
+    (worst,) = (row[2:4] for row in panel.numbers.rows if row[0] == "blur" and row[1] == 4)
+    assert worst == pytest.approx((0.45, 0.94))
+    write_document(document, tmp_path)
+    assert "<b>second" not in (tmp_path / "report.html").read_text(encoding="utf-8")

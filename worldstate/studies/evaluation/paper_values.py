@@ -37,8 +37,10 @@ class PaperValue:
 
     @property
     def digits(self) -> int:
-        """Decimals with which the paper prints it, such as 3 of 0.881."""
-        return len(f"{self.value:.10g}".partition(".")[2])
+        """Decimals with which the paper prints it, such as 3 of 0.881 and 2 of 0.70."""
+        stated = len(f"{self.value:.10g}".partition(".")[2])
+        # A float keeps no trailing zero; shares and areas have two decimals everywhere in the paper.
+        return max(stated, 2) if stated and self.unit in ("share", "") else stated
 
 
 _NAN = math.nan

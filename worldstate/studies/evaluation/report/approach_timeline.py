@@ -79,7 +79,7 @@ def approach_figure(approach: ApproachTimeline) -> ReportFigure:
         "approach_timeline",
         approach.title,
         f"{camera}Below: hazard statistic at the end of each 1-s window, threshold, advisory, moving boxes "
-        f"of the "
+        "of the "
         "camera, and line-of-sight entry T0.",
         draw,
         Curves(

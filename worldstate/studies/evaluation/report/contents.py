@@ -8,6 +8,7 @@ import scipy
 import sklearn
 
 from worldstate.ground.version import __version__
+from worldstate.studies.degradation.degradation_study import DegradationStudy
 from worldstate.studies.evaluation.evaluation import Evaluation
 from worldstate.studies.evaluation.hearing import data_fingerprint
 from worldstate.studies.evaluation.protocols import PROTOCOLS, STATIC
@@ -15,22 +16,29 @@ from worldstate.studies.signatures.signature_study import SignatureStudy
 
 from . import study_sections as study
 from . import warning_sections as warning
+from .degradation_section import awareness_figures, degradation_section, degradation_values
 from .document import Document, ReportTable, Section, Value
 from .measured_values import Values, measured_values
 
 
-def evaluation_document(found: Evaluation, signatures: SignatureStudy | None = None) -> Document:
+def evaluation_document(
+    found: Evaluation,
+    signatures: SignatureStudy | None = None,
+    degradation: DegradationStudy | None = None,
+) -> Document:
     """Return the whole report; sections that nothing was measured for say so."""
-    values = measured_values(found)
+    values = measured_values(found, {} if degradation is None else degradation_values(degradation))
+    panels = () if degradation is None else awareness_figures(degradation)
     data = "SIMULATED streets" if found.takes.simulated else "Recordings that were given"
     static = STATIC.name in found.runs
     sections = [
         _data_section(found, values),
         *((warning.table_i(found, values), warning.budget_section(found, values)) if static else ()),
-        *((warning.cueing_section(found, values, ()), warning.approach_section(found)) if static else ()),
+        *((warning.cueing_section(found, values, panels), warning.approach_section(found)) if static else ()),
         study.front_end_section(found, values),
         study.approach_rate_section(values),
         study.transfer_section(found, values),
+        degradation_section(degradation),
         *((study.ablation_section(found, values),) if static else ()),
         study.signature_section(signatures),
         *((warning.tracking_section(found, values),) if static else ()),
@@ -40,7 +48,7 @@ def evaluation_document(found: Evaluation, signatures: SignatureStudy | None = N
     return Document(
         "Evaluation of hidden-hazard warnings from sound",
         f"{data}: {found.takes.origin}, {len(found.trials)} recordings, {_hours(found):.3f} h of them "
-        f"hazard-free.",
+        "hazard-free.",
         tuple(sections),
         _facts(found),
     )

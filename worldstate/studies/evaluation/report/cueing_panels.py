@@ -166,7 +166,7 @@ def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) 
         "cueing_operating",
         "(c) Detection against achieved false alarms",
         f"Bars are 95 % intervals; open marks are the paper's. One alarm onset is {quantum_per_hour:.3g} "
-        f"an hour: "
+        "an hour: "
         "left of it the axis is linear, right of it logarithmic.",
         draw,
         Curves(("method", "alpha", *columns), rows),

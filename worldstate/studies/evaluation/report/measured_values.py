@@ -45,9 +45,9 @@ _FRONT_END = {
 }
 
 
-def measured_values(found: Evaluation) -> dict[Place, Value]:
-    """Return the values of all protocols and methods, the front-end, the array and the data."""
-    values = dict(_data_values(found)) | dict(_array_values())
+def measured_values(found: Evaluation, others: Values) -> dict[Place, Value]:
+    """Return the values of all protocols and methods, the front-end, the array and the data, and others."""
+    values = dict(others) | dict(_data_values(found)) | dict(_array_values())
     for protocol, scores in found.scores.items():
         for method, score in scores.items():
             if not method.startswith("curve"):

@@ -85,7 +85,7 @@ def junction_figure(
                 axes.plot(*place, "ko", ms=11, fillstyle="none", label="worst junction")
         axes.set_yticks(range(len(sites)), sites)
         axes.set(xlabel=unit, ylim=(len(sites) - 0.5, -0.5))
-        legend_below(canvas)
+        legend_below(canvas, columns=1)
 
     rows = [
         (method, site, value.value, value.low, value.high)
@@ -99,7 +99,7 @@ def junction_figure(
         "a method.",
         draw,
         Curves(("method", "junction", "value", "low", "high"), rows),
-        size_in=(4.4, 1.5 + 0.5 * max(len(sites), 1)),
+        size_in=(4.4, 1.6 + 0.18 * len(values) + 0.5 * max(len(sites), 1)),
     )
 
 

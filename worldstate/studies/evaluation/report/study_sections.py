@@ -34,16 +34,64 @@ _ABLATIONS = {
 }
 
 
+_WORDS = {
+    "lead_s": "lead",
+    "detection": "detected",
+    "false_alarms_per_hour": "false alarms",
+    "ece": "ECE",
+    "ece_raw": "ECE of the raw statistic",
+    "auroc_all": "AUROC, all before T0",
+    "auroc_2s": "AUROC, last 2 s",
+    "auroc_1s": "AUROC, last 1 s",
+    "hazard_free_hours": "hazard-free time",
+    "quantum_per_hour": "one alarm onset",
+    "bearing_deg": "median error",
+    "bearing_best_site_deg": "median error, best junction",
+    "bearing_worst_site_deg": "median error, worst junction",
+    "bearing_music_deg": "median error of MUSIC",
+    "bearing_gated_deg": "median error, gated",
+    "gated_coverage": "share kept by the gate",
+    "prominence_in_view": "prominence in view",
+    "prominence_in_silence": "prominence, hazard-free",
+    "detection_least": "detected, least",
+    "detection_most": "detected, most",
+    "detection_worst": "detected, worst junction",
+    "detection_best": "detected, best junction",
+    "approaches_with_early_box": "approaches with a box before T0",
+    "t0_s": "T0",
+    "fewer_false_alarms": "false alarms saved",
+    "pass_bys": "approaches",
+    "doppler_usable": "with a usable tone",
+    "doppler_speed_km_h": "speed read from it",
+    "looming_correlation": "correlation with the true time",
+    "looming_auroc": "AUROC, last 3 s",
+    "beta_boresight_clean": "clean, at boresight",
+    "beta_20_30_deg": "clean, 20 to 30 deg",
+    "beta_harshest": "harshest noise",
+    "beta_clean": "clean, all angles",
+    "beta_clean_large": "clean, all angles, other detector",
+    "awareness_least": "least hazard awareness",
+    "vision_least": "least of vision alone",
+}
+
+
 def group_table(
     name: str, title: str, values: Values, groups: Sequence[str], caption: str = ""
 ) -> ReportTable:
     """Return the paper's values of some groups beside ours, a row each."""
     rows = tuple(
-        (f"{one.row}: {one.figure}", _ours(one, values), _paper(one), one.unit)
+        (_label(one), _ours(one, values), _paper(one), one.unit)
         for one in PAPER_VALUES
         if one.group in groups and one.basis != "stated"
     )
     return ReportTable(name, title, ("figure", "here", "paper", "unit"), rows, caption)
+
+
+def _label(one: PaperValue) -> str:
+    """Condition and figure in words; where the row names the figure already, the row alone."""
+    if one.group in ("array bounds", "signature study", "data", "real time"):
+        return one.row
+    return f"{one.row}: {_WORDS.get(one.figure, one.figure.replace('_', ' '))}"
 
 
 def _ours(one: PaperValue, values: Values) -> Value:
@@ -250,8 +298,7 @@ def paper_section(found: Evaluation, values: Values) -> Section:
         (
             one.section,
             one.group,
-            one.row,
-            one.figure,
+            _label(one),
             _paper(one),
             one.unit,
             _ours(one, values),
@@ -268,7 +315,7 @@ def paper_section(found: Evaluation, values: Values) -> Section:
     table = ReportTable(
         "paper",
         "Every number of sections IV, VII, VIII and IX",
-        ("section", "about", "row", "figure", "paper", "unit", "here", "filled by"),
+        ("section", "about", "figure", "paper", "unit", "here", "filled by"),
         rows,
     )
     return Section("The paper's numbers, and what they need", (text,), (table,))

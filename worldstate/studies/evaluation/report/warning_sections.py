@@ -137,7 +137,7 @@ def table_i(found: Evaluation, values: Values) -> Section:
             f"False alarms are counted on {hours.number} h of hazard-free time, so one alarm onset is "
             f"{quantum.number} an hour (paper: 0.103 h, 9.7 an hour).",
             f"Vision only: a moving box precedes T0 in {early.number} {early.note} approaches (paper: 3 of "
-            f"42, put "
+            "42, put "
             "down to the tolerance of the T0 annotation and printed as 0).",
         ),
         (table, lead_figure(leads, {method: one.value for method, one in stated.items() if one})),
@@ -274,10 +274,11 @@ def approach_section(found: Evaluation) -> Section:
         return Section("One approach end to end", ("No approach was detected by the proposed method.",))
     middle = chosen[np.argsort(leads[chosen], kind="stable")[(chosen.size - 1) // 2]]
     trial, said = pairs[middle]
-    moving = trial.boxes.moving.astype(bool)
+    # Before the first hop a parked car cannot be told from a moving one.
+    moving = trial.boxes.moving.astype(bool) & (trial.boxes.time_s >= said.time_s[0])
     timeline = ApproachTimeline(
         f"Approach {trial.name} at {trial.site}, from the {trial.label}: lead {leads[middle]:.1f} s "
-        f"(paper's: 2.3 s)",
+        "(paper's: 2.3 s)",
         said.time_s,
         said.score,
         float(said.threshold[0]),
