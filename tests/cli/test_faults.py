@@ -103,7 +103,6 @@ def files(tmp_path, monkeypatch) -> Path:
         ("simulate --out a.wav", "a.wav"),
         ("evaluate --out a.wav", "a.wav"),
         ("realism t.csv --out a.wav", "a.wav"),
-        ("evaluate-degradation set --miss-rates m.json --out a.wav", "a.wav"),
     ],
 )
 def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files, capsys):

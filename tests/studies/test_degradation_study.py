@@ -1,5 +1,7 @@
 """The passes of the degradation sweep over one recording, and the study over several."""
 
+import json
+import shutil
 from dataclasses import replace
 from itertools import islice
 from types import SimpleNamespace
@@ -9,10 +11,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.camera.camera_channel import Watcher
 from worldstate.adapters.camera.camera_health import learn_health
+from worldstate.adapters.camera.degradation import degrade
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
-from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
@@ -30,6 +35,7 @@ from worldstate.operations.detectors.miss_rate_measurement import (
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate.studies.degradation.beta_curves import absence_counts, counts_table
 from worldstate.studies.degradation.conditions import CLEAN, FAMILIES, OFF, Condition, all_conditions
+from worldstate.studies.degradation.degradation_report import degradation_lines, degradation_values
 from worldstate.studies.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate.studies.degradation.looks import (
     READINGS,
@@ -98,6 +104,19 @@ def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
         assert frame.labels == found.labels
         assert frame.scores == pytest.approx(found.scores)
     assert kept.stamps_ns[:3].tolist() == [0, 100_000_000, 200_000_000]
+
+
+@pytest.mark.xdist_group("approach")
+def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
+    watcher = Watcher(MotionDetector(), rates)
+    for number, image in enumerate(islice(video.frames(), 90)):
+        watcher.look(100_000_000 * number, image)
+    watched, kept = watcher.watched(), detections_in(looks["mog2"], CLEAN)
+    assert [len(frame) for frame in watched.detections.frames] == [len(frame) for frame in kept.frames[:90]]
+    read = degradation_in(looks[READINGS], CLEAN, rates)
+    assert np.median(watched.degradation.degradation) == pytest.approx(np.median(read.degradation), abs=0.05)
+    with pytest.raises(InvalidArgumentError, match="health"):
+        Watcher(MotionDetector(), replace(rates, health=None))
 
 
 @pytest.mark.xdist_group("approach")
@@ -196,6 +215,28 @@ def assert_the_sound_says_the_same(source, off):
         said.append(measurement.signature.log_likelihoods)
     assert off.log_likelihoods == pytest.approx(np.array(said))
     assert off.presence == pytest.approx(np.array(presence))
+
+
+@pytest.mark.xdist_group("approach")
+def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
+    folder = tmp_path / "recording"
+    shutil.copytree(approach.folder, folder)
+    writer = cv2.VideoWriter(str(folder / VIDEO_NAME), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    for number, frame in enumerate(video.frames()):
+        writer.write(degrade(frame, "darkness", 1.0 if number >= 50 else 0.0, np.random.default_rng(0)))
+    writer.release()
+    darkening = replace(rates, families={"darkness": rates.families["noise"]})
+    save_miss_rates(tmp_path / "beta.json", darkening)
+    source = open_source(folder, miss_rates=tmp_path / "beta.json")
+    assert source.miss_rates.table == darkening.table
+    assert source.degradation(2_000_000_000) < 0.1 < 0.9 < source.degradation(8_000_000_000)
+    betas = {
+        m.stamp_ns: m.co_evidence.miss_rate
+        for _, m in measure_steps(source)
+        if isinstance(m.co_evidence, Absent)
+    }
+    assert np.median([b for t, b in betas.items() if t < 4_500_000_000]) < 0.4
+    assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
 
 
 @pytest.mark.xdist_group("approach")
@@ -303,4 +344,8 @@ def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recor
     assert again.awareness == sweep.awareness
     assert np.array_equal(again.beta.overall.value, sweep.beta.overall.value, equal_nan=True)
     assert len(sweep.awareness.rows) == 26
+    values = json.loads(json.dumps(degradation_values(first), allow_nan=False))
+    assert values["detectors"]["mog2"]["rows"][0]["awareness"] == list(sweep.awareness.rows[0].awareness)
+    assert values["skipped"].keys() == {broken.recording_id}
+    assert any(line.startswith("noise 0.75") for line in degradation_lines(first))
     assert sweep.least_vision.vision.value <= 0.05 < 0.5 < sweep.awareness.row(CLEAN).vision.value

@@ -27,7 +27,6 @@ COMMANDS = (
     "users.calibrate",
     "users.measure_absence",
     "studies.evaluate",
-    "studies.evaluate_degradation",
     "studies.evaluate_features",
     "studies.evaluate_signatures",
     "users.extract_features",

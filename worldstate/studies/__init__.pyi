@@ -1,7 +1,5 @@
 from .degradation.degradation_study import DegradationSettings as DegradationSettings
 from .degradation.degradation_study import degradation_study as degradation_study
-from .degradation.degradation_sweep import SweepSettings as SweepSettings
-from .degradation.degradation_sweep import degradation_sweep as degradation_sweep
 from .features.comparison import comparison as comparison
 from .paper.ablations import AblationSwitches as AblationSwitches
 from .paper.ablations import evaluate_ablation as evaluate_ablation

@@ -27,11 +27,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.detector_options import detector_filter, detector_maker, detector_name
 from worldstate.cli.common.output import CommandResult, write_report
 from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import Bar, progress_bar
 
 if TYPE_CHECKING:
+    from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.evaluation.classification import Classifiers
     from worldstate.studies.evaluation.evaluation import Evaluation
     from worldstate.studies.evaluation.takes import TakeList
@@ -46,6 +48,7 @@ examples:
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59
 SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
+SMOKE_WIDTH_PX = 160
 FULL_SEEDS = 5
 
 
@@ -60,6 +63,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--dynamic-ids", type=Path, metavar="CSV", help="tested recordings of a moving ego")
     add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="more time without a vehicle")
     add("--hazard-free-hours", type=float, metavar="H", help="score so many hours of it (default: all)")
+    add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
+    add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
     add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
     add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times")
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
@@ -89,12 +94,27 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             classifiers,
             Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
             _Bars(stack),
-            EvaluationSettings(seeds, arguments.hazard_free_hours),
+            EvaluationSettings(seeds, arguments.hazard_free_hours, degradation=_degradation(arguments)),
         )
     report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
     write_document(evaluation_document(found), arguments.out)
     return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
+
+
+def _degradation(arguments: argparse.Namespace) -> "DegradationSettings":
+    """Return the sweep over camera states; in a smoke test of one detector on small images."""
+    from worldstate.studies.degradation.degradation_study import DegradationSettings
+    from worldstate.studies.degradation.looks import StagedDetector, motion_detectors
+
+    detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
+    if arguments.smoke:
+        return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
+    if arguments.onnx_model is not None:
+        onnx = argparse.Namespace(**vars(arguments), detector="onnx")
+        second = detector_name(onnx), detector_maker(onnx), detector_filter(onnx)
+        detectors = detectors[0], StagedDetector(*second)
+    return DegradationSettings(detectors, model, seed=seed)
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -184,6 +204,8 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
 def _report(found: "Evaluation") -> dict[str, object]:
     import math
 
+    from worldstate.studies.degradation.degradation_report import degradation_values
+
     def known(values: "dict[str, float]") -> dict[str, float | None]:
         return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
@@ -197,11 +219,14 @@ def _report(found: "Evaluation") -> dict[str, object]:
             name: {method: known(score.figures()) for method, score in scores.items()}
             for name, scores in found.scores.items()
         },
+        "degradation": None if found.degradation is None else degradation_values(found.degradation),
         "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
     }
 
 
 def _lines(found: "Evaluation") -> list[str]:
+    from worldstate.studies.degradation.degradation_report import degradation_lines
+
     lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
     for name, scores in found.scores.items():
@@ -215,4 +240,4 @@ def _lines(found: "Evaluation") -> list[str]:
                 cells = [figures[key] for key in shown]
                 texts = ["-" if cell != cell else f"{cell:.3g}" for cell in cells]
                 lines.append(f"{method:34}{texts[0]:>8}{texts[1]:>10}{texts[2]:>8}{texts[3]:>13}")
-    return lines
+    return lines if found.degradation is None else [*lines, *degradation_lines(found.degradation)]

@@ -1,77 +1,90 @@
-"""The sweep over camera states as JSON, as a table and as a figure."""
+"""The degradation study as JSON and as text."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
+from typing import Any
 
-from worldstate.operations.figure_style import figure_file
+from worldstate.adapters.camera.degradation import LEVELS
 
-from .degradation_sweep import SweepRow
-from .degraded_detections import CLEAN, OFF
+from .awareness import AwarenessRow
+from .beta_curves import Band
+from .conditions import FAMILIES
+from .degradation_study import DegradationStudy, DetectorSweep
 
-COLUMNS = (
-    ("d", "degradation"), ("beta", "miss_rate"), ("vision", "vision_only"), ("any", "any_detection"),
-    ("aware", "awareness"),
-    ("unseen", "unseen_awareness"), ("detected", "detected"), ("lead s", "lead_time_s"),
-    ("FA/h", "false_alarms_per_hour"), ("false aware/h", "false_awareness_per_hour"),
-    ("share", "false_awareness"),
-)  # fmt: skip
-_FIGURES = ("false_alarms_per_hour", "false_awareness_per_hour", "false_awareness")
+_COLUMNS = ("d", "beta", "vision", "aware", "unseen", "detected", "lead s", "FA/h", "aware/h", "share")
 
 
-def sweep_report(rows: Sequence[SweepRow]) -> dict[str, object]:
-    """Return the rows and what the claim rests on: the worst of each column over the camera's states."""
-    # A ratio of false alarms to those of the clean camera is null where the clean camera has none.
-    staged = [row for row in rows if row.state != OFF]
-    clean = next(row for row in staged if row.state == CLEAN)
-    ratios = {f"largest_ratio_of_{name}": _largest_ratio(staged, clean, name) for name in _FIGURES}
+def degradation_values(study: DegradationStudy) -> dict[str, Any]:
+    """Return everything that was found, ready for JSON; null where nothing is known."""
+    values = {
+        "approaches": study.approaches,
+        "hazard_free": study.hazard_free,
+        "skipped": study.skipped,
+        "missing": study.missing,
+        "beta_shift": study.beta_shift,
+        "largest_awareness_difference": study.largest_awareness_difference,
+        "detectors": {sweep.detector: _sweep(sweep) for sweep in study.sweeps},
+    }
+    known: dict[str, Any] = _known(values)
+    return known
+
+
+def degradation_lines(study: DegradationStudy) -> list[str]:
+    """Return a table a detector, one row a condition, and what rain takes at once."""
+    return [line for sweep in study.sweeps for line in _lines(sweep)]
+
+
+def _sweep(sweep: DetectorSweep) -> dict[str, object]:
+    beta, found = sweep.beta, sweep.awareness
     return {
-        "clean_awareness": clean.awareness,
-        "least_awareness": min(row.awareness for row in staged),
-        "clean_vision_only": clean.vision_only,
-        "least_vision_only": min(row.vision_only for row in staged),
-        **ratios,
-        "states": [asdict(row) for row in rows],
+        "hops_in_view": found.hops_in_view,
+        "hazard_free_hours": found.hazard_free_hours,
+        "least_awareness": sweep.least_awareness.awareness,
+        "least_vision": sweep.least_vision.vision,
+        "rows": [{"name": row.condition.name, **asdict(row)} for row in found.rows],
+        "common_cause": [asdict(cause) for cause in found.common_cause],
+        "beta": {
+            "families": FAMILIES,
+            "levels": LEVELS,
+            "azimuth_deg": beta.azimuth_deg,
+            "looks": beta.looks.tolist(),
+            "by_azimuth": _lists(beta.by_azimuth),
+            "overall": _lists(beta.overall),
+            "falls": [asdict(fall) for fall in beta.falls],
+        },
     }
 
 
-def _largest_ratio(staged: Sequence[SweepRow], clean: SweepRow, name: str) -> float | None:
-    before = getattr(clean, name)
-    return max(getattr(row, name) for row in staged) / before if before else None
+def _lists(band: Band) -> dict[str, object]:
+    return {name: part.tolist() for name, part in band._asdict().items()}
 
 
-def sweep_table(rows: Sequence[SweepRow]) -> str:
-    """Return the rows as text, one a state."""
-    lines = [f"{'state':14}" + "".join(f"{title:>14}" for title, _ in COLUMNS)]
-    for row in rows:
-        values = [getattr(row, name) for _, name in COLUMNS]
-        texts = ["-" if value is None else f"{value:.{0 if value >= 20.0 else 3}f}" for value in values]
-        lines.append(f"{row.state:14}" + "".join(f"{text:>14}" for text in texts))
-    return "\n".join(lines)
+def _known(value: Any) -> Any:
+    """Replace NaN, which JSON does not know, by null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _known(one) for key, one in value.items()}
+    return [_known(one) for one in value] if isinstance(value, list | tuple) else value
 
 
-def write_sweep_figure(rows: Sequence[SweepRow], path: Path) -> None:
-    """Draw awareness and vision alone over the share of misses, and false alarms, by the ending of `path`."""
-    with figure_file(path, 8.5, 3.4) as figure:
-        left, right = figure.subplots(1, 2)
-        staged = [row for row in rows if row.state != OFF]
-        families = sorted({row.state.split()[0] for row in staged} - {CLEAN})
-        for family in families:
-            chosen = [row for row in staged if row.state.split()[0] in (CLEAN, family)]
-            missed = [1.0 - row.vision_only for row in chosen]
-            (line,) = left.plot(missed, [row.awareness for row in chosen], marker="o", label=family)
-            low, high = zip(*(row.awareness_interval for row in chosen), strict=True)
-            left.fill_between(missed, low, high, color=line.get_color(), alpha=0.12, lw=0)
-            d = range(len(chosen))
-            right.plot(d, [row.false_alarms_per_hour for row in chosen], marker="o", color=line.get_color())
-            aware = [row.false_awareness_per_hour for row in chosen]
-            right.plot(d, aware, ls=":", color=line.get_color())
-        left.plot([0.0, 1.0], [1.0, 0.0], color="grey", label="vision alone")
-        left.set(
-            xlabel="share of hops that the detector misses",
-            ylabel="hazard awareness after $T_0$",
-            ylim=(0, 1.02),
-        )
-        left.legend(fontsize="small", loc="lower left")
-        right.set(xlabel="level of the family", ylabel="per hazard-free hour", ylim=(0, None))
-        right.set_title("advisories (solid), awareness (dotted)", fontsize="small")
+def _lines(sweep: DetectorSweep) -> Iterator[str]:
+    yield ""
+    yield f"camera states, detector {sweep.detector}, {sweep.awareness.hops_in_view} hops in view"
+    yield f"{'':16}" + "".join(f"{title:>10}" for title in _COLUMNS)
+    for row in sweep.awareness.rows:
+        yield f"{row.condition.name:16}" + "".join(f"{_text(value):>10}" for value in _cells(row))
+    for cause in sweep.awareness.common_cause:
+        rain = f"rain {LEVELS[cause.level]:g} at {cause.noise_db:+.0f} dB: aware {cause.rain.value:.2f}"
+        yield rain + "; additive effects say {:.2f} [{:.2f}, {:.2f}] too much".format(*cause.optimism)
+
+
+def _cells(row: AwarenessRow) -> tuple[float | None, ...]:
+    sees = row.degradation, row.miss_rate, row.vision.value, row.awareness.value, row.unseen_awareness
+    false = row.false_alarms_per_hour.value, row.false_awareness_per_hour.value, row.false_awareness
+    return *sees, row.detected, row.lead_time_s, *false
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.{0 if value >= 20.0 else 2}f}"

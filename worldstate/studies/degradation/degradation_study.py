@@ -220,11 +220,12 @@ def degradation_study(
     ...     degradation_study([])
     ... except InvalidArgumentError as error:
     ...     print(str(error).partition(";")[0])
-    recordings: expected at least 2 filmed approaches and 2 filmed hazard-free ones
+    recordings: a sweep needs 2 filmed approaches and 2 filmed hazard-free recordings
     """
     chosen = settings or DegradationSettings()
     data = sweep_data(recordings, chosen.approaches, chosen.hazard_free)
-    data.check()
+    if data.lacks is not None:
+        raise InvalidArgumentError(f"recordings: a sweep {data.lacks}")
     passes = _Passes(chosen, {one.recording_id: fingerprint(one.path) for one in data.recordings}, keep)
     rng, skipped = np.random.default_rng(chosen.seed), dict[str, str]()
     seen = _done(over, passes.look, [Item(one) for one in data.recordings], skipped)

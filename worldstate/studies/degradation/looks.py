@@ -34,7 +34,7 @@ from .conditions import CLEAN, Condition, at_level, camera_conditions
 # Changes whenever the same video would give other detections.
 VERSION = 1
 # What is staged does not change within a recording, and reading it costs as much as two detections.
-HEALTH_PERIOD_S = 1.0
+HEALTH_PERIOD_S = 2.0
 # Around the part of an image that its quality is read from: the widest blur, 16 px, ends at three of them.
 _MARGIN_PX = 48
 READINGS = "readings"

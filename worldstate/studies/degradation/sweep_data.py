@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.ground.errors import InvalidArgumentError
 
 # Of each kind: with fewer, no recording is left to set thresholds and miss rates on.
 LEAST = 2
@@ -25,11 +24,13 @@ class SweepData:
         """Both kinds."""
         return *self.approaches, *self.hazard_free
 
-    def check(self) -> None:
-        """Refuse too few before the first video is opened."""
-        if min(len(self.approaches), len(self.hazard_free)) < LEAST:
-            expected = f"expected at least {LEAST} filmed approaches and {LEAST} filmed hazard-free ones"
-            raise InvalidArgumentError(f"recordings: {expected}; {'; '.join(self.missing)}")
+    @property
+    def lacks(self) -> str | None:
+        """What a sweep needs and does not find; None where it can be run."""
+        if min(len(self.approaches), len(self.hazard_free)) >= LEAST:
+            return None
+        least = f"needs {LEAST} filmed approaches and {LEAST} filmed hazard-free recordings"
+        return f"{least}; {'; '.join(self.missing)}"
 
 
 def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_free: int = 12) -> SweepData:

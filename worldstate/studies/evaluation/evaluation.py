@@ -9,8 +9,10 @@ import numpy as np
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import IndexArray
 from worldstate.operations.metrics.recording_draws import DRAWS, stratified_draws
+from worldstate.studies.degradation.degradation_study import DegradationSettings, DegradationStudy
 from worldstate.studies.paper.ablations import AblationRow, AblationSwitches, ablation_table
 
+from .camera_failure import camera_failure, lacking_films
 from .classification import Classifiers
 from .engine import Engine, Failed
 from .front_end_study import FrontEndStudy, front_end_study
@@ -46,6 +48,7 @@ class EvaluationSettings:
     seeds: tuple[int, ...] = (1,)  # Of the folds, which are drawn again for each
     hazard_free_hours: float | None = None  # Of hazard-free time that is scored; all where not given
     draws: int = DRAWS  # Samples of recordings that intervals are read from
+    degradation: DegradationSettings | None = None  # Of the camera; not swept where not given
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +64,7 @@ class Evaluation:
     draws: Mapping[str, IndexArray]  # Samples of recordings by protocol, the same for every method
     front_end: FrontEndStudy | None  # Of the standing ego, whose camera is a reference
     ablations: Mapping[str, AblationRow]
+    degradation: DegradationStudy | None  # Ablation (c), on the filmed recordings
     settings: EvaluationSettings
 
 
@@ -117,6 +121,7 @@ def evaluate(
         },
         front_end_study(standing, rng, settings.draws) if filmed else None,
         _ablations(standing, classifiers, settings.seeds[0]) if STATIC.name in runs else {},
+        _degradation(takes, hearing, engine, steps, settings.degradation, lacking),
         settings,
     )
 
@@ -126,6 +131,23 @@ def _run(
 ) -> ProtocolRun:
     own = [trial for trial in trials if bool(trial.hops.about["moving"]) == protocol.moving]
     return run_protocol(protocol, own, methods_for(own), classifiers, seeds)
+
+
+def _degradation(
+    takes: TakeList,
+    hearing: Hearing,
+    engine: Engine,
+    steps: Steps,
+    settings: DegradationSettings | None,
+    lacking: dict[str, str],
+) -> DegradationStudy | None:
+    if settings is None:
+        return None
+    lacks = lacking_films(takes, settings)
+    if lacks is not None:
+        lacking["degradation sweep"] = lacks
+        return None
+    return camera_failure(takes, hearing.folder, engine, settings, steps.begin, steps.advance)
 
 
 def _ablations(trials: Sequence[Trial], classifiers: Classifiers, seed: int) -> dict[str, AblationRow]:
