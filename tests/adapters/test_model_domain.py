@@ -344,6 +344,17 @@ def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
     assert "heard with another model's signature" in capsys.readouterr().err and not out.exists()
 
 
+def test_evaluate_refuses_a_model_of_another_array(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped = read_model()
+    roof = domain_of(roof_array_56(), [RATE], ["SA1"])
+    save_model(tmp_path / "roof.json", replace(shipped, signature=replace(shipped.signature, domain=roof)))
+    assert main(["evaluate", "--out", str(tmp_path / "e"), "--model", str(tmp_path / "roof.json")]) == 2
+    assert "not the array of the model" in capsys.readouterr().err
+    assert not (tmp_path / "e" / "streets").exists()
+
+
 @pytest.mark.parametrize(
     "show", [lambda: main(["model", "--json"]), lambda: main(["model"])], ids=["json", "text"]
 )

@@ -147,6 +147,8 @@ class _Bars:
 def _takes(arguments: argparse.Namespace) -> "TakeList":
     from worldstate.studies.evaluation.takes import find_takes
 
+    if arguments.model is not None:
+        _check_model(arguments.model, arguments.dataset)
     root = arguments.dataset or _simulated(arguments)
     return find_takes(
         root,
@@ -154,6 +156,19 @@ def _takes(arguments: argparse.Namespace) -> "TakeList":
         dynamic_ids=arguments.dynamic_ids,
         hazard_free=arguments.hazard_free,
     )
+
+
+def _check_model(model: Path, dataset: Path | None) -> None:
+    """Refuse a model that was made for another array: every row of it would be of no meaning."""
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.files.acoustic_domain import check_array
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate.frontend.array.ovad_array import ovad_array
+
+    domain = read_model(model).domain
+    if domain is not None:
+        # Streets are simulated with OVAD's array: a mismatch is found before, not after a quarter of an hour.
+        check_array(domain, ovad_array() if dataset is None else choose_array(dataset))
 
 
 def _simulated(arguments: argparse.Namespace) -> Path:
