@@ -11,7 +11,7 @@ from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, as_sound, open_sound, path_of
-from worldstate.adapters.camera.camera_channel import video_degradation
+from worldstate.adapters.camera.camera_channel import Watcher, video_degradation
 from worldstate.adapters.camera.detection_formats import read_any_detections
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.detector import Detector
@@ -401,13 +401,23 @@ def _with_camera(
     """Return the source with what the camera reported and how well it sees."""
     lens = read_camera(camera) if isinstance(camera, Path | str) else camera or PinholeCamera()
     rates = load_miss_rates(miss_rates) if isinstance(miss_rates, Path | str) else miss_rates
-    return replace(
-        source,
-        detections=_detections(detections, detector, recording, lens),
-        camera=lens,
-        miss_rates=rates,
-        degradation=_degradation(recording, rates),
-    )
+    source = replace(source, camera=lens, miss_rates=rates)
+    if detector is None:
+        found = _detections(detections, recording, lens)
+        return replace(source, detections=found, degradation=_degradation(recording, rates))
+    if detections is not None or recording is None:
+        raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
+    video = open_video(recording.path / VIDEO_NAME)
+    if rates is None or rates.health is None:
+        boxes = [detector.detect(image) for image in video.frames()]
+        log = DetectionLog.at_rate(boxes, video.frame_rate_hz, source=str(video.path))
+        return replace(source, detections=log)
+    # Each image is decoded once, for its boxes and for its quality.
+    watcher = Watcher(detector, rates)
+    for number, image in enumerate(video.frames()):
+        watcher.look(nanoseconds(number / video.frame_rate_hz), image)
+    watched = watcher.watched()
+    return replace(source, detections=watched.detections, degradation=watched.degradation)
 
 
 def _array(
@@ -425,18 +435,9 @@ def _policy(model: Model, alpha: float | None) -> CueingPolicy:
 
 
 def _detections(
-    given: Path | str | DetectionLog | None,
-    detector: Detector | None,
-    recording: Recording | None,
-    camera: PinholeCamera,
+    given: Path | str | DetectionLog | None, recording: Recording | None, camera: PinholeCamera
 ) -> DetectionLog | None:
-    """Return what the camera reported: as given, by a detector of the user's, or beside the recording."""
-    if detector is not None:
-        if given is not None or recording is None:
-            raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
-        video = open_video(recording.path / VIDEO_NAME)
-        found = [detector.detect(image) for image in video.frames()]
-        return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
+    """Return what the camera reported: as given, or beside the recording."""
     if isinstance(given, DetectionLog):
         return given
     path = given if given is not None else recording and recording.detections_path

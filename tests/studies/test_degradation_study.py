@@ -230,6 +230,10 @@ def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(appr
     source = open_source(folder, miss_rates=tmp_path / "beta.json")
     assert source.miss_rates.table == darkening.table
     assert source.degradation(2_000_000_000) < 0.1 < 0.9 < source.degradation(8_000_000_000)
+    looking = open_source(folder, miss_rates=tmp_path / "beta.json", detector=MotionDetector())
+    assert looking.degradation(2_000_000_000) < 0.1 < 0.9 < looking.degradation(8_000_000_000)
+    assert len(looking.detections) == len(looking.detections.stamps_ns) == 100
+    assert looking.detections.stamps_ns[-1] == 9_900_000_000
     betas = {
         m.stamp_ns: m.co_evidence.miss_rate
         for _, m in measure_steps(source)
