@@ -4,6 +4,7 @@ import csv
 import io
 import math
 from base64 import b64decode
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -45,10 +46,12 @@ from worldstate.studies.evaluation.report.document import (
 )
 from worldstate.studies.evaluation.report.html_page import html_page
 from worldstate.studies.evaluation.report.markdown_page import markdown_page
+from worldstate.studies.evaluation.report.study_sections import signature_values
 from worldstate.studies.evaluation.report.writing import write_document
 from worldstate.studies.evaluation.scores import Score
 from worldstate.studies.evaluation.takes import Take, TakeList
 from worldstate.studies.evaluation.trial import Trial
+from worldstate.studies.signatures.signature_study import SignatureRow, SignatureStudy
 
 HOSTILE = '<script src="http://x/y.js">a|b</script> `*_\n| "q" & [t](http://x)'
 
@@ -236,7 +239,7 @@ def evaluation(tmp_path_factory):
     lacking = {one.name: "needs more" for one in (DYNAMIC, RETRAINED)}
     study = front_end_study(trials, rng, 20)
     return Evaluation(
-        takes, tuple(trials), (), lacking, runs, scores, draws, study, {}, EvaluationSettings(draws=50)
+        takes, tuple(trials), (), lacking, runs, scores, draws, study, {}, None, EvaluationSettings(draws=50)
     )
 
 
@@ -309,7 +312,7 @@ def degradation(detectors):
 
 
 def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation, tmp_path):
-    document = evaluation_document(evaluation, degradation=degradation(("first", "<b>second")))
+    document = evaluation_document(replace(evaluation, degradation=degradation(("first", "<b>second"))))
     names = [block.name for block in document.all_blocks]
     assert len(set(names)) == len(names)
     assert {"cueing_awareness_1", "cueing_awareness_2", "degradation_2", "rain_2"} <= set(names)
@@ -323,3 +326,18 @@ def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation,
     assert worst == pytest.approx((0.45, 0.94))
     write_document(document, tmp_path)
     assert "<b>second" not in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_signature_rows_fill_the_paper_s_numbers_and_a_range_its_two_ends():
+    rows = tuple(
+        SignatureRow(str(i), "roadside", "AUROC", value, paper=paper)
+        for i, (value, paper) in enumerate(
+            ((0.99, (0.999, 0.999)), *((v, (0.76, 0.9)) for v in (0.7, 0.8, 0.75)), (None, (0.997, 0.997)))
+        )
+    )
+    values = signature_values(SignatureStudy(rows, True, None, ()))
+    assert {place[2]: value.value for place, value in values.items()} == {
+        "auroc_studio": 0.99,
+        "auroc_shape_least": 0.7,
+        "auroc_shape_most": 0.8,
+    }

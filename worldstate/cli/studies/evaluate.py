@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from worldstate.studies.evaluation.classification import Classifiers
     from worldstate.studies.evaluation.evaluation import Evaluation
     from worldstate.studies.evaluation.takes import TakeList
+    from worldstate.studies.signatures.signature_study import SignatureStudy
 
 EXAMPLE = """\
 examples:
@@ -50,6 +51,9 @@ STATIC, DYNAMIC = 83, 59
 SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
 SMOKE_WIDTH_PX = 160
 FULL_SEEDS = 5
+# Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`,
+# as they are made anew in every run.
+PASSAGES = 6
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -98,8 +102,24 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         )
     report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
-    write_document(evaluation_document(found), arguments.out)
+    signatures = None if arguments.smoke else _signatures(arguments)
+    write_document(evaluation_document(found, signatures), arguments.out)
     return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
+
+
+def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
+    """Return the signature study on simulated passages; `evaluate-signatures` hears the published corpora."""
+    import numpy as np
+
+    from worldstate.studies.signatures.signature_study import QUESTIONS, signature_study
+    from worldstate.studies.signatures.simulated_corpora import STREETS, simulated_corpora
+
+    # Apart, so that more recordings leave the folds and draws of a row as they are.
+    simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
+    with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
+        corpora = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
+    with progress_bar("measuring signatures", len(QUESTIONS)) as bar:
+        return signature_study(*corpora, draws, bar.advance)
 
 
 def _degradation(arguments: argparse.Namespace) -> "DegradationSettings":

@@ -79,8 +79,7 @@ def approach_figure(approach: ApproachTimeline) -> ReportFigure:
         "approach_timeline",
         approach.title,
         f"{camera}Below: hazard statistic at the end of each 1-s window, threshold, advisory, moving boxes "
-        "of the "
-        "camera, and line-of-sight entry T0.",
+        "of the camera, and line-of-sight entry T0.",
         draw,
         Curves(
             ("time_s", "statistic", "advisory", "moving_boxes"),

@@ -1,6 +1,7 @@
 """From the result of an evaluation to the document that tells it."""
 
 import platform
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,7 +9,6 @@ import scipy
 import sklearn
 
 from worldstate.ground.version import __version__
-from worldstate.studies.degradation.degradation_study import DegradationStudy
 from worldstate.studies.evaluation.evaluation import Evaluation
 from worldstate.studies.evaluation.hearing import data_fingerprint
 from worldstate.studies.evaluation.protocols import PROTOCOLS, STATIC
@@ -16,19 +16,19 @@ from worldstate.studies.signatures.signature_study import SignatureStudy
 
 from . import study_sections as study
 from . import warning_sections as warning
-from .degradation_section import awareness_figures, degradation_section, degradation_values
+from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .document import Document, ReportTable, Section, Value
 from .measured_values import Values, measured_values
 
 
-def evaluation_document(
-    found: Evaluation,
-    signatures: SignatureStudy | None = None,
-    degradation: DegradationStudy | None = None,
-) -> Document:
+def evaluation_document(found: Evaluation, signatures: SignatureStudy | None = None) -> Document:
     """Return the whole report; sections that nothing was measured for say so."""
-    values = measured_values(found, {} if degradation is None else degradation_values(degradation))
-    panels = () if degradation is None else awareness_figures(degradation)
+    values = measured_values(
+        found,
+        ({} if found.degradation is None else sweep_values(found.degradation))
+        | ({} if signatures is None else study.signature_values(signatures)),
+    )
+    panels = () if found.degradation is None else awareness_figures(found.degradation)
     data = "SIMULATED streets" if found.takes.simulated else "Recordings that were given"
     static = STATIC.name in found.runs
     sections = [
@@ -38,7 +38,7 @@ def evaluation_document(
         study.front_end_section(found, values),
         study.approach_rate_section(values),
         study.transfer_section(found, values),
-        degradation_section(degradation),
+        degradation_section(found.degradation, found.lacking.get("degradation sweep", "not asked for")),
         *((study.ablation_section(found, values),) if static else ()),
         study.signature_section(signatures),
         *((warning.tracking_section(found, values),) if static else ()),
@@ -91,8 +91,17 @@ def _data_section(found: Evaluation, values: Values) -> Section:
         if found.takes.simulated
         else "The figures are measured on the sound that was given."
     )
+    strata = Counter((trial.label, trial.site) for trial in found.trials)
+    single = sum(count == 1 for count in strata.values())
+    intervals = (
+        f"Intervals draw recordings again within side and junction: {single} of {len(strata)} such strata "
+        f"hold a "
+        "single recording, which every draw repeats, so intervals are too narrow by what it would add."
+        if single
+        else "Intervals draw recordings again within side and junction; every such stratum holds several."
+    )
     skipped = f"{len(found.failed)} recordings could not be heard and are left out of every figure."
-    return Section("What was evaluated", (sound, skipped), tuple(blocks))
+    return Section("What was evaluated", (sound, intervals, skipped), tuple(blocks))
 
 
 def _facts(found: Evaluation) -> tuple[tuple[str, str], ...]:

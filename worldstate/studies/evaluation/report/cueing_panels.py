@@ -120,36 +120,9 @@ class OperatingPoint:
 
 def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) -> ReportFigure:
     """Draw detection against achieved false alarms an hour: the curve over alpha, the others as points."""
-    curve = sorted((one for one in points if one.alpha is not None), key=lambda one: one.alpha or 0.0)
-    others = [one for one in points if one.alpha is None]
-    linear = max(quantum_per_hour, 1e-3)
 
     def draw(canvas: "Figure") -> None:
-        axes = canvas.subplots()
-        # The hour has few alarms: between none and one onset the axis is linear, above it logarithmic.
-        axes.set_xscale("symlog", linthresh=linear)
-        line = [(one.false_alarms_per_hour.value, one.detection.value) for one in curve]
-        if line:
-            axes.plot(*zip(*line, strict=True), color=GREEN, zorder=1)
-            axes.plot([], [], "o", color="black", fillstyle="none", label="the paper's (open)")
-        for one in curve:
-            _mark(canvas, one, GREEN, "o", r"proposed, over $\alpha$")
-            place = one.false_alarms_per_hour.value, one.detection.value
-            axes.annotate(
-                f"{one.alpha:g}", place, (-5, 5), textcoords="offset points", ha="right", fontsize=8
-            )
-        for i, one in enumerate(others):
-            _mark(canvas, one, _COLOURS[i % len(_COLOURS)], _MARKS[(i + 1) % len(_MARKS)], one.name)
-        axes.set(xlabel="false alarms per hazard-free hour", ylabel="approaches detected", ylim=(-0.03, 1.05))
-        rates = [one.false_alarms_per_hour for one in points]
-        right = np.nanmax([[one.value, one.high] for one in rates] + [[10.0 * linear] * 2])
-        ticks = [
-            tick for tick in (0, 10, 30, 100, 300, 1000, 3000, 10_000) if tick == 0 or linear <= tick <= right
-        ]
-        axes.set_xticks(ticks, map(str, ticks))
-        axes.minorticks_off()
-        axes.set_xlim(-0.3 * linear, 1.3 * right)
-        legend_below(canvas)
+        _draw_operating(canvas, points, max(quantum_per_hour, 1e-3))
 
     names = ("detection", "false_alarms_per_hour")
     columns = [f"{name}{part}" for name in names for part in ("", "_low", "_high", "_paper")]
@@ -166,8 +139,7 @@ def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) 
         "cueing_operating",
         "(c) Detection against achieved false alarms",
         f"Bars are 95 % intervals; open marks are the paper's. One alarm onset is {quantum_per_hour:.3g} "
-        "an hour: "
-        "left of it the axis is linear, right of it logarithmic.",
+        "an hour: left of it the axis is linear, right of it logarithmic.",
         draw,
         Curves(("method", "alpha", *columns), rows),
         size_in=(4.4, 4.4),
@@ -211,6 +183,34 @@ def awareness_figure(
         Curves(("family", "level", "miss_rate", "awareness", "awareness_low", "awareness_high"), rows),
         size_in=(4.4, 4.2),
     )
+
+
+def _draw_operating(canvas: "Figure", points: Sequence[OperatingPoint], linear: float) -> None:
+    curve = sorted((one for one in points if one.alpha is not None), key=lambda one: one.alpha or 0.0)
+    others = [one for one in points if one.alpha is None]
+    axes = canvas.subplots()
+    # The hour has few alarms: between none and one onset the axis is linear, above it logarithmic.
+    axes.set_xscale("symlog", linthresh=linear)
+    line = [(one.false_alarms_per_hour.value, one.detection.value) for one in curve]
+    if line:
+        axes.plot(*zip(*line, strict=True), color=GREEN, zorder=1)
+        axes.plot([], [], "o", color="black", fillstyle="none", label="the paper's (open)")
+    for one in curve:
+        _mark(canvas, one, GREEN, "o", r"proposed, over $\alpha$")
+        place = one.false_alarms_per_hour.value, one.detection.value
+        axes.annotate(f"{one.alpha:g}", place, (-5, 5), textcoords="offset points", ha="right", fontsize=8)
+    for i, one in enumerate(others):
+        _mark(canvas, one, _COLOURS[i % len(_COLOURS)], _MARKS[(i + 1) % len(_MARKS)], one.name)
+    axes.set(xlabel="false alarms per hazard-free hour", ylabel="approaches detected", ylim=(-0.03, 1.05))
+    rates = [one.false_alarms_per_hour for one in points]
+    right = np.nanmax([[one.value, one.high] for one in rates] + [[10.0 * linear] * 2])
+    ticks = [
+        tick for tick in (0, 10, 30, 100, 300, 1000, 3000, 10_000) if tick == 0 or linear <= tick <= right
+    ]
+    axes.set_xticks(ticks, map(str, ticks))
+    axes.minorticks_off()
+    axes.set_xlim(-0.3 * linear, 1.3 * right)
+    legend_below(canvas)
 
 
 def _beside(value: Value) -> str:

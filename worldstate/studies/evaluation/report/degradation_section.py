@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.studies.degradation.awareness import AwarenessRow, Estimate
 from worldstate.studies.degradation.beta_curves import Band
 from worldstate.studies.degradation.conditions import FAMILIES, OFF
@@ -29,7 +30,7 @@ _CONDITION = (
 )
 
 
-def degradation_values(study: DegradationStudy) -> dict[Place, Value]:
+def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
     """Return what the paper states of the sweep, of the first detector; a larger one is the last."""
     first, last = study.sweeps[0], study.sweeps[-1]
     beta, clean = first.beta, (0, 0)
@@ -62,11 +63,11 @@ def awareness_figures(study: DegradationStudy) -> tuple[ReportFigure, ...]:
     return tuple(figures)
 
 
-def degradation_section(study: DegradationStudy | None) -> Section:
-    """Return miss rates and awareness of every detector, or what would fill them."""
+def degradation_section(study: DegradationStudy | None, lacking: str) -> Section:
+    """Return miss rates and awareness of every detector, or what is lacking and what would fill them."""
     title = "Vision degradation"
     if study is None:
-        return Section(title, (f"Not part of this run. On filmed recordings {COMMANDS['ovad']} fills it.",))
+        return Section(title, (f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it.",))
     text = [
         f"{len(study.approaches)} approaches and {len(study.hazard_free)} hazard-free recordings, "
         f"{len(study.sweeps)} detectors; ablation (c) is this sweep.",
@@ -83,10 +84,12 @@ def _detector_section(sweep: DetectorSweep, number: int) -> Section:
     beta = sweep.beta
     steps = range(beta.overall.value.shape[1])
     levels: dict[str, list[tuple[str, Value]]] = {
-        family: [(f"level {level}", _at(beta.overall, (f, level))) for level in steps]
+        family: [(f"{LEVELS[level]:g}", _at(beta.overall, (f, level))) for level in steps]
         for f, family in enumerate(FAMILIES)
     }
-    states = {"clean": (0, 0)} | {f"{name}, level {steps[-1]}": (f, -1) for f, name in enumerate(FAMILIES)}
+    states = {"clean": (0, 0)} | {
+        f"{name}, d = {LEVELS[steps[-1]]:g}": (f, -1) for f, name in enumerate(FAMILIES)
+    }
     bins = range(len(beta.azimuth_deg) - 1)
     angles = {
         name: [_at(beta.by_azimuth, (f, b, level)) for b in bins] for name, (f, level) in states.items()

@@ -28,7 +28,7 @@ table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabu
 th, td { padding: .35rem .7rem; text-align: left; vertical-align: top; border-bottom: 1px solid #e3e3e3; }
 tbody td:first-child, thead th:first-child { position: sticky; left: 0; background: #fff; }
 thead th { border-bottom: 2px solid #555; vertical-align: bottom; }
-td.text { min-width: 7rem; max-width: 26rem; }
+td.text { min-width: 9rem; max-width: 26rem; }
 td.value { white-space: nowrap; }
 td.note { min-width: 6rem; color: #666; }
 td span { display: block; color: #666; font-size: .92em; }

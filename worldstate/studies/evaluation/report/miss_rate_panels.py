@@ -18,18 +18,16 @@ _MARKS = ("o", "s", "^", "D", "v", "P")
 
 
 def miss_rate_level_figure(families: Mapping[str, Sequence[tuple[str, Value]]]) -> ReportFigure:
-    """Draw beta over the level, one line a family; `families` holds (level as text, beta), clean first."""
+    """Draw beta over the level, one line a family; `families` holds (d as text, beta), clean first."""
 
     def draw(canvas: "Figure") -> None:
         axes = canvas.subplots()
         for (name, levels), mark in zip(families.items(), _MARKS, strict=False):
-            names = ", ".join(level for level, _ in levels[1:])
-            values = [value for _, value in levels]
-            _line(axes, np.arange(len(values)), values, mark, f"{name}: {names}" if names else name)
-        longest = max((len(levels) for levels in families.values()), default=0)
-        axes.set_xticks(range(longest), ["clean", *map(str, range(1, longest))][:longest])
-        axes.set(xlabel="level of the degradation", ylabel=r"miss rate $\beta$", ylim=(-0.02, 1.02))
-        legend_below(canvas, columns=1)
+            _line(axes, np.arange(len(levels)), [value for _, value in levels], mark, name)
+        names = [level for level, _ in next(iter(families.values()), ())]
+        axes.set_xticks(range(len(names)), names)
+        axes.set(xlabel="staged degradation d", ylabel=r"miss rate $\beta$", ylim=(-0.02, 1.02))
+        legend_below(canvas, columns=3)
 
     rows = [
         (name, level, value.value, value.low, value.high)

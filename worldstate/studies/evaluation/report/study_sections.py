@@ -11,7 +11,7 @@ from worldstate.studies.paper.ablations import AblationRow
 from worldstate.studies.signatures.signature_study import SignatureRow, SignatureStudy
 
 from .document import Cell, ReportTable, Section, Value
-from .measured_values import Values, site_values
+from .measured_values import Place, Values, site_values
 from .recording_panels import bearing_gating_figure, junction_figure
 from .warning_sections import PROPOSED, method_table, methods_of
 
@@ -262,6 +262,23 @@ def _ablation_cells(row: AblationRow) -> tuple[Value, ...]:
         (row.vision_only, 2),
     )
     return tuple(Value(np.nan if value is None else value, digits=digits) for value, digits in figures)
+
+
+def signature_values(study: SignatureStudy) -> dict[Place, Value]:
+    """Return what was measured of the paper's numbers on signatures; of its range the least and the most."""
+    values: dict[Place, Value] = {}
+    wanted = [one for one in PAPER_VALUES if one.group == "signature study"]
+    for row in study.rows:
+        for one in wanted:
+            place, found = (one.group, one.row, one.figure), _signature(row)
+            if row.paper is None or row.value is None or one.value not in row.paper:
+                continue
+            # The paper's range spans several rows: its lower end is the least of ours, the upper the most.
+            least = min(row.paper) < max(row.paper) and one.value == min(row.paper)
+            before = values.get(place)
+            if before is None or (found.value < before.value) == least:
+                values[place] = found
+    return values
 
 
 def signature_section(study: SignatureStudy | None) -> Section:

@@ -137,8 +137,7 @@ def table_i(found: Evaluation, values: Values) -> Section:
             f"False alarms are counted on {hours.number} h of hazard-free time, so one alarm onset is "
             f"{quantum.number} an hour (paper: 0.103 h, 9.7 an hour).",
             f"Vision only: a moving box precedes T0 in {early.number} {early.note} approaches (paper: 3 of "
-            "42, put "
-            "down to the tolerance of the T0 annotation and printed as 0).",
+            "42, put down to the tolerance of the T0 annotation and printed as 0).",
         ),
         (table, lead_figure(leads, {method: one.value for method, one in stated.items() if one})),
     )
