@@ -35,7 +35,7 @@ from worldstate.operations.detectors.miss_rate_measurement import (
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate.studies.degradation.beta_curves import absence_counts, counts_table
 from worldstate.studies.degradation.conditions import CLEAN, FAMILIES, OFF, Condition, all_conditions
-from worldstate.studies.degradation.degradation_report import degradation_lines, degradation_values
+from worldstate.studies.degradation.degradation_report import degradation_lines, degradation_record
 from worldstate.studies.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate.studies.degradation.looks import (
     READINGS,
@@ -348,7 +348,7 @@ def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recor
     assert again.awareness == sweep.awareness
     assert np.array_equal(again.beta.overall.value, sweep.beta.overall.value, equal_nan=True)
     assert len(sweep.awareness.rows) == 26
-    values = json.loads(json.dumps(degradation_values(first), allow_nan=False))
+    values = json.loads(json.dumps(degradation_record(first), allow_nan=False))
     assert values["detectors"]["mog2"]["rows"][0]["awareness"] == list(sweep.awareness.rows[0].awareness)
     assert values["skipped"].keys() == {broken.recording_id}
     assert any(line.startswith("noise 0.75") for line in degradation_lines(first))

@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
     signatures = None if arguments.smoke else _signatures(arguments)
-    write_document(evaluation_document(found, signatures), arguments.out)
+    write_document(evaluation_document(found, signatures, found.degradation), arguments.out)
     return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
 
 
@@ -239,7 +239,7 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
 def _report(found: "Evaluation") -> dict[str, object]:
     import math
 
-    from worldstate.studies.degradation.degradation_report import degradation_values
+    from worldstate.studies.degradation.degradation_report import degradation_record
 
     def known(values: "dict[str, float]") -> dict[str, float | None]:
         return {name: value if math.isfinite(value) else None for name, value in values.items()}
@@ -254,7 +254,7 @@ def _report(found: "Evaluation") -> dict[str, object]:
             name: {method: known(score.figures()) for method, score in scores.items()}
             for name, scores in found.scores.items()
         },
-        "degradation": None if found.degradation is None else degradation_values(found.degradation),
+        "degradation": None if found.degradation is None else degradation_record(found.degradation),
         "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
     }
 

@@ -15,7 +15,7 @@ from .degradation_study import DegradationStudy, DetectorSweep
 _COLUMNS = ("d", "beta", "vision", "aware", "unseen", "detected", "lead s", "FA/h", "aware/h", "share")
 
 
-def degradation_values(study: DegradationStudy) -> dict[str, Any]:
+def degradation_record(study: DegradationStudy) -> dict[str, Any]:
     """Return everything that was found, ready for JSON; null where nothing is known."""
     values = {
         "approaches": study.approaches,
