@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
     signatures = None if arguments.smoke else _signatures(arguments)
-    write_document(evaluation_document(found, signatures, found.degradation), arguments.out)
+    write_document(evaluation_document(found, signatures), arguments.out)
     return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
 
 
