@@ -69,8 +69,9 @@ def _data_section(found: Evaluation, values: Values) -> Section:
             continue
         approaches = sum(not trial.hazard_free for trial in run.trials)
         hours = values[protocol.name, warning.PROPOSED, "hazard_free_hours"]
+        told = "; ".join(run.cautions) or "run"
         counts = str(len(run.trials)), str(approaches)
-        rows.append((protocol.title, *counts, Value(hours.value, digits=3), run.trained_on, "run"))
+        rows.append((protocol.title, *counts, Value(hours.value, digits=3), run.trained_on, told))
     heads = (
         "protocol",
         "recordings",
