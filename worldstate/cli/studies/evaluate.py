@@ -34,6 +34,7 @@ from worldstate.cli.common.progress import Bar, progress_bar
 
 if TYPE_CHECKING:
     from worldstate.studies.degradation.degradation_study import DegradationSettings
+    from worldstate.studies.evaluation.against import Comparison
     from worldstate.studies.evaluation.classification import Classifiers
     from worldstate.studies.evaluation.evaluation import Evaluation
     from worldstate.studies.evaluation.takes import TakeList
@@ -48,12 +49,15 @@ examples:
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59
-SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
+SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 1, 5.0
 SMOKE_WIDTH_PX = 160
 FULL_SEEDS = 5
 # Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`,
 # as they are made anew in every run.
 PASSAGES = 6
+# What two evaluations must have in common for their figures to be comparable.
+COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
+COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -69,6 +73,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--hazard-free-hours", type=float, metavar="H", help="score so many hours of it (default: all)")
     add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
+    add("--idmt", type=Path, metavar="DIR", help="IDMT-Traffic, for the signature study")
+    add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, for the signature study")
+    add("--against", type=Path, metavar="DIR", help="a finished evaluation to compare this one with")
     add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
     add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times")
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
@@ -79,6 +86,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
+    from worldstate.studies.evaluation.against import save_scores
     from worldstate.studies.evaluation.engine import Engine
     from worldstate.studies.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
     from worldstate.studies.evaluation.hearing import Hearing
@@ -100,22 +108,28 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             _Bars(stack),
             EvaluationSettings(seeds, arguments.hazard_free_hours, degradation=_degradation(arguments)),
         )
-    report = _report(found)
+    save_scores(arguments.out, found.scores, COMPARABLE)
+    compared = _compared(arguments)
+    report = _report(found) | {"against": [_difference(one) for one in compared]}
     write_report(arguments.out / "evaluation.json", report)
     signatures = None if arguments.smoke else _signatures(arguments)
     write_document(evaluation_document(found, signatures), arguments.out)
-    return CommandResult(report, table={"out": str(arguments.out), "data": takes.origin}, lines=_lines(found))
+    shown = {"out": str(arguments.out), "data": takes.origin, "windows": classifiers.told}
+    return CommandResult(report, table=shown, lines=[*_lines(found), *_against_lines(compared)])
 
 
 def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
-    """Return the signature study on simulated passages; `evaluate-signatures` hears the published corpora."""
+    """Return the signature study on the corpora that were given, else on simulated passages."""
     import numpy as np
 
+    from worldstate.cli.studies.evaluate_signatures import published_corpora
     from worldstate.studies.signatures.signature_study import QUESTIONS, signature_study
     from worldstate.studies.signatures.simulated_corpora import STREETS, simulated_corpora
 
     # Apart, so that more recordings leave the folds and draws of a row as they are.
     simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
+    if arguments.idmt is not None or arguments.melaudis is not None:
+        return signature_study(*published_corpora(arguments), draws)
     with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
         corpora = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
     with progress_bar("measuring signatures", len(QUESTIONS)) as bar:
@@ -146,6 +160,36 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
     if arguments.dataset is not None and arguments.smoke:
         raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
+
+
+def _compared(arguments: argparse.Namespace) -> "tuple[Comparison, ...]":
+    import numpy as np
+
+    from worldstate.studies.evaluation.against import compare
+
+    if arguments.against is None:
+        return ()
+    return compare(arguments.out, arguments.against, np.random.default_rng(arguments.seed))
+
+
+def _difference(one: "Comparison") -> dict[str, object]:
+    """Return JSON-able values; a figure that neither evaluation has is left out."""
+    known = {name: values for name, values in one.differences.items() if values[0] == values[0]}
+    return {"protocol": one.protocol, "method": one.method, "shared": one.shared, "differences": known}
+
+
+def _against_lines(compared: "tuple[Comparison, ...]") -> list[str]:
+    """Show the differences of the main figures to the other evaluation, with their intervals."""
+    lines = []
+    for one in compared:
+        shown = [
+            f"{name} {ours:+.3g} [{low:+.3g}, {high:+.3g}]"
+            for name in COMPARED
+            for ours, low, high in (one.differences[name],)
+            if ours == ours
+        ]
+        lines.append(f"{one.protocol}, {one.method}, {one.shared} shared: {'; '.join(shown) or 'nothing'}")
+    return ["", "less the other evaluation:", *lines] if lines else []
 
 
 class _Bars:

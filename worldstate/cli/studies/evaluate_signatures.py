@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     # Apart, so that more recordings leave the folds and draws of a row as they are.
     simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
     given = arguments.idmt is not None or arguments.melaudis is not None
-    corpora, stated = (_published(arguments), []) if given else _simulated(arguments, simulation)
+    corpora, stated = (published_corpora(arguments), []) if given else _simulated(arguments, simulation)
     with progress_bar("measuring", len(QUESTIONS)) as bar:
         study = signature_study(*corpora, draws, bar.advance)
     report = study_values(study) | {"assumptions": stated}
@@ -87,7 +87,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     return CommandResult(report, table={}, lines=lines)
 
 
-def _published(arguments: argparse.Namespace) -> "Corpora":
+def published_corpora(arguments: argparse.Namespace) -> "Corpora":
+    """Read the corpora of --idmt and --melaudis; None stands for one that was not given."""
     from worldstate.adapters.datasets.idmt_traffic import idmt_traffic
     from worldstate.adapters.datasets.melaudis import melaudis
     from worldstate.studies.signatures.signature_study import IDMT, MELAUDIS

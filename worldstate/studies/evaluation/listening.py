@@ -36,7 +36,7 @@ from .takes import Take
 from .trial import BOX_COLUMNS, LEFT, NO_SIDE, RIGHT, TRACK_COLUMNS, TRUTH_COLUMNS, Decisions
 
 # Changes whenever a pass over the same recording would give other numbers.
-VERSION = 1
+VERSION = 2
 # How the library listens: at its first guess of the site, learning the site, and hearing past the own engine.
 CHAINS = {
     "plain": ListenSettings(site_adaptation=False, uncalibrated=True),
@@ -184,8 +184,15 @@ def _decided(state: WorldState) -> tuple[Any, ...]:
     told = max(raised or state.cues, key=lambda cue: cue.risk, default=None)
     score = max((cue.statistic for cue in state.cues), default=np.nan)
     side = SIDES.get(told.direction, NO_SIDE) if raised and told is not None else NO_SIDE
-    bearing = np.nan if told is None else told.azimuth_rad
-    return seconds(state.stamp_ns), bool(raised), side, bearing, score, state.risk, _visible(told)
+    return seconds(state.stamp_ns), bool(raised), side, _bearing(state), score, state.risk, _visible(told)
+
+
+def _bearing(state: WorldState) -> float:
+    """Return the azimuth of the moving entity that most likely exists, NaN where none likely does."""
+    # Not that of a cue: a vehicle in view leaves both hidden sides at a risk of nothing, at 55 degrees.
+    likely = [one for one in state.entities if one.moving and one.existence_probability >= LIKELY]
+    strongest = max(likely, key=lambda one: one.existence_probability, default=None)
+    return np.nan if strongest is None else strongest.azimuth_rad
 
 
 def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
