@@ -92,6 +92,7 @@ def _data_section(found: Evaluation, values: Values) -> Section:
         if found.takes.simulated
         else "The figures are measured on the sound that was given."
     )
+    # A stratum of one is the same in every draw; nothing in the interval itself shows that.
     strata = Counter((trial.label, trial.site) for trial in found.trials)
     single = sum(count == 1 for count in strata.values())
     intervals = (

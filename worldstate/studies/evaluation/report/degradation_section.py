@@ -68,14 +68,19 @@ def degradation_section(study: DegradationStudy | None, lacking: str) -> Section
     title = "Vision degradation"
     if study is None:
         return Section(title, (f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it.",))
+    names = " and ".join(sweep.detector for sweep in study.sweeps)
     text = [
-        f"{len(study.approaches)} approaches and {len(study.hazard_free)} hazard-free recordings, "
-        f"{len(study.sweeps)} detectors; ablation (c) is this sweep.",
-        "Between the first and the last detector awareness differs by at most "
-        f"{study.largest_awareness_difference:.3f}, beta by {study.beta_shift:+.3f} in the mean.",
-        *(f"Missing: {one}." for one in study.missing),
+        f"{len(study.approaches)} approaches and {len(study.hazard_free)} hazard-free recordings, detectors: "
+        f"{names}; ablation (c) is this sweep.",
+        *(f"{one}." for one in study.missing),
         *(f"Left out: {name}, {why}." for name, why in study.skipped.items()),
     ]
+    # One detector agrees with itself: the sentence would claim what nobody measured.
+    if len(study.sweeps) > 1:
+        text.append(
+            "Between the first and the last detector awareness differs by at most "
+            f"{study.largest_awareness_difference:.3f}, beta by {study.beta_shift:+.3f} in the mean."
+        )
     parts = tuple(_detector_section(sweep, number) for number, sweep in enumerate(study.sweeps, start=1))
     return Section(title, tuple(text), (), parts)
 

@@ -53,7 +53,9 @@ def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Seq
         for (name, values), mark in zip(states.items(), _MARKS, strict=False):
             _line(axes, middle, values, mark, name)
         axes.set(xlabel="angle off boresight |azimuth| (deg)", ylabel=r"miss rate $\beta$")
-        axes.set(ylim=(-0.02, 1.02), xlim=(edges_deg[0], edges_deg[-1]), xticks=list(edges_deg))
+        axes.set(ylim=(-0.02, 1.02), xlim=(edges_deg[0], edges_deg[-1]))
+        # The last edge is that of the view, such as 35.19 degrees.
+        axes.set_xticks(list(edges_deg), [f"{edge:.0f}" for edge in edges_deg])
         legend_below(canvas, columns=2)
 
     rows = [

@@ -95,6 +95,7 @@ def _label(one: PaperValue) -> str:
 
 
 def _ours(one: PaperValue, values: Values) -> Value:
+    # With the digits of what was measured: the paper rounds 0.0883 m to 0.088.
     found = values.get((one.group, one.row, one.figure), _NOT_MEASURED)
     return Value(found.value, found.low, found.high, found.digits, found.note)
 
