@@ -10,7 +10,7 @@ import soundfile
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.pass_cache import FingerprintMemo, PassCache, fingerprint
+from worldstate.studies.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.trial import (
+from worldstate.studies.trials.trial import (
     BOX_COLUMNS,
     TRACK_COLUMNS,
     TRUTH_COLUMNS,

@@ -12,7 +12,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError, Schem
 from worldstate.operations.metrics.recording_draws import stratified_draws
 from worldstate.studies.evaluation.against import compare, load_scores, save_scores
 from worldstate.studies.evaluation.scores import Score, paired
-from worldstate.studies.evaluation.trial import Trial
+from worldstate.studies.trials.trial import Trial
 
 KEY = ("static folds", "proposed (alpha = .02)")
 SETTINGS = {"alpha": 0.02, "folds": 5}

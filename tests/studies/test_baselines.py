@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from worldstate.adapters.camera.detections import read_detections
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.methods.line_of_sight import RadarFieldOfView, VisionOnly, seen_early_s
-from worldstate.studies.evaluation.methods.oc_sort import OcSort, OcSortSettings
-from worldstate.studies.evaluation.methods.track_recovery import OcSortRecovery
-from worldstate.studies.evaluation.trial import LEFT, RIGHT, Trial
+from worldstate.studies.methods.line_of_sight import RadarFieldOfView, VisionOnly, seen_early_s
+from worldstate.studies.methods.oc_sort import OcSort, OcSortSettings
+from worldstate.studies.methods.track_recovery import OcSortRecovery
+from worldstate.studies.trials.trial import LEFT, RIGHT, Trial
 
 NOTHING = np.empty((0, 4)), np.empty(0)
 ROWS = [VisionOnly(), OcSortRecovery("stock"), OcSortRecovery("coasting")]

@@ -47,8 +47,8 @@ from worldstate.studies.degradation.looks import (
 )
 from worldstate.studies.degradation.rain import RAIN_DB, rained
 from worldstate.studies.degradation.staged_filter import by_condition, cameras, filter_in_conditions
-from worldstate.studies.evaluation.engine import Engine
-from worldstate.studies.evaluation.pass_cache import PassCache
+from worldstate.studies.trials.engine import Engine
+from worldstate.studies.trials.pass_cache import PassCache
 
 WHOLE = PinholeCamera()
 WIDTH, HEIGHT = 484, 304

@@ -13,7 +13,7 @@ import pytest
 from engine_work import Levels, end_at_one, write_sounds
 
 from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
-from worldstate.studies.evaluation.engine import Engine, Failed
+from worldstate.studies.trials.engine import Engine, Failed
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_a_loop_that_is_left_leaves_no_work_on_the_cluster(cluster):
 def test_a_cluster_that_would_compute_something_else_is_refused(cluster, tmp_path, monkeypatch):
     with pytest.raises(InvalidArgumentError, match=r"nowhere is not there.*same path"):
         list(Engine(scheduler=cluster, shared=(tmp_path / "nowhere",)).over(abs, [1]))
-    monkeypatch.setattr("worldstate.studies.evaluation.engine.__version__", "0.0.1")
+    monkeypatch.setattr("worldstate.studies.trials.engine.__version__", "0.0.1")
     with pytest.raises(InvalidArgumentError, match=r"expected version 0\.0\.1 on tcp"):
         list(Engine(scheduler=cluster).over(abs, [1]))
 
@@ -88,7 +88,7 @@ def test_a_cluster_that_loses_a_worker_is_an_error_not_an_endless_wait(cluster):
 
 
 def test_a_scheduler_that_does_not_answer_is_refused_with_what_to_do(monkeypatch):
-    monkeypatch.setattr("worldstate.studies.evaluation.engine.CONNECT_S", 0.2)
+    monkeypatch.setattr("worldstate.studies.trials.engine.CONNECT_S", 0.2)
     for address in ("127.0.0.1:1", "nonsense:xx"):
         with pytest.raises(
             InvalidArgumentError, match=f"{address}, none answers; start one with `dask sched"
@@ -99,7 +99,7 @@ def test_a_scheduler_that_does_not_answer_is_refused_with_what_to_do(monkeypatch
 def test_a_cluster_without_workers_is_refused(monkeypatch):
     import distributed
 
-    monkeypatch.setattr("worldstate.studies.evaluation.engine.CONNECT_S", 0.5)
+    monkeypatch.setattr("worldstate.studies.trials.engine.CONNECT_S", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
         pytest.raises(InvalidArgumentError, match="got none; start some with `dask worker"),
@@ -117,7 +117,7 @@ RUN = """
 import signal, sys
 from pathlib import Path
 from engine_work import Levels
-from worldstate.studies.evaluation.engine import Engine
+from worldstate.studies.trials.engine import Engine
 def end(number, frame): raise SystemExit(128 + number)
 signal.signal(signal.SIGTERM, end)
 folder, pause_s = Path(sys.argv[1]), float(sys.argv[2])

@@ -21,19 +21,19 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.bearing_gating import bearing_curve
 from worldstate.operations.recordings.hop_stream import ABSENT
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.classification import Classifiers, classified, junction_of, posteriors
 from worldstate.studies.evaluation.front_end_study import front_end_study
-from worldstate.studies.evaluation.hearing import Hearing
-from worldstate.studies.evaluation.listening import pass_time_s
-from worldstate.studies.evaluation.methods.calibrated_cue import CalibratedCue
-from worldstate.studies.evaluation.methods.published_rule import PublishedRule
 from worldstate.studies.evaluation.protocol_run import ProtocolRun, run_protocol
 from worldstate.studies.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STATIC
 from worldstate.studies.evaluation.scores import Score
-from worldstate.studies.evaluation.takes import Take, TakeList
-from worldstate.studies.evaluation.training_windows import windows_from_simulation, windows_from_table
-from worldstate.studies.evaluation.trial import Decisions, Trial
+from worldstate.studies.methods.calibrated_cue import CalibratedCue
+from worldstate.studies.methods.published_rule import PublishedRule
 from worldstate.studies.streets.simulated_windows import simulated_windows
+from worldstate.studies.trials.classification import Classifiers, classified, junction_of, posteriors
+from worldstate.studies.trials.hearing import Hearing
+from worldstate.studies.trials.listening import pass_time_s
+from worldstate.studies.trials.takes import Take, TakeList
+from worldstate.studies.trials.training_windows import windows_from_simulation, windows_from_table
+from worldstate.studies.trials.trial import Decisions, Trial
 
 HOPS = 91
 T0_S, PASS_S = 7.0, 8.0

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable, load_named, load_tables, save_named
-from worldstate.studies.evaluation.pass_cache import FingerprintMemo, PassCache, fingerprint
+from worldstate.studies.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
 
 DTYPES = st.sampled_from([np.float64, np.float32, np.int64, np.bool_, "<U7"])
 NAMES = st.text("abc_", min_size=1, max_size=4)

@@ -26,9 +26,6 @@ from worldstate.studies.degradation.degradation_study import (
 )
 from worldstate.studies.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate.studies.evaluation.front_end_study import front_end_study
-from worldstate.studies.evaluation.methods.calibrated_cue import CalibratedCue
-from worldstate.studies.evaluation.methods.line_of_sight import VisionOnly
-from worldstate.studies.evaluation.methods.published_rule import PublishedRule
 from worldstate.studies.evaluation.paper_values import PAPER_VALUES, paper_value
 from worldstate.studies.evaluation.protocol_run import ProtocolRun
 from worldstate.studies.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC
@@ -49,9 +46,12 @@ from worldstate.studies.evaluation.report.markdown_page import markdown_page
 from worldstate.studies.evaluation.report.study_sections import signature_values
 from worldstate.studies.evaluation.report.writing import write_document
 from worldstate.studies.evaluation.scores import Score
-from worldstate.studies.evaluation.takes import Take, TakeList
-from worldstate.studies.evaluation.trial import Trial
+from worldstate.studies.methods.calibrated_cue import CalibratedCue
+from worldstate.studies.methods.line_of_sight import VisionOnly
+from worldstate.studies.methods.published_rule import PublishedRule
 from worldstate.studies.signatures.signature_study import SignatureRow, SignatureStudy
+from worldstate.studies.trials.takes import Take, TakeList
+from worldstate.studies.trials.trial import Trial
 
 HOSTILE = '<script src="http://x/y.js">a|b</script> `*_\n| "q" & [t](http://x)'
 

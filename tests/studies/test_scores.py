@@ -19,7 +19,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.recording_draws import stratified_draws
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.evaluation.scores import Score, paired
-from worldstate.studies.evaluation.trial import TRUTH_COLUMNS, Trial
+from worldstate.studies.trials.trial import TRUTH_COLUMNS, Trial
 
 
 def close(ours, theirs):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from worldstate.cli.main import main
-from worldstate.studies.evaluation.hearing import Hearing
-from worldstate.studies.evaluation.methods.line_of_sight import seen_early_s
-from worldstate.studies.evaluation.takes import find_takes
+from worldstate.studies.methods.line_of_sight import seen_early_s
+from worldstate.studies.trials.hearing import Hearing
+from worldstate.studies.trials.takes import find_takes
 
 pytestmark = pytest.mark.xdist_group("evaluation")
 

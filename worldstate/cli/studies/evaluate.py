@@ -35,10 +35,10 @@ from worldstate.cli.common.progress import Bar, progress_bar
 if TYPE_CHECKING:
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.evaluation.against import Comparison
-    from worldstate.studies.evaluation.classification import Classifiers
     from worldstate.studies.evaluation.evaluation import Evaluation
-    from worldstate.studies.evaluation.takes import TakeList
     from worldstate.studies.signatures.signature_study import SignatureStudy
+    from worldstate.studies.trials.classification import Classifiers
+    from worldstate.studies.trials.takes import TakeList
 
 EXAMPLE = """\
 examples:
@@ -87,11 +87,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.studies.evaluation.against import save_scores
-    from worldstate.studies.evaluation.engine import Engine
     from worldstate.studies.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
-    from worldstate.studies.evaluation.hearing import Hearing
     from worldstate.studies.evaluation.report.contents import evaluation_document
     from worldstate.studies.evaluation.report.writing import write_document
+    from worldstate.studies.trials.engine import Engine
+    from worldstate.studies.trials.hearing import Hearing
 
     _check(arguments)
     output_folder(arguments.out, "evaluation.json")
@@ -209,7 +209,7 @@ class _Bars:
 
 
 def _takes(arguments: argparse.Namespace) -> "TakeList":
-    from worldstate.studies.evaluation.takes import find_takes
+    from worldstate.studies.trials.takes import find_takes
 
     if arguments.model is not None:
         _check_model(arguments.model, arguments.dataset)
@@ -257,8 +257,8 @@ def _simulated(arguments: argparse.Namespace) -> Path:
 
 def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifiers":
     from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
-    from worldstate.studies.evaluation import training_windows as windows
-    from worldstate.studies.evaluation.classification import Classifiers
+    from worldstate.studies.trials import training_windows as windows
+    from worldstate.studies.trials.classification import Classifiers
 
     if arguments.features is not None:
         return Classifiers(*windows.windows_from_table(arguments.features, takes))

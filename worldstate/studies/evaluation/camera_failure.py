@@ -13,10 +13,9 @@ from worldstate.studies.degradation.degradation_study import (
     degradation_study,
 )
 from worldstate.studies.degradation.sweep_data import sweep_data
-
-from .engine import Engine, Failed
-from .pass_cache import FingerprintMemo, PassCache, fingerprint
-from .takes import TakeList
+from worldstate.studies.trials.engine import Engine, Failed
+from worldstate.studies.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
+from worldstate.studies.trials.takes import TakeList
 
 Begin = Callable[[str, int], None]
 

@@ -10,19 +10,19 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import IndexArray
 from worldstate.operations.metrics.recording_draws import DRAWS, stratified_draws
 from worldstate.studies.degradation.degradation_study import DegradationSettings, DegradationStudy
+from worldstate.studies.methods.table_rows import methods_for
 from worldstate.studies.paper.ablations import AblationRow, AblationSwitches, ablation_table
+from worldstate.studies.trials.classification import Classifiers
+from worldstate.studies.trials.engine import Engine, Failed
+from worldstate.studies.trials.hearing import Hearing, hear, within_hours
+from worldstate.studies.trials.takes import TakeList
+from worldstate.studies.trials.trial import Trial
 
 from .camera_failure import camera_failure, lacking_films
-from .classification import Classifiers
-from .engine import Engine, Failed
 from .front_end_study import FrontEndStudy, front_end_study
-from .hearing import Hearing, hear, within_hours
-from .methods.table_rows import methods_for
 from .protocol_run import ProtocolRun, run_protocol
 from .protocols import PROTOCOLS, STATIC, Protocol
 from .scores import Score
-from .takes import TakeList
-from .trial import Trial
 
 # The paper's alpha; the ablations are told at it.
 ALPHA = 0.02

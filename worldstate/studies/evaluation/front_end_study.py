@@ -10,8 +10,7 @@ from worldstate.operations.metrics.recording_draws import middle, stratified_dra
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.bearing_gating import bearing_figures
 from worldstate.operations.recordings.hop_table import HopTable, joined
-
-from .trial import Trial
+from worldstate.studies.trials.trial import Trial
 
 # The paper's figure of looming is of the last three seconds before the pass.
 IMMINENT_S = 3.0

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.operations.recordings.advisories import caution
+from worldstate.studies.trials.classification import Classifiers
+from worldstate.studies.trials.trial import Decisions, Method, Trial
 
-from .classification import Classifiers
 from .protocols import Protocol
-from .trial import Decisions, Method, Trial
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,9 @@ import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.recording_folds import deal_folds
-
-from .classification import TrainedOn, junction_of
-from .takes import Take
-from .trial import Trial
+from worldstate.studies.trials.classification import TrainedOn, junction_of
+from worldstate.studies.trials.takes import Take
+from worldstate.studies.trials.trial import Trial
 
 FOLDS = 5
 

@@ -15,8 +15,7 @@ from worldstate.operations.metrics.track_measures import TrackRows, TruthRows, t
 from worldstate.operations.recordings.advisories import LONGEST_LEAD_S, SLACK_S, detection, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
-
-from .trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
+from worldstate.studies.trials.trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 
 # The paper's, before line-of-sight entry.
 HORIZONS_S = {"all": np.inf, "2s": 2.0, "1s": 1.0}

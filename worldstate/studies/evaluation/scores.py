@@ -24,9 +24,9 @@ from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, joined
+from worldstate.studies.trials.trial import Decisions, Trial
 
 from . import reduction
-from .trial import Decisions, Trial
 
 Interval = tuple[float, float]
 

@@ -10,9 +10,9 @@ import sklearn
 
 from worldstate.ground.version import __version__
 from worldstate.studies.evaluation.evaluation import Evaluation
-from worldstate.studies.evaluation.hearing import data_fingerprint
 from worldstate.studies.evaluation.protocols import PROTOCOLS, STATIC
 from worldstate.studies.signatures.signature_study import SignatureStudy
+from worldstate.studies.trials.hearing import data_fingerprint
 
 from . import study_sections as study
 from . import warning_sections as warning

@@ -11,10 +11,10 @@ from worldstate.operations.metrics.recording_draws import middle
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate.studies.evaluation.evaluation import Evaluation
 from worldstate.studies.evaluation.front_end_study import FrontEndStudy
-from worldstate.studies.evaluation.methods.line_of_sight import seen_early_s
 from worldstate.studies.evaluation.paper_values import PAPER_VALUES, paper_value
 from worldstate.studies.evaluation.protocols import RETRAINED, STATIC
 from worldstate.studies.evaluation.scores import Score
+from worldstate.studies.methods.line_of_sight import seen_early_s
 
 from .document import Value
 

@@ -12,12 +12,12 @@ from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.advisories import detection, rising_edges
 from worldstate.studies.evaluation.evaluation import ALPHA, Evaluation
-from worldstate.studies.evaluation.methods.table_rows import CURVE_ALPHAS
 from worldstate.studies.evaluation.paper_values import paper_value
 from worldstate.studies.evaluation.protocols import STATIC
 from worldstate.studies.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate.studies.evaluation.scores import paired
-from worldstate.studies.evaluation.trial import Decisions, Trial
+from worldstate.studies.methods.table_rows import CURVE_ALPHAS
+from worldstate.studies.trials.trial import Decisions, Trial
 
 from .approach_timeline import ApproachImage, ApproachTimeline, approach_figure, approach_images
 from .cueing_panels import OperatingPoint, operating_figure, reliability_figure, roc_figure

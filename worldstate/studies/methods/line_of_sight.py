@@ -10,7 +10,7 @@ import numpy as np
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_stream import HOP_S
-from worldstate.studies.evaluation.trial import Decide, Decisions, Trial
+from worldstate.studies.trials.trial import Decide, Decisions, Trial
 
 from .images import SLACK_S, Images, sides
 

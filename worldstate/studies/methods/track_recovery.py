@@ -8,7 +8,7 @@ import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.trial import TRACK_COLUMNS, Decide, Decisions, Trial
+from worldstate.studies.trials.trial import TRACK_COLUMNS, Decide, Decisions, Trial
 
 from .images import Images, sides, vehicles
 from .oc_sort import OcSort, TrackedBox

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.studies.evaluation.classification import SIDE_COLUMNS, posteriors
-from worldstate.studies.evaluation.trial import Decide, Decisions, Trial
+from worldstate.studies.trials.classification import SIDE_COLUMNS, posteriors
+from worldstate.studies.trials.trial import Decide, Decisions, Trial
 
 from .sustained_rule import argmax_is_side, best_sustain, likelier_side
 

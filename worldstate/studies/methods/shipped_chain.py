@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.studies.evaluation.trial import Decide, Decisions, Trial
+from worldstate.studies.trials.trial import Decide, Decisions, Trial
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from worldstate.studies.evaluation.trial import Method, Trial
+from worldstate.studies.trials.trial import Method, Trial
 
 from .calibrated_cue import CalibratedCue
 from .line_of_sight import RadarFieldOfView, VisionOnly

@@ -11,7 +11,7 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
-from worldstate.studies.evaluation.trial import Decide, Decisions, Trial
+from worldstate.studies.trials.trial import Decide, Decisions, Trial
 
 from .sustained_rule import best_sustain, labelled_windows, likelier_side
 

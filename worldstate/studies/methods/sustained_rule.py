@@ -7,8 +7,8 @@ import numpy as np
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.advisories import detection, rising_edges
-from worldstate.studies.evaluation.classification import SIDE_COLUMNS, posteriors
-from worldstate.studies.evaluation.trial import LEFT, RIGHT, Trial
+from worldstate.studies.trials.classification import SIDE_COLUMNS, posteriors
+from worldstate.studies.trials.trial import LEFT, RIGHT, Trial
 
 # Every hop of k costs a tenth of a second of lead.
 SUSTAIN_CHOICES = (2, 3, 4, 5)

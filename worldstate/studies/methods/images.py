@@ -9,7 +9,7 @@ from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.studies.evaluation.trial import Trial
+from worldstate.studies.trials.trial import Trial
 
 # At 47,998 Hz a hop ends up to 10 us before the image that it belongs to.
 SLACK_S = 1e-3
