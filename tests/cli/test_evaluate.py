@@ -34,6 +34,8 @@ def test_every_row_of_the_table_is_there(smoke):
     assert set(report["protocols"]) == {"static", "junctions_fixed", "junctions_retrained"}
     assert "dynamic" in report["lacking"] and "moving ego" in report["lacking"]["dynamic"]
     assert "simulated" in report["data"]
+    # Two recordings of either kind say nothing, and the report says that.
+    assert len(report["cautions"]["static"]) == 2
 
 
 def test_line_of_sight_says_nothing_before_sight(smoke):

@@ -33,6 +33,7 @@ from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import Bar, progress_bar
 
 if TYPE_CHECKING:
+    from worldstate.operations.recordings.hop_table import HopTable
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.evaluation.against import Comparison
     from worldstate.studies.evaluation.evaluation import Evaluation
@@ -123,17 +124,27 @@ def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
     import numpy as np
 
     from worldstate.cli.studies.evaluate_signatures import published_corpora
+    from worldstate.studies.signatures.clip_signatures import ClipSignatures
     from worldstate.studies.signatures.signature_study import QUESTIONS, signature_study
-    from worldstate.studies.signatures.simulated_corpora import STREETS, simulated_corpora
+    from worldstate.studies.signatures.simulated_corpora import LAYOUT, STREETS, simulated_corpora
+    from worldstate.studies.trials.pass_cache import PassCache
 
     # Apart, so that more recordings leave the folds and draws of a row as they are.
     simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
     if arguments.idmt is not None or arguments.melaudis is not None:
         return signature_study(*published_corpora(arguments), draws)
-    with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
-        corpora = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
+
+    def simulate() -> "dict[str, HopTable]":
+        with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
+            made = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
+        return {name: corpus.table() for name, corpus in zip(("roads", "city"), made, strict=True)}
+
+    kept = PassCache(arguments.out / "cache").tables(
+        "signatures", [LAYOUT, PASSAGES, arguments.seed], simulate
+    )
+    roads, city = (ClipSignatures.from_table(kept[name]) for name in ("roads", "city"))
     with progress_bar("measuring signatures", len(QUESTIONS)) as bar:
-        return signature_study(*corpora, draws, bar.advance)
+        return signature_study(roads, city, draws, bar.advance)
 
 
 def _degradation(arguments: argparse.Namespace) -> "DegradationSettings":

@@ -35,7 +35,7 @@ SPREAD_RAD = float(GRID_RAD[1] - GRID_RAD[0])
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class NoisyEstimate:
     """One estimation problem that can be tried at any SNR."""
 
     name: str  # For the legend
@@ -94,7 +94,7 @@ class Efficiency:
 
 
 def measure_over_snr(
-    trial: Trial,
+    trial: NoisyEstimate,
     snr_db: Sequence[float],
     trials: int,
     rng: Generator,
@@ -104,7 +104,7 @@ def measure_over_snr(
 
     Parameters
     ----------
-    trial : Trial
+    trial : NoisyEstimate
         From `tone_trial`, `delay_trial` or `bearing_trial`.
     snr_db : sequence of float
         SNRs, dB.
@@ -166,7 +166,7 @@ def measure_toward_endfire(
     return Efficiency(name, np.array(azimuths_rad), np.array(bounds), np.array(squares), trials)
 
 
-def tone_trial(*, complex_signal: bool) -> Trial:
+def tone_trial(*, complex_signal: bool) -> NoisyEstimate:
     r"""Frequency of a single tone by `estimate_tone`, against the bound of Rife and Boorstyn, Hz."""
     time_s = np.arange(TONE_SAMPLES) / TONE_RATE_HZ
 
@@ -180,10 +180,10 @@ def tone_trial(*, complex_signal: bool) -> Trial:
         return estimate_tone(samples, TONE_RATE_HZ).frequency_hz - float(frequency_hz)
 
     name = "tone, complex, eta = A^2 / s^2" if complex_signal else "tone, real, eta = A^2 / 2 s^2"
-    return Trial(name, lambda eta: tone_crb_hz2(eta, TONE_SAMPLES, TONE_RATE_HZ), error)
+    return NoisyEstimate(name, lambda eta: tone_crb_hz2(eta, TONE_SAMPLES, TONE_RATE_HZ), error)
 
 
-def delay_trial() -> Trial:
+def delay_trial() -> NoisyEstimate:
     """Delay between two microphones by GCC-PHAT, against eq. (3), seconds."""
     shift = np.exp(-2j * np.pi * PAIR_FREQUENCIES_HZ * PAIR_DELAY_S)
     arrivals = np.stack([shift, np.ones_like(shift)], axis=-1)
@@ -199,12 +199,12 @@ def delay_trial() -> Trial:
         spectra = _circular(rng, *shape, 1) * arrivals + _circular(rng, *shape, 2) / np.sqrt(snr)
         return float(gcc_delays(spectra, PAIR_FREQUENCIES_HZ, PAIR_LIMIT_S).delay_s[0]) - PAIR_DELAY_S
 
-    return Trial("delay, GCC-PHAT", bound, error)
+    return NoisyEstimate("delay, GCC-PHAT", bound, error)
 
 
 def bearing_trial(
     array: MicrophoneArray, *, azimuth_rad: float = 0.0, frequency_hz: float = 1000.0, snapshots: int = 20
-) -> Trial:
+) -> NoisyEstimate:
     """Azimuth by SRP-PHAT on the front-end's grid of one degree, against eq. (4), radians."""
     broadside = broadside_rad(array.positions_m)
     grid, middle = broadside + GRID_RAD, broadside + azimuth_rad
@@ -222,10 +222,10 @@ def bearing_trial(
         return find_peaks(spectrum, grid, max_peaks=1)[0].azimuth_rad - truth
 
     bound(1.0)  # refuses what cannot be tried, before hours of it
-    return Trial(f"broadside bearing, SRP-PHAT, {array.n_microphones} microphones", bound, error)
+    return NoisyEstimate(f"broadside bearing, SRP-PHAT, {array.n_microphones} microphones", bound, error)
 
 
-def _mean_square(trial: Trial, snr: float, trials: int, rng: Generator) -> float:
+def _mean_square(trial: NoisyEstimate, snr: float, trials: int, rng: Generator) -> float:
     return float(np.mean([trial.error(snr, rng) ** 2 for _ in range(trials)]))
 
 

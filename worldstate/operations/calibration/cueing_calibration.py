@@ -23,7 +23,7 @@ from worldstate.operations.training.window_calibration import MISS_RATES
 
 from .false_alarm_map import FalseAlarmRate, false_alarm_rate
 
-Method = Literal["conformal", "plain"]
+ThresholdKind = Literal["conformal", "plain"]
 
 # With fewer false alarms in all the hours than this, their rate is not known to a factor of two.
 ENOUGH_ONSETS = 10
@@ -66,7 +66,7 @@ class CueingSettings:
 
     alphas: tuple[float, ...] = (0.01, 0.02, 0.05)
     sustain_hops: int = 3
-    method: Method = "conformal"
+    method: ThresholdKind = "conformal"
     confidence: float | None = None
     block_s: float = 10.0
     folds: int = 5

@@ -20,7 +20,7 @@ Passes = list[dict[float, Predictions]]
 
 
 @dataclass(frozen=True, slots=True)
-class Method:
+class WindowMethod:
     """One way from windows to risk."""
 
     # From the table as read to the table that the classifier sees.
@@ -43,7 +43,7 @@ class Row:
 
 
 def evaluate_pass(
-    method: Method,
+    method: WindowMethod,
     table: FeatureTable,
     protocol: Protocol,
     *,
@@ -72,7 +72,7 @@ def evaluate_pass(
     )
 
 
-def _inner_splits(method: Method, protocol: Protocol) -> tuple[Split, ...]:
+def _inner_splits(method: WindowMethod, protocol: Protocol) -> tuple[Split, ...]:
     split = split_for(protocol)
     return (split, folds_by_recording) if method.two_levels and split is junction_folds else (split,)
 
@@ -105,11 +105,11 @@ def distant_site(rng: np.random.Generator) -> Classifier:
 
 
 METHODS = {
-    "baseline": Method(as_read, PublishedClassifier, fit_isotonic, two_levels=False),
-    "loudest_direction": Method(as_read, loudest_direction, fit_isotonic, two_levels=False),
-    "ensemble": Method(with_site_references, site_ensemble, fit_platt, two_levels=True),
-    "commissioning_drive": Method(with_commissioning_drive, site_ensemble, fit_platt, two_levels=True),
-    "distant_site": Method(
+    "baseline": WindowMethod(as_read, PublishedClassifier, fit_isotonic, two_levels=False),
+    "loudest_direction": WindowMethod(as_read, loudest_direction, fit_isotonic, two_levels=False),
+    "ensemble": WindowMethod(with_site_references, site_ensemble, fit_platt, two_levels=True),
+    "commissioning_drive": WindowMethod(with_commissioning_drive, site_ensemble, fit_platt, two_levels=True),
+    "distant_site": WindowMethod(
         with_site_references, distant_site, fit_platt, two_levels=False, match_prevalence=True
     ),
 }
@@ -134,6 +134,6 @@ def row_of(method: str, protocol: Protocol) -> str:
     return OURS[protocol] if method == "worldstate" else method
 
 
-def method_of(method: str) -> Method:
+def method_of(method: str) -> WindowMethod:
     """Return what a method is where the ego drives as it did in training."""
     return METHODS[row_of(method, "cv")]

@@ -20,6 +20,15 @@ LONGEST_TTA_S = 30.0
 Interval = tuple[float, float]
 
 
+@dataclass(frozen=True, slots=True)
+class SiteError:
+    """Median error of the SRP bearings in view at one site, with its interval over recordings."""
+
+    median_deg: float
+    interval_deg: Interval
+    frames: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrontEndStudy:
     """Bearings against the camera, prominence, looming and tonal Doppler, with intervals over recordings."""
@@ -28,7 +37,7 @@ class FrontEndStudy:
     # `prominence_in_silence`, `looming_auroc`, `looming_correlation`, `doppler_usable` (count).
     figures: Mapping[str, float]
     intervals: Mapping[str, Interval]
-    by_site: Mapping[str, tuple[float, int]]  # Median SRP error in degrees, and frames
+    by_site: Mapping[str, SiteError]
     frames: int  # Line-of-sight frames with a moving box to compare with
     approaches: int
     checked: HopTable  # `prominence` and `error_rad` of every hop, for the gating curve
@@ -41,17 +50,17 @@ def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: in
     drawn = stratified_draws(strata, rng, draws)
     found = _figures(trials, np.arange(len(trials)))
     samples = [_figures(trials, rows) for rows in drawn]
-    by_site = {}
-    for site in sorted({trial.site for trial in approaches}):
-        errors = _known(np.concatenate([_error(t.hops, "srp_rad") for t in approaches if t.site == site]))
-        if errors.size:
-            by_site[site] = float(np.degrees(np.median(errors))), int(errors.size)
+    by_site = {
+        site: _site_error([trial.hops for trial in approaches if trial.site == site], rng, draws)
+        for site in sorted({trial.site for trial in approaches})
+    }
+    by_site = {site: error for site, error in by_site.items() if error.frames}
     checked = [_checked(trial.hops) for trial in approaches]
     return FrontEndStudy(
         found,
         {name: middle(np.array([one[name] for one in samples])) for name in found},
         by_site,
-        sum(frames for _, frames in by_site.values()),
+        sum(error.frames for error in by_site.values()),
         len(approaches),
         joined(checked) if checked else HopTable({"prominence": np.empty(0), "error_rad": np.empty(0)}),
     )
@@ -95,6 +104,15 @@ def _looming(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[s
         "looming_auroc": np.nan if area is None else area,
         "looming_correlation": float(np.corrcoef(_flat(read), _flat(true))[0, 1]) if enough else np.nan,
     }
+
+
+def _site_error(approaches: Sequence[HopTable], rng: np.random.Generator, draws: int) -> SiteError:
+    errors = [_known(_error(hops, "srp_rad")) for hops in approaches]
+    drawn = rng.integers(len(errors), size=(draws, len(errors)))
+    medians = [_median(_flat([errors[i] for i in rows])) for rows in drawn.tolist()]
+    every = _flat(errors)
+    interval = middle(np.degrees(np.array(medians)))
+    return SiteError(float(np.degrees(_median(every))), interval, every.size)
 
 
 def _checked(hops: HopTable) -> HopTable:

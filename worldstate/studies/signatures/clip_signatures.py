@@ -12,6 +12,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
+from worldstate.operations.recordings.hop_table import HopTable
 
 # Bands end at whole bins of 512 samples, so clips of two rates would have different bands: all are brought
 # to the rate of the larger corpus first.
@@ -19,6 +20,9 @@ RATE_HZ = 48_000.0
 # The highest band ends at 8 kHz, where 0.45 of the sample rate must still reach.
 LOWEST_RATE_HZ = 8000.0 / 0.45
 MOTOR_VEHICLES = ("car", "truck", "bus", "motorcycle")
+
+
+_COLUMNS = ("energy", "kinds", "microphones", "recordings", "sites", "splits")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +61,18 @@ class ClipSignatures:
             splits=np.array([one.split for one in labels]),
             left_out=left_out,
         )
+
+    def table(self) -> HopTable:
+        """Return it as a table, to be kept in a file."""
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        about = {"simulated": self.simulated, "left_out": list(self.left_out)}
+        return HopTable(columns, self.name, about=about)
+
+    @classmethod
+    def from_table(cls, table: HopTable) -> "ClipSignatures":
+        """Return what was kept by `table`."""
+        about = table.about
+        return cls(table.name, about["simulated"], **table.columns, left_out=tuple(about["left_out"]))
 
     @property
     def background(self) -> BoolArray:

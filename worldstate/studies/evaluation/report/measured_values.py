@@ -138,7 +138,7 @@ def _array_values() -> Iterator[tuple[Place, Value]]:
 def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
     for name, place in _FRONT_END.items():
         yield place, Value(study.figures[name], *study.intervals[name], figure_digits(name))
-    medians = [median for median, _ in study.by_site.values()] or [math.nan]
+    medians = [one.median_deg for one in study.by_site.values()] or [math.nan]
     counts = {
         "frames": study.frames,
         "recordings": study.approaches,

@@ -118,7 +118,8 @@ def front_end_section(found: Evaluation, values: Values) -> Section:
         return Section("Front-end accuracy", ("No recording has a camera reference.",), (), (bounds,))
     study = found.front_end
     sites = tuple(
-        (site, Value(median, digits=1), str(frames)) for site, (median, frames) in study.by_site.items()
+        (site, Value(one.median_deg, *one.interval_deg, digits=1), str(one.frames))
+        for site, one in study.by_site.items()
     )
     blocks = (
         group_table(
