@@ -1,7 +1,7 @@
 """The street as the camera sees it without a vehicle: ground, side walls, corners, what stands opposite."""
 
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class StreetView:
         return np.concatenate([reduced(self.image[row : row + step].astype(np.float32)) for row in rows])
 
 
+# Painting takes 4 s, a third of a recording's video. Five sites of 66 MB each: those of OVAD.
+@lru_cache(maxsize=5)
 def paint_street(site: Site, view: View) -> StreetView:
     """Paint a site; it has the same face in every recording."""
     panels = street_panels(site)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.evaluation.against import Comparison
     from worldstate.studies.evaluation.evaluation import Evaluation
+    from worldstate.studies.evaluation.scores import Score
     from worldstate.studies.signatures.signature_study import SignatureStudy
     from worldstate.studies.trials.classification import Classifiers
     from worldstate.studies.trials.takes import TakeList
@@ -321,13 +322,19 @@ def _lines(found: "Evaluation") -> list[str]:
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
     for name, scores in found.scores.items():
         run = found.runs[name]
-        lines += ["", f"{run.protocol.title}, {len(run.trials)} recordings", *run.cautions]
-        lines.append(f"{'':34}{'lead s':>8}{'detected':>10}{'FA/h':>8}{'bearing deg':>13}")
-        for method, score in scores.items():
-            if not method.startswith("curve"):
-                figures = score.figures()
-                shown = ("lead_s", "detection", "false_alarms_per_hour", "bearing_deg")
-                cells = [figures[key] for key in shown]
-                texts = ["-" if cell != cell else f"{cell:.3g}" for cell in cells]
-                lines.append(f"{method:34}{texts[0]:>8}{texts[1]:>10}{texts[2]:>8}{texts[3]:>13}")
+        hours = next(iter(scores.values())).figures()["hazard_free_hours"]
+        head = f"{run.protocol.title}: {len(run.trials)} recordings, {hours:.3f} h of them hazard-free"
+        lines += ["", head, *run.cautions]
+        lines.append(f"{'':36}{'lead s':>8}{'detected':>10}{'FA/h':>8}{'(95 %)':>14}{'bearing deg':>13}")
+        lines += [_row(name, score) for name, score in scores.items() if not name.startswith("curve")]
     return lines if found.degradation is None else [*lines, *degradation_lines(found.degradation)]
+
+
+def _row(method: str, score: "Score") -> str:
+    figures, (low, high) = score.figures(), score.poisson()
+    forms = {"lead_s": ".2f", "detection": ".2f", "false_alarms_per_hour": ".0f", "bearing_deg": ".1f"}
+    lead, detected, alarms, bearing = (
+        "-" if figures[name] != figures[name] else format(figures[name], form) for name, form in forms.items()
+    )
+    interval = f"[{low:.0f}, {high:.0f}]" if low == low else "-"
+    return f"{method:36}{lead:>8}{detected:>10}{alarms:>8}{interval:>14}{bearing:>13}"

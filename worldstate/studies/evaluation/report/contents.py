@@ -42,6 +42,7 @@ def evaluation_document(found: Evaluation, signatures: SignatureStudy | None = N
         *((study.ablation_section(found, values),) if static else ()),
         study.signature_section(signatures),
         *((warning.tracking_section(found, values),) if static else ()),
+        *((warning.strata_section(found, values),) if static else ()),
         warning.difference_section(found),
         study.paper_section(found, values),
     ]
