@@ -108,7 +108,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             classifiers,
             Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
             _Bars(stack),
-            EvaluationSettings(seeds, arguments.hazard_free_hours, degradation=_degradation(arguments)),
+            EvaluationSettings(
+                seeds, arguments.hazard_free_hours, degradation=_degradation(arguments, classifiers)
+            ),
         )
     save_scores(arguments.out, found.scores, COMPARABLE)
     compared = _compared(arguments)
@@ -148,12 +150,18 @@ def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
         return signature_study(roads, city, draws, bar.advance)
 
 
-def _degradation(arguments: argparse.Namespace) -> "DegradationSettings":
-    """Return the sweep over camera states; in a smoke test of one detector on small images."""
+def _degradation(arguments: argparse.Namespace, classifiers: "Classifiers") -> "DegradationSettings":
+    """Return the sweep over camera states; in a smoke test of one detector on small images.
+
+    It listens with --model, else with a model trained on the training windows, else with the one that ships.
+    """
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.degradation.looks import StagedDetector, motion_detectors
+    from worldstate.studies.trials.training_windows import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
+    if model is None and classifiers.windows is not None and not arguments.smoke:
+        model = model_from_windows(classifiers.windows, arguments.out / "cache", seed)
     if arguments.smoke:
         return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
     if arguments.onnx_model is not None:

@@ -69,9 +69,11 @@ def degradation_section(study: DegradationStudy | None, lacking: str) -> Section
     if study is None:
         return Section(title, (f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it.",))
     names = " and ".join(sweep.detector for sweep in study.sweeps)
+    model = study.settings.model
+    heard = "the model that ships" if model is None else f"the model {model.name}"
     text = [
         f"{len(study.approaches)} approaches and {len(study.hazard_free)} hazard-free recordings, detectors: "
-        f"{names}; ablation (c) is this sweep.",
+        f"{names}; heard with {heard}. Ablation (c) is this sweep.",
         *(f"{one}." for one in study.missing),
         *(f"Left out: {name}, {why}." for name, why in study.skipped.items()),
     ]
