@@ -192,11 +192,16 @@ def test_no_constant_beats_the_constants_that_stand_beside(true, seed):
 
 def test_errors_of_stated_times_in_closed_form():
     true = np.array([1.0, 2.0, 3.0, np.nan, 5.0])
-    stated = np.array([[0, 1, 2], [2, 3, 4], [0, 1, 2], [0, 1, 2], [np.nan, 1, 2]], dtype=float)
+    stated = np.array([[0, 1, 2], [2, 3, 4], [0, 1, 2], [0, 1, 2], [0, np.nan, 2]], dtype=float)
     errors = visible_errors(stated, true)
     assert (errors.count, errors.median_s, errors.rmse_s) == (3, 1.0, pytest.approx((5 / 3) ** 0.5))
     assert (errors.coverage, errors.width_s) == pytest.approx((2 / 3, 2.0))
     # Two of 1, 2, 3 lie within one second of each other.
     assert (errors.constant_median_s, errors.constant_width_s) == (0.5, 1.0)
+    # A method may state a time without an interval, as a cue does: its error counts, its coverage does not.
+    stated[0, 0] = stated[1, 2] = np.nan
+    alone = visible_errors(stated, true)
+    assert (alone.count, alone.intervals, alone.rmse_s) == (3, 1, errors.rmse_s)
+    assert alone.coverage == 0.0
     with pytest.raises(InvalidArgumentError, match="stated"):
         visible_errors(np.zeros((2, 2)), np.zeros(2))

@@ -19,9 +19,14 @@ class VisibleErrors:
     >>> errors = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
     >>> errors.count, round(errors.median_s, 2), round(errors.coverage, 2), round(errors.constant_median_s, 2)
     (3, 0.5, 0.67, 0.7)
+    >>> stated[:, [0, 2]] = np.nan
+    >>> without = visible_errors(stated, np.array([1.1, 2.5, 5.0]))
+    >>> round(without.median_s, 2), without.coverage
+    (0.5, nan)
     """
 
     count: int  # Times that were stated and can be checked
+    intervals: int  # Of these, with an interval
     median_s: float  # Of the absolute error of the best value
     rmse_s: float
     coverage: float  # Share of truths within the stated interval
@@ -35,7 +40,8 @@ class VisibleErrors:
 def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
     """Compare stated times to visible, low, best and high (n, 3), with the true seconds (n,).
 
-    Rows with a NaN are not stated, or never come into view, and are left out.
+    Rows without a best value, or that never come into view, are left out. Coverage and width are those of
+    the rows that have an interval, NaN where none has: a method may state a time alone.
 
     Examples
     --------
@@ -43,22 +49,24 @@ def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
     0
     """
     check_shape("stated", np.shape(stated), (len(true_s), 3))
-    known = np.isfinite(stated).all(axis=1) & np.isfinite(true_s)
+    known = np.isfinite(stated[:, 1]) & np.isfinite(true_s)
     if not known.any():
-        return VisibleErrors(0, *[math.nan] * 7)
-    low, best, high = stated[known].T
-    true = true_s[known]
-    inside = (low <= true) & (true <= high)
+        return VisibleErrors(0, 0, *[math.nan] * 7)
+    best, true = stated[known, 1], true_s[known]
+    bounded = known & np.isfinite(stated).all(axis=1)
+    low, high = stated[bounded][:, [0, 2]].T
+    inside = (low <= true_s[bounded]) & (true_s[bounded] <= high)
     return VisibleErrors(
         count=true.size,
+        intervals=inside.size,
         # Of an even number the upper of the two middle errors, for which the shortest half is exact.
         median_s=float(np.quantile(np.abs(best - true), 0.5, method="higher")),
         rmse_s=float(np.sqrt(np.mean((best - true) ** 2))),
-        coverage=float(inside.mean()),
-        width_s=float(np.mean(high - low)),
+        coverage=float(inside.mean()) if inside.size else math.nan,
+        width_s=float(np.mean(high - low)) if inside.size else math.nan,
         constant_median_s=shortest_interval(true, true.size // 2 + 1) / 2.0,
         constant_rmse_s=float(true.std()),
-        constant_width_s=shortest_interval(true, int(inside.sum())),
+        constant_width_s=shortest_interval(true_s[bounded], int(inside.sum())),
     )
 
 

@@ -122,11 +122,12 @@ def visible_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     errors = visible_errors(said.visible_s, true_s)
     if not errors.count:
         return {}
-    known = true_s[np.isfinite(true_s) & np.isfinite(said.visible_s).all(axis=1)]
+    known = true_s[np.isfinite(true_s) & np.isfinite(said.visible_s[:, 1])]
     return {
         "visible_hops": float(errors.count),
         "visible_squared": errors.count * errors.rmse_s**2,
-        "visible_inside": errors.count * errors.coverage,
+        "visible_intervals": float(errors.intervals),
+        "visible_inside": errors.intervals * errors.coverage if errors.intervals else 0.0,
         "visible_true": float(known.sum()),
         "visible_true_squared": float((known**2).sum()),
     }

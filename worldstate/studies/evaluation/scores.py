@@ -50,14 +50,14 @@ _RATIOS = {
     "track_latency_s": ("track_latency_s", "tracked", 1.0),
     "azimuth_error_deg": ("azimuth_error_rad", "matched", np.degrees(1.0)),
     "gospa_deg": ("gospa_rad", "gospa_hops", np.degrees(1.0)),
-    "visible_coverage": ("visible_inside", "visible_hops", 1.0),
+    "visible_coverage": ("visible_inside", "visible_intervals", 1.0),
 }
 # What one recording adds; a count that it does not have is zero.
 COUNTS = (
     *dict.fromkeys(name for ratio in _RATIOS.values() for name in ratio[:2]),
     *("onsets_before", "window_s", "before_s"),
     *(f"windows_{horizon}" for horizon in reduction.HORIZONS_S),
-    *("squared_error", "visible_squared", "visible_true", "visible_true_squared"),
+    *("squared_error", "visible_hops", "visible_squared", "visible_true", "visible_true_squared"),
 )
 _RISK, _RAW = 0, 1
 # Measured after T0 with a vehicle in view; the other figures are of the time before it or without any.
