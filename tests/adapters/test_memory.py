@@ -112,5 +112,5 @@ def test_many_members_and_many_empty_streams_are_refused(tmp_path: Path) -> None
     with pytest.raises(InputFileError, match="short list of members"):
         load_streams(path)
     save_tables(path, [HopTable({"time_s": np.zeros(0)}, name="a")] * 100_001)
-    with pytest.raises(InputFileError, match="at most 100000 recordings"):
+    with pytest.raises(InputFileError, match="at most 100000 tables"):
         load_streams(path)

@@ -56,6 +56,7 @@ def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, capsys):
     assert "less the other evaluation" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_stream_of_the_same_quiet_recordings_can_be_added(smoke, tmp_path):
     import numpy as np
     import soundfile

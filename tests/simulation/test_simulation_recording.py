@@ -322,6 +322,7 @@ def test_distant_vehicles_are_as_frequent_in_a_short_recording_as_in_a_long_one(
     assert outside == pytest.approx(0.12 * 8.0, rel=0.1)  # they are heard before and after they are loudest
 
 
+@pytest.mark.slow
 def test_hidden_approaches_are_louder_and_sharper_than_empty_streets():
     """Direction of the effect that everything else rests on, with two sites and one seed."""
     peaks = {"left": [], "none": []}

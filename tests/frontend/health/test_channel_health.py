@@ -379,6 +379,7 @@ def test_gaps_are_found_where_they_are() -> None:
     assert 70_000 <= repeat.sample < 70_800
 
 
+@pytest.mark.slow
 def test_four_cuts_in_five_are_found_in_simulated_streets() -> None:
     """Pooled over streets with and without a vehicle; .86 of them, more where nothing drives."""
     array = MicrophoneArray(roof_array_56().positions_m[::4])

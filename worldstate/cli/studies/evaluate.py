@@ -51,7 +51,7 @@ examples:
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59
-SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 1, 5.0
+SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
 SMOKE_WIDTH_PX = 160
 FULL_SEEDS = 5
 # Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`,
@@ -280,10 +280,10 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
     from worldstate.studies.trials import training_windows as windows
     from worldstate.studies.trials.classification import Classifiers
 
-    if arguments.features is not None:
-        return Classifiers(*windows.windows_from_table(arguments.features, takes))
     folder = arguments.out / "cache"
     folder.mkdir(parents=True, exist_ok=True)
+    if arguments.features is not None:
+        return Classifiers(*windows.windows_from_table(arguments.features, takes))
     found = windows.windows_from_recordings(takes, folder)
     if found is None and takes.simulated:
         count = SMOKE_WINDOWS if arguments.smoke else windows.PER_APPROACH
