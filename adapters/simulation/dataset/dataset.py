@@ -223,7 +223,9 @@ def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray | 
     settings = replace(drawn, preset=preset(wanted.preset))
     recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
-    frames = camera_frames(settings, recording, rng.spawn(1)[0]) if wanted.video else None
+    frames = None
+    if wanted.video:
+        frames = camera_frames(settings, recording, rng.spawn(1)[0], wanted.camera())
     return write_recording(root, recording, plan.number, frames)
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
 from worldstate.adapters.simulation.scene.occlusions import occluded_scene
@@ -47,6 +48,8 @@ class DatasetSettings:
     video : bool
         Write what the camera sees, too; sound, detections and truth are the same with and without. Only for
         a standing ego at a junction.
+    video_width_px : int
+        Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
     preset : str
         Name of the levels of everything that is not geometry.
 
@@ -68,6 +71,7 @@ class DatasetSettings:
     kind: str = "light"
     duration_s: float = 10.0
     video: bool = False
+    video_width_px: int = PinholeCamera().width_px
     preset: str = DEFAULT_PRESET
 
     def __post_init__(self) -> None:
@@ -76,6 +80,7 @@ class DatasetSettings:
         in_range("n_static + n_dynamic", self.n_static + self.n_dynamic, 1, MAX_RECORDINGS)
         in_range("seed", self.seed, 0, 2**63)
         in_range("duration_s", self.duration_s, 0.5, 60.0)
+        in_range("video_width_px", self.video_width_px, 64, PinholeCamera().width_px)
         vehicle_kind(self.kind)
         preset(self.preset)
         if self.scene != JUNCTION:
@@ -86,6 +91,13 @@ class DatasetSettings:
             )
         if self.video and (self.n_dynamic or self.scene != JUNCTION):
             raise InvalidArgumentError("video: expected only static recordings of the scene 'junction'")
+
+    def camera(self) -> PinholeCamera:
+        """Return the camera of the video: OVAD's, with images of the width that is wanted."""
+        whole = PinholeCamera()
+        # An even height: the codec takes no other.
+        height_px = 2 * round(0.5 * whole.height_px * self.video_width_px / whole.width_px)
+        return PinholeCamera(width_px=self.video_width_px, height_px=height_px)
 
     def plans(self) -> list[Plan]:
         """Return what every recording is: site after site, the standing ego first.

@@ -22,6 +22,7 @@ leaving junctions out two junctions that have both; what a protocol lacks is sai
 """
 
 import argparse
+import os
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,7 +53,8 @@ examples:
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59
 SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
-SMOKE_WIDTH_PX = 160
+# Images of OVAD's size take more than half of the time of a simulated recording.
+SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
 # Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`,
 # as they are made anew in every run.
@@ -81,7 +83,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
     add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times")
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
-    add("--jobs", type=int, default=1, help="processes (default: %(default)s)")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    add("--jobs", type=int, default=cores, help="processes (default: one a core)")
     add_choice(parser, "--engine", "where the work is done", "local", "dask")
     add("--scheduler", metavar="ADDRESS", help="of the Dask cluster, which sees the same paths")
 
@@ -257,6 +260,8 @@ def _check_model(model: Path, dataset: Path | None) -> None:
 
 def _simulated(arguments: argparse.Namespace) -> Path:
     """Simulate the streets that are not there yet."""
+    from dataclasses import replace
+
     from worldstate.adapters.datasets.ovad_layout import LOG_NAME
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
@@ -266,7 +271,8 @@ def _simulated(arguments: argparse.Namespace) -> Path:
         return root
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
     # A moving ego has no video: its camera moves, and every box with it.
-    parts = [DatasetSettings(n_static=static, seed=arguments.seed, video=True, duration_s=length_s)]
+    streets = DatasetSettings(static, seed=arguments.seed, duration_s=length_s, video=True)
+    parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
         parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
     with progress_bar("simulating streets", static + dynamic) as bar:

@@ -51,6 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
     add("--video", action="store_true", help="render the camera's video, too")
+    add("--video-width", type=int, default=1936, metavar="PX", help="of its images (default: 1936)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -88,5 +89,6 @@ def _settings(arguments: argparse.Namespace) -> "DatasetSettings":
         kind=arguments.kind,
         duration_s=arguments.duration,
         video=arguments.video,
+        video_width_px=arguments.video_width,
         preset=arguments.preset,
     )
