@@ -89,3 +89,19 @@ def test_partial_data_are_refused_with_what_is_missing(smoke, tmp_path, capsys):
     assert "DataLog.csv" in capsys.readouterr().err
     assert time.monotonic() - started < 10.0
     assert not (tmp_path / "no" / "cache").exists()
+
+
+@pytest.mark.slow
+def test_streets_whose_simulation_was_interrupted_are_completed(smoke, tmp_path):
+    import shutil
+
+    out, report = smoke
+    again = tmp_path / "again"
+    shutil.copytree(out / "smoke", again / "smoke")
+    shutil.copytree(out / "cache", again / "cache")
+    log = again / "smoke" / "DataLog.csv"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-1]))
+    assert main(["evaluate", "--smoke", "--out", str(again)]) == 0
+    found = json.loads((again / "evaluation.json").read_text())
+    assert found["recordings"] == report["recordings"]
+    assert found["protocols"] == report["protocols"]

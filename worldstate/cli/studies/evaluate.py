@@ -56,8 +56,7 @@ SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
 # Images of OVAD's size take more than half of the time of a simulated recording.
 SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
-# Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`,
-# as they are made anew in every run.
+# Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`.
 PASSAGES = 6
 # What two evaluations must have in common for their figures to be comparable.
 COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
@@ -262,14 +261,16 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     """Simulate the streets that are not there yet."""
     from dataclasses import replace
 
+    from worldstate.adapters.datasets.ovad import OvadDataset
     from worldstate.adapters.datasets.ovad_layout import LOG_NAME
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
-    if (root / LOG_NAME).is_file():
-        return root
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
+    # A log of fewer recordings is that of a simulation that was interrupted.
+    if (root / LOG_NAME).is_file() and len(OvadDataset(root)) == static + dynamic:
+        return root
     # A moving ego has no video: its camera moves, and every box with it.
     streets = DatasetSettings(static, seed=arguments.seed, duration_s=length_s, video=True)
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]

@@ -21,7 +21,7 @@ from worldstate.studies.trials.trial import Trial
 from .camera_failure import camera_failure, lacking_films
 from .front_end_study import FrontEndStudy, front_end_study
 from .protocol_run import ProtocolRun, run_protocol
-from .protocols import PROTOCOLS, STATIC, Protocol
+from .protocols import PROTOCOLS, STATIC
 from .scores import Score
 
 # The paper's alpha; the ablations are told at it.
@@ -96,7 +96,8 @@ def evaluate(
     steps.begin("fitting and deciding", len(chosen))
     runs = {}
     for protocol in chosen:
-        runs[protocol.name] = _run(protocol, trials, classifiers, settings.seeds)
+        own = [trial for trial in trials if bool(trial.hops.about["moving"]) == protocol.moving]
+        runs[protocol.name] = run_protocol(protocol, own, methods_for(own), classifiers, settings.seeds)
         steps.advance()
     steps.begin("scoring", sum(len(run.decisions) for run in runs.values()))
     scores: dict[str, dict[str, Score]] = {}
@@ -124,13 +125,6 @@ def evaluate(
         _degradation(takes, hearing, engine, steps, settings.degradation, lacking),
         settings,
     )
-
-
-def _run(
-    protocol: Protocol, trials: Sequence[Trial], classifiers: Classifiers, seeds: Sequence[int]
-) -> ProtocolRun:
-    own = [trial for trial in trials if bool(trial.hops.about["moving"]) == protocol.moving]
-    return run_protocol(protocol, own, methods_for(own), classifiers, seeds)
 
 
 def _degradation(

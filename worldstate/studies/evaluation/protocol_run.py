@@ -40,21 +40,23 @@ def run_protocol(
     seeds: Sequence[int],
     on_part: Callable[[], None] = lambda: None,
 ) -> ProtocolRun:
-    """Fit and ask all methods on all folds, for every seed; by junction the first seed is the only one."""
-    heard = [trial for trial in trials if bool(trial.hops.about["moving"]) == protocol.moving]
+    """Fit and ask all methods on all folds, for every seed; by junction the first seed is the only one.
+
+    The trials are those of the ego motion that the protocol is about.
+    """
     # Junctions are not drawn: another seed would give the same folds.
     used = tuple(seeds[:1]) if protocol.by_junction else tuple(seeds)
     passes: list[dict[str, dict[int, Decisions]]] = []
     for seed in used:
         said: dict[str, dict[int, Decisions]] = {method.name: {} for method in methods}
-        for calibration, tested in protocol.parts(heard, np.random.default_rng(seed)):
-            _one_part(protocol, heard, methods, classifiers, calibration, tested, seed, said)
+        for calibration, tested in protocol.parts(trials, np.random.default_rng(seed)):
+            _one_part(protocol, trials, methods, classifiers, calibration, tested, seed, said)
             on_part()
         passes.append(said)
     rows = sorted(next(iter(passes[0].values())))
     return ProtocolRun(
         protocol,
-        tuple(heard[i] for i in rows),
+        tuple(trials[i] for i in rows),
         {
             method.name: tuple(tuple(one[method.name][i] for i in rows) for one in passes)
             for method in methods

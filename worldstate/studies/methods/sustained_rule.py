@@ -32,12 +32,13 @@ def onsets_s(trial: Trial, alarm: BoolArray) -> list[float]:
 
 def best_sustain(calibration: Sequence[Trial], evidence: str) -> int:
     """Return the k with the largest share of approaches detected less that of quiet recordings alarmed."""
+    named = [(trial, argmax_is_side(trial, evidence)) for trial in calibration]
 
     def gain(hops: int) -> float:
         found: list[bool] = []
         alarmed: list[bool] = []
-        for trial in calibration:
-            onsets = onsets_s(trial, sustained_alarm(argmax_is_side(trial, evidence), hops))
+        for trial, side_named in named:
+            onsets = onsets_s(trial, sustained_alarm(side_named, hops))
             if trial.hazard_free:
                 alarmed.append(bool(onsets))
             else:

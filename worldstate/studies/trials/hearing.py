@@ -1,7 +1,5 @@
 """From recordings to trials: every pass over the sound, each recording's results kept by its content."""
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,9 +17,9 @@ from worldstate.studies.origin import origin_of
 
 from .engine import Engine, Failed
 from .listening import VERSION, chain_tables, filtered_decisions, front_end_tables, unfiltered_decisions
-from .pass_cache import FingerprintMemo, PassCache, fingerprint
+from .pass_cache import FingerprintMemo, PassCache, content_hash, fingerprint
 from .takes import Take
-from .trial import Decisions, Trial
+from .trial import DECISION_COLUMNS, Decisions, Trial
 
 ALPHA = 0.02
 # Streams are cut into pieces of this length, dealt to folds in their order: a threshold is then set on other
@@ -40,15 +38,9 @@ class Hearing:
         """Listen to one recording, or read back what an earlier run heard of the same content."""
         mark = fingerprint(take.path, FingerprintMemo(self.folder / "fingerprints"))
         model = read_model(self.model)
-        about = [
-            VERSION,
-            take.name,
-            take.label,
-            take.t0_s,
-            take.site,
-            mark,
-            _checksum(named_array(take.path)),
-        ]
+        array = named_array(take.path)
+        about = [VERSION, take.name, take.label, take.t0_s, take.site, mark]
+        about.append("" if array is None else content_hash(array))
         cache = PassCache(self.folder)
         heard = cache.tables("front_end", about, partial(front_end_tables, take))
         # What the chains say depends on the model, too, which the shipped one may change with a release.
@@ -155,17 +147,10 @@ def _rows(table: HopTable, inside: Inside) -> HopTable:
 
 def _cut(said: Decisions, inside: Inside) -> Decisions:
     kept = inside(said.time_s)
-    columns: Mapping[str, np.ndarray] = {
-        name: getattr(said, name)[kept]
-        for name in ("time_s", "alarm", "side", "bearing_rad", "score", "risk", "visible_s")
-    }
+    columns: Mapping[str, np.ndarray] = {name: getattr(said, name)[kept] for name in DECISION_COLUMNS}
     return Decisions(**columns, tracks=_rows(said.tracks, inside))
-
-
-def _checksum(path: Path | None) -> str:
-    return "" if path is None else hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
 def data_fingerprint(trials: Sequence[Trial]) -> str:
     """Name the content of all recordings of an evaluation in 32 characters."""
-    return origin_of(json.loads(json.dumps(sorted((t.name, t.hops.about["fingerprint"]) for t in trials))))
+    return origin_of(sorted((trial.name, trial.hops.about["fingerprint"]) for trial in trials))

@@ -33,7 +33,16 @@ from worldstate.operations.recordings.true_track import read_true_tracks
 from worldstate.state import RiskCue, WorldState
 
 from .takes import Take
-from .trial import BOX_COLUMNS, LEFT, NO_SIDE, RIGHT, TRACK_COLUMNS, TRUTH_COLUMNS, Decisions
+from .trial import (
+    BOX_COLUMNS,
+    DECISION_COLUMNS,
+    LEFT,
+    NO_SIDE,
+    RIGHT,
+    TRACK_COLUMNS,
+    TRUTH_COLUMNS,
+    Decisions,
+)
 
 # Changes whenever a pass over the same recording would give other numbers.
 VERSION = 2
@@ -116,10 +125,9 @@ def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str,
             if entity.moving and entity.existence_probability >= LIKELY:
                 number = identities.setdefault(entity.id, len(identities))
                 tracks.append((seconds(step.state.stamp_ns), number, entity.azimuth_rad))
-    names = ("time_s", "alarm", "side", "bearing_rad", "score", "risk", "visible_s")
     stream = hop_stream(measured, name=take.name)
     return {
-        "decisions": HopTable.of_rows(names, rows),
+        "decisions": HopTable.of_rows(DECISION_COLUMNS, rows),
         "tracks": HopTable.of_rows(TRACK_COLUMNS, tracks),
         "stream": stream.replace(**HopTable.of_rows(("grounded", "rateless"), grounded).columns),
     }

@@ -10,10 +10,12 @@ from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_table import HopTable
 
 LEFT, RIGHT, NO_SIDE = 1, -1, 0
-# The columns of the three tables of a trial and of an answer.
+# The columns of the tables of a trial and of an answer.
 BOX_COLUMNS = ("frame", "time_s", "box_px", "score", "class_name", "azimuth_rad", "moving")
 TRUTH_COLUMNS = ("time_s", "vehicle", "azimuth_rad", "in_view")
 TRACK_COLUMNS = ("time_s", "track", "azimuth_rad")
+# One value a hop each, in the order of `Decisions`.
+DECISION_COLUMNS = ("time_s", "alarm", "side", "bearing_rad", "score", "risk", "visible_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
