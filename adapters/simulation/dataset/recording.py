@@ -17,18 +17,13 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
 )
 from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
-from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
+from worldstate.adapters.simulation.scene.vehicle import Trajectory
 from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.ego_sound import ego_noise
-from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.late_field import add_late_field, street_field
-from worldstate.adapters.simulation.sound.propagation import add_sources
 from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.adapters.simulation.sound.scatter import scattering
-from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.adapters.simulation.sound.surroundings import Surroundings
+from worldstate.adapters.simulation.sound.vehicle_sound import add_vehicle
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
@@ -38,7 +33,6 @@ from .truth import describe
 FULL_SCALE_PA = 20.0  # 120 dB, where measurement microphones of this kind end
 HEAD_START_S = 2.0  # emission begins this long before the recording: travel time and late field
 NO_VEHICLE_T0 = 0.7  # OVAD gives recordings without a vehicle frame 70 of 100
-LATE_DISTANCE_M = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +128,7 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     static = StaticSources(sound, settings.sample_rate_hz)
     paths = trajectories(settings, _knots(settings))
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
-        _add_vehicle_sound(static, settings, path, receiver, draws)
+        add_vehicle(static, settings.site, settings.preset, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
     add_background(static, settings.site, settings.preset, positions, to_street)
     static.render()
@@ -165,45 +159,6 @@ def _knots(settings: SimulationSettings) -> FloatArray:
     knot_s = KNOT_SAMPLES / settings.sample_rate_hz
     before, after = -(-HEAD_START_S // knot_s), -(-settings.duration_s // knot_s)
     return np.arange(-before, after + 1) * knot_s
-
-
-def _add_vehicle_sound(
-    static: StaticSources,
-    settings: SimulationSettings,
-    path: Trajectory,
-    receiver: Receiver,
-    rng: np.random.Generator,
-) -> None:
-    preset, rate, site = settings.preset, settings.sample_rate_hz, settings.site
-    level = preset.vehicle_level_db + preset.vehicle_spread_db * rng.standard_normal()
-    parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng)
-    sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
-    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
-    add_sources(static, sources, around)
-    whole = np.sum([one.signal for one in parts], axis=0)
-    middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
-    add_scattered(static, _moving(path, whole, middle, SOURCE_HEIGHT_M, rate), around)
-    dry = whole * _late_gain(settings, path, len(whole))
-    heard = dry[: round(-path.time_s[0] * rate) + receiver.samples]
-    field = street_field(site, preset.late_lobe_share)
-    add_late_field(static, heard, preset.late_decay_s, receiver.positions_m, rng, field)
-
-
-def _moving(
-    path: Trajectory, signal: Float32Array, behind_m: float, height_m: float, rate: float
-) -> MovingSource:
-    return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
-
-
-def _late_gain(settings: SimulationSettings, path: Trajectory, samples: int) -> Float32Array:
-    """How strongly the source feeds the late field: less the farther it, or the ego, is from the mouth."""
-    x, y = path.behind(0.0)
-    away = np.hypot(x - settings.site.corner_ahead_m, y) - settings.ego.x_m(path.time_s)
-    walled = settings.site.opposite_wall_m is not None
-    late_db = settings.preset.late_walled_db if walled else settings.preset.late_open_db
-    gain = 10.0 ** (late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
-    knots = np.arange(len(gain)) * KNOT_SAMPLES
-    return np.asarray(np.interp(np.arange(samples), knots, gain), np.float32)
 
 
 def _to_samples(sound: Float32Array, settings: SimulationSettings, rng: np.random.Generator) -> Float32Array:

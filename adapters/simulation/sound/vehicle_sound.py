@@ -1,0 +1,61 @@
+"""Everything that one vehicle adds to the microphones: its paths, its scattered and its late sound."""
+
+import numpy as np
+
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
+from worldstate.ground.typing import Float32Array
+
+from .delay import KNOT_SAMPLES
+from .emission import Emission, MovingSource
+from .late_field import add_late_field, street_field
+from .propagation import add_sources
+from .receiver import Receiver
+from .scatter import scattering
+from .scattered_sound import add_scattered
+from .static_field import StaticSources
+from .surroundings import Surroundings
+
+LATE_DISTANCE_M = 8.0
+
+
+def add_vehicle(
+    static: StaticSources,
+    site: Site,
+    preset: Preset,
+    path: Trajectory,
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
+    rate = receiver.sample_rate_hz
+    level = preset.vehicle_level_db + preset.vehicle_spread_db * rng.standard_normal()
+    parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng)
+    sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
+    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
+    add_sources(static, sources, around)
+    whole = np.sum([one.signal for one in parts], axis=0)
+    middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
+    add_scattered(static, _moving(path, whole, middle, SOURCE_HEIGHT_M, rate), around)
+    dry = whole * _late_gain(site, preset, path, receiver)
+    heard = dry[: round((receiver.knots_s[0] - path.time_s[0]) * rate) + receiver.samples]
+    field = street_field(site, preset.late_lobe_share)
+    add_late_field(static, heard, preset.late_decay_s, receiver.positions_m, rng, field)
+
+
+def _moving(
+    path: Trajectory, signal: Float32Array, behind_m: float, height_m: float, rate: float
+) -> MovingSource:
+    return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
+
+
+def _late_gain(site: Site, preset: Preset, path: Trajectory, receiver: Receiver) -> Float32Array:
+    """How strongly the source feeds the late field: less the farther it, or the ego, is from the mouth."""
+    x, y = path.behind(0.0)
+    away = np.hypot(x - site.corner_ahead_m, y) - receiver.ego.x_m(path.time_s)
+    late_db = preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
+    gain = 10.0 ** (late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
+    knots = np.arange(len(gain)) * KNOT_SAMPLES
+    samples = np.arange((len(gain) - 1) * KNOT_SAMPLES)
+    return np.asarray(np.interp(samples, knots, gain), np.float32)
