@@ -1,4 +1,4 @@
-"""The comparison of simulated with real windows, on sets whose answer is known."""
+"""The comparison of simulated with real windows, on sets whose answer is known and on the released ones."""
 
 import json
 from types import SimpleNamespace
@@ -6,15 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.signal
+from released_data import FOLDER, TABLE, needs_released_windows
 
-from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
+from worldstate.abduction.signature.mirror import mirror_features
+from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.simulation import SITES
 from worldstate.cli.main import main
-from worldstate.cli.studies import realism as command
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.studies.streets.realism import DESCRIPTORS, compare_windows, describe_windows
+from worldstate.studies.streets.groupings import halves
+from worldstate.studies.streets.measures import MEASURES, describe_windows, spread_values
+from worldstate.studies.streets.realism import Realism, measure_realism
+from worldstate.studies.streets.set_figures import set_figures
+from worldstate.studies.streets.side import odd_profiles, side_accuracy
 from worldstate.studies.streets.simulated_windows import (
     DECIMATION,
     NFFT,
@@ -22,61 +27,149 @@ from worldstate.studies.streets.simulated_windows import (
     simulated_windows,
     window_feature,
 )
+from worldstate.studies.streets.transfer import published_transfer
+from worldstate.studies.streets.two_sample import measure_areas, two_sample_areas
 
 LABELS = ("left", "right", "none", "front")
+PLACES = ("SA1", "SA2", "SB1", "SB2")
 
 
-def windows(rng: np.random.Generator, n: int = 30, louder: float = 1.5, scale: float = 1.0) -> FeatureTable:
-    """Smooth made-up windows of two junctions; hazards are `louder`."""
+def windows(rng: np.random.Generator, n: int = 24, louder: float = 1.5, scale: float = 1.0) -> FeatureTable:
+    """Smooth made-up windows of four junctions, two louder; hazards are `louder`, their peak aside."""
     labels = np.repeat(LABELS, n)
-    bump = np.exp(-0.5 * ((np.arange(30) - rng.uniform(5, 25, (4 * n, 1))) / 4.0) ** 2)
+    middle = np.select([labels == "left", labels == "right"], [22.0, 7.0], 14.5)[:, None]
+    bump = np.exp(-0.5 * ((np.arange(30) - middle - rng.normal(0, 3, (4 * n, 1))) / 4.0) ** 2)
     gain = np.where(labels == "none", 1.0, louder)[:, None] * rng.lognormal(0.0, 0.1, (4 * n, 1))
-    features = scale * gain * np.tile(0.1 + 0.1 * bump, (1, 2))
-    where = np.tile(["SA1", "SB1"], 2 * n)
+    gain *= np.tile([0.93, 1.07, 1.07, 0.93], n)[:, None]
+    features = scale * gain * np.tile(0.1 + 0.1 * bump, (1, 2)) * rng.lognormal(0.0, 0.05, (4 * n, 60))
     keys = np.array([str(i) for i in range(4 * n)])
-    return FeatureTable(features, labels, keys, where, keys, (None,) * (4 * n))
+    return FeatureTable(features, labels, keys, np.tile(PLACES, n), keys, (None,) * (4 * n))
 
 
-def test_sets_of_one_kind_agree_and_cannot_be_told_apart():
+def row(found: Realism, figure: str, of: str):
+    return next(one for one in found.rows if (one.figure, one.windows) == (figure, of))
+
+
+def test_sets_of_one_kind_cannot_be_told_apart_and_are_inside():
     rng = np.random.default_rng(1)
-    result = compare_windows(windows(rng), windows(rng), rng, draws=50)
-    scale_rows = [row for row in result.medians if row.statistic in ("level", "peak")]
-    assert len(scale_rows) == 2 * 2 * 3
-    assert all(row.within for row in scale_rows)
-    assert 0.35 < result.c2st["all"] < 0.65
-    assert min(one.auroc for one in result.transfers) > 0.9
-    assert set(result.to_dict()) == {"medians", "transfers", "c2st"}
-    assert "C2ST all" in result.table()
-
-
-def test_another_level_is_seen():
-    rng = np.random.default_rng(2)
-    result = compare_windows(windows(rng), windows(rng, scale=2.0), rng, draws=50)
-    levels = [row for row in result.medians if row.statistic == "level"]
-    assert levels
-    assert not any(row.within for row in levels)
-    assert result.c2st["all"] > 0.9
+    found = measure_realism(
+        windows(rng), {"alike": windows(rng), "louder": windows(rng, scale=2.0)}, rng, draws=20
+    )
+    c2st, level = row(found, "C2ST", "all"), row(found, "AUROC of level", "none")
+    assert 0.3 < c2st.simulated["alike"] < 0.65
+    assert c2st.simulated["louder"] > 0.9
+    assert (c2st.inside["louder"], level.inside["louder"]) == (False, False)
+    assert level.inside["alike"]
+    medians = [one.inside for one in found.rows if one.figure.startswith("median of level, type")]
+    assert len(medians) == 2 * 3
+    assert all(inside == {"alike": True, "louder": False} for inside in medians)
+    assert row(found, "transfer, simulated to real", "hidden, none").simulated["alike"] > 0.9
+    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["groupings"][0] == "SA1 SB1 | SA2 SB2"
 
 
 def test_a_gain_over_the_scalar_has_an_interval_around_the_difference():
     rng = np.random.default_rng(3)
-    for one in compare_windows(windows(rng, louder=1.1), windows(rng, louder=1.1), rng, draws=100).transfers:
-        assert one.gain[0] <= one.auroc - one.scalar <= one.gain[1]
+    one = published_transfer(windows(rng, louder=1.1), windows(rng, louder=1.1), rng, draws=100)
+    assert one.gain is not None
+    assert one.gain[0] <= one.auroc - one.scalar <= one.gain[1]
 
 
 def test_shape_does_not_depend_on_the_level():
     features = windows(np.random.default_rng(4)).features
     one, two = describe_windows(features), describe_windows(3.0 * features)
-    for name in DESCRIPTORS:
-        factor = 3.0 if name in ("level", "peak", "change") else 1.0
-        np.testing.assert_allclose(two[name], factor * one[name], rtol=1e-9, atol=1e-12)
+    logs, logs_of_louder = spread_values(features), spread_values(3.0 * features)
+    for name in MEASURES:
+        scales = name in ("level", "peak", "change")
+        np.testing.assert_allclose(two[name], (3.0 if scales else 1.0) * one[name], rtol=1e-9, atol=1e-12)
+        shift = np.log(3.0) if scales else 0.0
+        np.testing.assert_allclose(logs_of_louder[name] - logs[name], shift, atol=1e-9)
+
+
+def test_the_areas_do_not_depend_on_the_order_of_the_sets():
+    rng = np.random.default_rng(5)
+    one, other = windows(rng), windows(rng, scale=1.1)
+    areas = measure_areas(one, other)
+    assert areas == pytest.approx(measure_areas(other, one))
+    assert min(areas.values()) >= 0.5
+
+
+def test_the_side_is_learned_from_other_junctions_and_is_chance_where_labels_are_shuffled():
+    rng = np.random.default_rng(6)
+    table = windows(rng, n=60)
+    assert min(side_accuracy(table, table).values()) > 0.9
+    shuffled = FeatureTable(
+        table.features,
+        np.concatenate([rng.permutation(table.labels[:120]), table.labels[120:]]),
+        *(table.ids, table.environments, table.recordings, table.t0_frames),
+    )
+    assert 0.3 < np.mean(list(side_accuracy(shuffled, shuffled).values())) < 0.7
+
+
+def test_the_mirrored_street_has_the_same_side():
+    """Left and right exchanged, features and labels: the same accuracy, and the same odd profile."""
+    table = windows(np.random.default_rng(7))
+    swapped = np.select([table.labels == "left", table.labels == "right"], ["right", "left"], table.labels)
+    about = table.ids, table.environments, table.recordings, table.t0_frames
+    mirrored = FeatureTable(mirror_features(table.features), swapped, *about)
+    assert side_accuracy(table, mirrored) == side_accuracy(table, table)
+    for site, profile in odd_profiles(table).items():
+        np.testing.assert_allclose(odd_profiles(mirrored)[site], profile, atol=1e-12)
+        assert profile[:, 4:12].min() > 0.0  # the far side is the louder one
+
+
+def test_the_share_between_sites_is_that_of_their_offsets():
+    """Sites that differ by known offsets in pattern and in level, in random windows."""
+    rng = np.random.default_rng(8)
+    table = windows(rng, n=400)
+    offsets = dict(zip(PLACES, rng.normal(0.0, 0.2, (len(PLACES), 60)), strict=True))
+    noise = rng.normal(0.0, 0.2, (1600, 60))
+    levels = noise + np.array([offsets[name] for name in table.environments])
+    about = table.labels, table.ids, table.environments, table.recordings, table.t0_frames
+    figures = set_figures(FeatureTable(np.exp(levels), *about))
+    assert figures["between-site share of pattern", "none"] == pytest.approx(0.43, abs=0.06)
+    assert figures["sd of pattern", "none"] == pytest.approx(0.26, abs=0.02)
+
+
+def test_junctions_are_grouped_so_that_both_halves_hold_both_types():
+    assert len(halves(["SA1", "SA2", "SB1", "SB2", "SB3"])) == 6
+    assert [str(one) for one in halves(["DA1", "DB1", "DB2"])] == [
+        "DA1 | DB1 DB2",
+        "DB1 | DA1 DB2",
+        "DB2 | DA1 DB1",
+    ]
 
 
 def test_a_set_without_hazards_is_refused():
     rng = np.random.default_rng(5)
     calm = windows(rng)
-    with pytest.raises(InvalidArgumentError, match="simulated"):
-        compare_windows(windows(rng), calm.select(calm.hazard_free), rng)
+    with pytest.raises(InvalidArgumentError, match="seed 1"):
+        measure_realism(windows(rng), {"seed 1": calm.select(calm.hazard_free)}, rng)
+
+
+@needs_released_windows
+def test_the_released_windows_have_the_known_figures():
+    """Figures of the released windows that were computed by another program (review of the simulation)."""
+    real = read_features(FOLDER / TABLE).group("static")
+    figures = set_figures(real)
+    for windows_of, sd in (("hidden", 0.151), ("front", 0.130), ("none", 0.264)):
+        assert figures["sd of log level", windows_of] == pytest.approx(sd, abs=5e-4)
+    assert figures["between-site share of pattern", "hidden"] == pytest.approx(0.57, abs=5e-3)
+    assert figures["between-site share of level", "none"] == pytest.approx(0.42, abs=5e-3)
+    assert figures["sd of pattern", "none"] == pytest.approx(0.148, abs=5e-4)
+    assert figures["iqr of log prominence", "none"] == pytest.approx(0.131, abs=5e-4)
+    assert figures["share of peaks at 40 to 65 deg", "hidden"] == pytest.approx(0.89, abs=5e-3)
+    assert figures["AUROC of the second half's peak", "hidden, none"] == pytest.approx(0.945, abs=1e-3)
+    sides = side_accuracy(real, real)
+    assert len(sides) == 5
+    assert min(sides.values()) > 0.8
+    far = np.array([odd_profiles(real)[name][1, 4:8] for name in ("SB1", "SB2", "SB3")])
+    assert 0.01 < far.min() < far.max() < 0.14
+    # Two tuning junctions against the rest: an area near the lower end of .92 to .96.
+    held = halves(sorted(set(real.environments.tolist())))[-1]
+    assert str(held) == "SA2 SB3 | SA1 SB1 SB2"
+    assert two_sample_areas(*held.tables(real), np.random.default_rng(1))["all"] == pytest.approx(
+        0.92, abs=0.015
+    )
 
 
 def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
@@ -107,8 +200,6 @@ def test_simulated_windows_are_laid_out_as_the_released_ones():
     assert np.isfinite(table.features).all()
     assert (table.features > 0.0).all()
     assert len(np.unique(table.recordings)) == 4
-    again = simulated_windows(1, 3, sites=("SB1",))
-    np.testing.assert_array_equal(again.features, table.features)
     assert "SB1" in SITES
 
 
@@ -138,20 +229,24 @@ def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
     np.testing.assert_allclose(later, 1.5, atol=1e-3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("group", "sites"), [("static", ("SA1", "SB1")), ("dynamic", ("DA1", "DB1"))])
-def test_the_command_compares_the_windows_of_a_table(group, sites, tmp_path, capsys, monkeypatch):
-    """Simulated windows of one seed against those of another, which take the part of the real ones."""
-    monkeypatch.setattr(command, "WINDOWS", 8)
-    monkeypatch.setattr(command, "SEEDS", (1,))
-    write_features(tmp_path / "real.csv", simulated_windows(8, seed=9, sites=sites))
-    words = ["realism", str(tmp_path / "real.csv"), "--group", group, "--out", str(tmp_path / "r"), "--json"]
-    assert main(words) == 0
+def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
+    """Windows that were made before, at some of the junctions, without simulating."""
+    rng = np.random.default_rng(9)
+    write_features(tmp_path / "real.csv", windows(rng))
+    write_features(tmp_path / "made.csv", windows(rng))
+    words = ["realism", str(tmp_path / "real.csv"), "--sites", "SA1", "SB1", "--json"]
+    given = [*words, "--simulated", str(tmp_path / "made.csv"), "--out", str(tmp_path / "r")]
+    assert main(given) == 0
     report = json.loads(capsys.readouterr().out)
     assert json.loads((tmp_path / "r" / "realism.json").read_text()) == report
-    assert set(report["realism"]) == {"1"}
-    assert set(report["realism"]["1"]) == {"medians", "transfers", "c2st"}
-    assert report["realism"]["1"]["c2st"]["all"] < 0.75
+    assert report["groupings"] == ["SA1 | SB1"]
+    assert {name for one in report["rows"] for name in one["simulated"]} == {"made"}
+    assert main([*words, "--real-only"]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    spans = [
+        {(one["figure"], one["windows"]): one["halves"] for one in found["rows"]} for found in (report, alone)
+    ]
+    assert spans[0]["C2ST", "all"] == spans[1]["C2ST", "all"]
 
 
 def test_a_table_without_the_group_is_refused_before_the_work(tmp_path, capsys):

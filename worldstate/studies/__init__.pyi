@@ -6,4 +6,4 @@ from .paper.ablations import evaluate_ablation as evaluate_ablation
 from .paper.identifiability import reach_of_array as reach_of_array
 from .paper.identifiability import reach_on_data as reach_on_data
 from .signatures.fisher_profile import fisher_profile as fisher_profile
-from .streets.realism import realism_over_seeds as realism_over_seeds
+from .streets.realism import measure_realism as measure_realism

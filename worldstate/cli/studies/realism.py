@@ -1,14 +1,19 @@
 """`worldstate realism`: how far simulated feature windows are from real ones.
 
 Simulate windows at the junctions of a feature table, laid out as the released real ones, over three seeds,
-and compare them with the table:
+and hold them against the table. Beside every figure stands the same figure of real against real: between
+groupings of the junctions, and of every junction against the others of its type. A figure outside that range
+is marked with "!".
 
-  medians    of level and shape by junction type and class; within 15 %, as real junctions of one type agree
+  C2ST       how well boosting tells two sets apart; .5 would be indistinguishable
+  AUROC of   the same of one measure alone, by class: level, peak, width, prominence, change, position
   transfer   the published classifier trained on one and tested on the other, beside the loudest direction
-  C2ST       how well boosting tells the two sets apart; .5 would be indistinguishable
+  medians    of level and shape; within 15 %; and spreads, and the share of variance between sites
+  side       how often left is told from right of hidden windows by a classifier of other junctions
 
 FEATURES.csv is a table of labelled windows, such as the one released with OVAD, or one that extract-features
-wrote of a folder in its layout. OUT/realism.json is the report.
+wrote of a folder in its layout. OUT/realism.json is the report, OUT/windows-SEED.csv what was simulated:
+given as --simulated, they are held against the table again without simulating.
 """
 
 import argparse
@@ -21,7 +26,7 @@ from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate.studies.streets.realism import Realism
+    from worldstate.adapters.datasets.feature_table import FeatureTable
 
 # Windows from either side at every site; the seeds show what one draw of streets changes.
 WINDOWS = 10
@@ -30,6 +35,7 @@ SEEDS = (1, 2, 3)
 EXAMPLE = """\
 examples:
   worldstate realism extracted_features.csv --jobs 2 --out realism
+  worldstate realism extracted_features.csv --sites SA1 SB1 SB2 --simulated realism/windows-*.csv
   worldstate realism extracted_features.csv --group dynamic --json"""
 
 
@@ -38,45 +44,65 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("features", type=Path, metavar="FEATURES.csv", help="real windows")
     add_choice(parser, "--group", "windows of a standing or a moving ego", "static", "dynamic")
+    add("--sites", nargs="+", metavar="SITE", help="only these junctions (default: all of the table)")
     add("--preset", metavar="NAME", help="levels of the simulation (default: the newest)")
+    add("--simulated", type=Path, nargs="+", metavar="CSV", help="simulated windows, instead of simulating")
+    add("--real-only", action="store_true", help="real against real alone")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--out", type=Path, metavar="DIR", help="write realism.json")
+    add("--out", type=Path, metavar="DIR", help="write realism.json and the simulated windows")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
+    import numpy as np
+
+    from worldstate.studies.streets.realism import measure_realism
+    from worldstate.studies.streets.realism_table import realism_lines
+
     if arguments.out is not None:
         output_folder(arguments.out, "realism.json")
-    found = _compared(arguments)
-    report: dict[str, object] = {
-        "group": arguments.group,
-        "realism": {str(seed): one.to_dict() for seed, one in found.items()},
-    }
+    real = _chosen(arguments.features, arguments)
+    # The figures of real against real come first: they are the same beside any simulation.
+    found = measure_realism(real, _simulated(arguments, real), np.random.default_rng(SEEDS[0]))
+    report: dict[str, object] = {"group": arguments.group, **found.to_dict()}
     if arguments.out is not None:
         write_report(arguments.out / "realism.json", report)
-    lines = [f"\nseed {seed}\n{one.table()}" for seed, one in found.items()]
-    return CommandResult(report, table={"group": arguments.group}, lines=lines)
+    return CommandResult(report, table={"group": arguments.group}, lines=realism_lines(found))
 
 
-def _compared(arguments: argparse.Namespace) -> "dict[int, Realism]":
-    from functools import partial
+def _chosen(path: Path, arguments: argparse.Namespace) -> "FeatureTable":
+    import numpy as np
 
     from worldstate.adapters.datasets.feature_table import read_features
+    from worldstate.ground.errors import InvalidArgumentError
+
+    table = read_features(path).group(arguments.group)
+    if arguments.sites is None:
+        return table
+    unknown = sorted(set(arguments.sites) - set(table.environments.tolist()))
+    if unknown:
+        raise InvalidArgumentError(f"--sites: {path} has no windows of {', '.join(unknown)}")
+    return table.select(np.isin(table.environments, arguments.sites))
+
+
+def _simulated(arguments: argparse.Namespace, real: "FeatureTable") -> "dict[str, FeatureTable]":
+    from worldstate.adapters.datasets.feature_table import write_features
     from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
-    from worldstate.studies.streets.realism import realism_over_seeds
     from worldstate.studies.streets.simulated_windows import simulated_windows
 
-    real = read_features(arguments.features).group(arguments.group)
+    if arguments.real_only:
+        return {}
+    if arguments.simulated:
+        return {path.stem: _chosen(path, arguments) for path in arguments.simulated}
     # A moving ego's junctions come as they are in the table; a site that it lacks has nothing to be held to.
     sites = sorted(set(real.environments.tolist()))
-    levels = preset(arguments.preset or DEFAULT_PRESET)
+    levels, found = preset(arguments.preset or DEFAULT_PRESET), {}
     with progress_bar("simulating windows", 4 * WINDOWS * len(sites) * len(SEEDS)) as bar:
-        simulate = partial(
-            simulated_windows,
-            WINDOWS,
-            sites=sites,
-            jobs=arguments.jobs,
-            levels=levels,
-            progress=bar.advance,
-        )
-        return realism_over_seeds(real, simulate, SEEDS)
+        for seed in SEEDS:
+            table = simulated_windows(
+                WINDOWS, seed, sites=sites, jobs=arguments.jobs, levels=levels, progress=bar.advance
+            )
+            found[f"seed {seed}"] = table
+            if arguments.out is not None:
+                write_features(arguments.out / f"windows-{seed}.csv", table)
+    return found
