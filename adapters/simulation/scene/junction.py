@@ -43,8 +43,9 @@ class Site:
     side_order, facade_order : int
         Highest number of reflections followed in the ego's street and in the crossing street.
     occluders : tuple of OccludingBody
-        Bodies in the open that hide a vehicle, at most 4. Where there are any there are no corners and no
-        walls to be heard; the corners only limit what the camera sees.
+        Bodies in the open that hide a vehicle, at most 4. Where there are any the site is in the open.
+    in_the_open : bool
+        Whether there are neither corners nor walls to be heard; the corners only limit what the camera sees.
 
     Raises
     ------
@@ -70,6 +71,7 @@ class Site:
     side_order: int = 3
     facade_order: int = 4
     occluders: tuple[OccludingBody, ...] = ()
+    in_the_open: bool = False
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -88,6 +90,11 @@ class Site:
         if self.opposite_wall_m is not None:
             nearest = self.corner_ahead_m + self.street_width_m
             in_range("opposite_wall_m", self.opposite_wall_m, nearest, 200.0)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether sound meets only the road and bodies."""
+        return self.in_the_open or bool(self.occluders)
 
     @property
     def lanes_m(self) -> tuple[float, float]:

@@ -203,6 +203,7 @@ def near_facade(site: Site, source: SourceImage, source_y: FloatArray, aim_y: Fl
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     weight = np.ones_like(source_y)
     for plane in source.near_planes_m:
-        met = aim_y + (source_y - aim_y) * (plane - mouth) / (source.x_m - mouth)
+        # A source in the ego's own street would stand behind that facade: it meets nothing but the mouth.
+        met = aim_y + (source_y - aim_y) * (plane - mouth) / np.maximum(source.x_m - mouth, plane - mouth)
         weight *= smooth_step(np.maximum(met - left, right - met) / FACADE_END_M)
     return weight

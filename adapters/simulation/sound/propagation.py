@@ -15,9 +15,9 @@ from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import MovingSource
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_paths
 from .receiver import NEAREST_M, Receiver, add_turning
-from .screened import screened_legs
+from .screened import ScreenedLeg, open_images, screened_legs
 from .static_field import StaticSources
-from .surroundings import Surroundings
+from .surroundings import Surroundings, in_own_street
 
 TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
 FAINTEST = 1e-3  # a path below this share of the whole is left out
@@ -25,9 +25,9 @@ FAINTEST = 1e-3  # a path below this share of the whole is left out
 
 def add_sources(static: StaticSources, sources: Sequence[MovingSource], around: Surroundings) -> None:
     """Add moving sources, by every path, to all microphones."""
-    if around.site.occluders:
+    if around.site.is_open:
         for source in sources:
-            _add_screened(static.out, source, around)
+            _add_open(static.out, source, around)
         return
     images = receiver_images(around.site)
     bent = np.zeros((len(images), 2, around.receiver.samples), np.float32)
@@ -47,7 +47,39 @@ def _paths(source: MovingSource, around: Surroundings) -> list[Path]:
     mirrored = np.sqrt(1.0 - around.scattering)
     place = source.x_m, source.y_m, above
     paths = trace_paths(around.site, *place, around.cap_db, receiver_x_m=heard_x, specular=mirrored)
+    beside = in_own_street(around.site, source.x_m, source.y_m)
+    if beside.any():
+        paths = [_beside(path, source, beside, mirrored, heard_x, above) for path in paths]
     return [replace(path, gain=path.gain * _media(path.bent_m, source, around)) for path in paths]
+
+
+def _beside(
+    path: Path,
+    source: MovingSource,
+    share: FloatArray,
+    specular: FloatArray,
+    heard_x_m: float | FloatArray,
+    above_m: float,
+) -> Path:
+    """Return the path of a source that stands, as far as `share` says, in the ego's own street.
+
+    Shapes: share, heard_x_m (T,), specular (8,).
+    """
+    image, order = path.receiver, path.source.order
+    if order % 2:
+        return path  # by the wall opposite: through the mouth, as from the crossing street
+    if order:
+        # The near facade comes first, and there a source in the own street stands behind it.
+        return replace(path, gain=path.gain * (1.0 - share)[:, None])
+    across = source.y_m - float(image.mirror(np.zeros(1))[0])
+    straight = np.sqrt((source.x_m - heard_x_m) ** 2 + across**2 + above_m**2)
+    whole = image.gain * specular**image.order
+    return replace(
+        path,
+        lit=np.maximum(path.lit, share),
+        bent_m=path.bent_m + share * (straight - path.bent_m),
+        gain=path.gain + share[:, None] * (whole - path.gain),
+    )
 
 
 def _media(length_m: FloatArray, source: MovingSource, around: Surroundings) -> float | FloatArray:
@@ -98,23 +130,30 @@ def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray)
     return np.asarray(np.sqrt((along - x_m) ** 2 + flat_squared))
 
 
-def _add_screened(out: Float32Array, source: MovingSource, around: Surroundings) -> None:
-    """Add what reaches every microphone past the bodies of an open scene, on the straight line or round."""
+def _add_open(out: Float32Array, source: MovingSource, around: Surroundings) -> None:
+    """Add what reaches every microphone in the open: straight, by a wall, or round a body."""
     receiver, knots, ahead = around.receiver, source.emission.knots_s, source.ahead_m
     flat = source.y_m**2 + receiver.above(source.height_m) ** 2
-    straight, heard_x = receiver.arrivals(knots, partial(_slant, ahead, flat))
-    media = _media(straight, source, around)
-    for leg in screened_legs(around.site.occluders, ahead, source.y_m, heard_x, around.cap_db):
-        made = source.emission.table(leg.gain * media)
-        if made is None:
-            continue
-        table, span = made
-        before, via_x, via_y = leg.before_m[span], leg.via_x_m[span], leg.via_y_m[span]
-        for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
-            rise, across = position[2] - source.height_m, via_y - position[1]
-            turn = partial(_round, before, via_x - position[0], across, rise)
-            travel, _ = receiver.arrivals(knots[span], turn)
-            _add_along(microphone, table, knots[span], travel, receiver.knots_s - skew)
+    _, heard_x = receiver.arrivals(knots, partial(_slant, ahead, flat))
+    for image in open_images(around.site, ahead, source.y_m, heard_x):
+        straight = np.sqrt((image.x_m - heard_x) ** 2 + image.y_m**2 + receiver.above(source.height_m) ** 2)
+        gain = image.gain * _media(straight, source, around)
+        for leg in screened_legs(image.occluders, image.x_m, image.y_m, heard_x, around.cap_db):
+            _add_leg(out, source, replace(leg, gain=leg.gain * gain), receiver)
+
+
+def _add_leg(out: Float32Array, source: MovingSource, leg: ScreenedLeg, receiver: Receiver) -> None:
+    """Add what reaches every microphone by one point, or straight."""
+    made = source.emission.table(leg.gain)
+    if made is None:
+        return
+    table, span = made
+    knots = source.emission.knots_s[span]
+    before, via_x, via_y = leg.before_m[span], leg.via_x_m[span], leg.via_y_m[span]
+    for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
+        rise, across = position[2] - source.height_m, via_y - position[1]
+        travel, _ = receiver.arrivals(knots, partial(_round, before, via_x - position[0], across, rise))
+        _add_along(microphone, table, knots, travel, receiver.knots_s - skew)
 
 
 def _add_along(

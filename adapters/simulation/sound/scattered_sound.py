@@ -15,7 +15,7 @@ from .surroundings import Surroundings
 
 def add_scattered(static: StaticSources, source: MovingSource, around: Surroundings) -> None:
     """Add what rough walls send on of one moving source, from where they stand, to all microphones."""
-    if not around.scattering.any() or around.site.occluders:
+    if not around.scattering.any() or around.site.is_open:
         return
     for group in patches(around.site):
         arrived = np.zeros((len(group.strengths_m), around.receiver.samples), np.float32)
