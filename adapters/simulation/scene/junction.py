@@ -35,9 +35,14 @@ class Site:
     opposite_wall_m : float or None
         Distance ahead of the wall across the crossing street; None where there is none (type B).
     side_wall_left_m, side_wall_right_m : float
-        Distance of the side walls of the ego's own street; not nearer than the corners.
+        Distance of the side walls of the ego's own street; nearer than the corners where these are bevelled.
     street_width_m : float
-        Width of the crossing street; lanes are at a quarter and three quarters.
+        Width of the crossing street's roadway; lanes are at a quarter and three quarters.
+    verge_m : float
+        Pavement, verge or square between the corners and that roadway.
+    left_openings_m, right_openings_m : tuple of (float, float)
+        Stretches along x in which the side wall is missing: driveways, set-back fronts, and the places
+        before it begins and after it ends.
     side_reflection, facade_reflection : float
         Pressure reflection factors of the side walls and of the crossing street's facades, 0..1.
     side_order, facade_order : int
@@ -70,6 +75,9 @@ class Site:
     facade_reflection: float = 0.8
     side_order: int = 3
     facade_order: int = 4
+    verge_m: float = 0.0
+    left_openings_m: tuple[tuple[float, float], ...] = ()
+    right_openings_m: tuple[tuple[float, float], ...] = ()
     occluders: tuple[OccludingBody, ...] = ()
     in_the_open: bool = False
 
@@ -78,9 +86,10 @@ class Site:
         in_range("corner_left_m", self.corner_left_m, 1.0, 30.0)
         in_range("corner_right_m", self.corner_right_m, 1.0, 30.0)
         in_range("corner_ahead_m", self.corner_ahead_m, 1.0, 50.0)
-        in_range("side_wall_left_m", self.side_wall_left_m, self.corner_left_m, 60.0)
-        in_range("side_wall_right_m", self.side_wall_right_m, self.corner_right_m, 60.0)
+        in_range("side_wall_left_m", self.side_wall_left_m, 1.0, 60.0)
+        in_range("side_wall_right_m", self.side_wall_right_m, 1.0, 60.0)
         in_range("street_width_m", self.street_width_m, 3.0, 40.0)
+        in_range("verge_m", self.verge_m, 0.0, 40.0)
         in_range("side_reflection", self.side_reflection, 0.0, 0.98)
         in_range("facade_reflection", self.facade_reflection, 0.0, 0.98)
         in_range("side_order", self.side_order, 0, 8)
@@ -88,7 +97,7 @@ class Site:
         if len(self.occluders) > MAX_OCCLUDERS:
             raise InvalidArgumentError(f"occluders: expected at most {MAX_OCCLUDERS}")
         if self.opposite_wall_m is not None:
-            nearest = self.corner_ahead_m + self.street_width_m
+            nearest = self.corner_ahead_m + self.verge_m + self.street_width_m
             in_range("opposite_wall_m", self.opposite_wall_m, nearest, 200.0)
 
     @property
@@ -100,7 +109,8 @@ class Site:
     def lanes_m(self) -> tuple[float, float]:
         """Distance ahead of the near lane (traffic from the left keeps right) and of the far lane."""
         quarter = self.street_width_m / 4.0
-        return self.corner_ahead_m + quarter, self.corner_ahead_m + 3.0 * quarter
+        kerb = self.corner_ahead_m + self.verge_m
+        return kerb + quarter, kerb + 3.0 * quarter
 
     def sight_m(self, ahead_m: float, eye_m: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
         """Return the lateral limits (right, left) of what an eye sees between the corners, at a distance.

@@ -17,9 +17,10 @@ from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
 from worldstate.ground.typing import FloatArray
 
-from .diffraction import screen_attenuation_db
+from .diffraction import EXTERIOR_RAD, edge_gain
 
 LIT_DEPTH_M = 0.25  # a line this far inside the mouth no longer touches the corner
+NEAREST_M = 0.5  # no leg round a corner is shorter
 FACADE_END_M = 0.5  # a reflection fades over this length at the end of a facade
 LEFT, RIGHT = 0, 1
 
@@ -49,10 +50,16 @@ class ReceiverImage:
     offset_m: float
     gain: float
     order: int = 0
+    walls: tuple[
+        tuple[int, float], ...
+    ] = ()  # The walls met, LEFT or RIGHT, and where, unfolded, outwards in
 
     def mirror(self, y_m: FloatArray) -> FloatArray:
         """Lateral positions in the unfolded street."""
         return self.sign * y_m + self.offset_m
+
+
+DIRECT = ReceiverImage(1, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,17 +109,15 @@ def receiver_images(site: Site) -> list[ReceiverImage]:
     [(1, 0.0), (-1, 5.6), (-1, -5.6)]
     """
     left, right = site.side_wall_left_m, site.side_wall_right_m
-    images = [ReceiverImage(1, 0.0, 1.0)]
+    images = [DIRECT]
     for order in range(1, site.side_order + 1):
         gain = site.side_reflection**order
         shift = (order // 2) * 2.0 * (left + right)
-        if order % 2:
-            images += [
-                ReceiverImage(-1, shift + 2.0 * left, gain, order),
-                ReceiverImage(-1, -shift - 2.0 * right, gain, order),
-            ]
-        else:
-            images += [ReceiverImage(1, shift, gain, order), ReceiverImage(1, -shift, gain, order)]
+        for first, sign, near in ((LEFT, 1.0, left), (RIGHT, -1.0, right)):
+            # Unfolded outwards the walls alternate, a street's width apart.
+            walls = tuple(((first + k) % 2, sign * (near + k * (left + right))) for k in range(order))
+            offset = sign * (shift + 2.0 * near * (order % 2))
+            images.append(ReceiverImage(-1 if order % 2 else 1, offset, gain, order, walls))
     return images
 
 
@@ -136,6 +141,7 @@ def trace_paths(
         end_m = receiver_x_m, float(receiver.mirror(np.zeros(1))[0])
         passage = through_mouth(site, (source.x_m, source_y_m), end_m, height_m)
         walls = source.gain * receiver.gain * near_facade(site, source, source_y_m, passage.aim_y_m)
+        walls = walls * side_walls(site, receiver, receiver_x_m, passage.aim_y_m)
         gain = walls[:, None] * mirror ** (source.order + receiver.order) * passage.screen_gain(cap_db)
         edge_y = np.where(passage.edge == LEFT, site.corner_left_m, -site.corner_right_m)
         before = np.hypot(source.x_m - site.corner_ahead_m, source_y_m - edge_y)
@@ -153,6 +159,8 @@ class Passage:
     straight_m: FloatArray  # Length of the line, and of the way round that corner
     bent_m: FloatArray
     aim_y_m: FloatArray  # Where the line, or the way round the corner, passes the mouth
+    turn_rad: FloatArray  # Angle between the two legs at that corner, below pi where the line is lit
+    reduced_m: FloatArray  # Product of the two legs over their sum, seen from above
 
     @property
     def lit(self) -> FloatArray:
@@ -161,8 +169,8 @@ class Passage:
 
     def screen_gain(self, cap_db: float) -> FloatArray:
         """Amplitude that the corner leaves, shape (T, 8)."""
-        detour = np.copysign(self.bent_m - self.straight_m, -self.clearance_m)
-        return np.asarray(10.0 ** (-screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db) / 20.0))
+        gain = edge_gain(self.turn_rad, self.reduced_m, self.bent_m - self.straight_m, OCTAVES_HZ)
+        return np.maximum(gain, 10.0 ** (-cap_db / 20.0))
 
 
 def through_mouth(
@@ -188,14 +196,59 @@ def through_mouth(
     clearance = np.minimum(left - crossing, crossing - right)
     # Over a vertical edge both legs lie in one unfolded plane. The shorter way round counts: both are equal
     # where the corner changes, so nothing jumps there.
-    ways = [
-        np.hypot(np.hypot(x - mouth, y - edge) + np.hypot(depth, edge - end_y), height_m)
-        for edge in (left, right)
+    legs = [
+        np.stack(
+            np.broadcast_arrays(
+                np.hypot(x - mouth, y - at), np.hypot(depth, at - end_y), sign * (y - at), sign * (at - end_y)
+            )
+        )
+        for sign, at in ((1.0, left), (-1.0, right))
     ]
+    ways = [np.hypot(before + after, height_m) for before, after, _, _ in legs]
     across = y - end_y
     straight = np.sqrt(run * run + across * across + height_m * height_m)
     edge, bent = np.argmin(ways, axis=0).astype(np.int8), np.minimum(*ways)
-    return Passage(clearance, edge, straight, bent, np.clip(crossing, right, left))
+    before, after, out, back = np.where(edge == LEFT, *legs)
+    turn = EXTERIOR_RAD - np.arctan2(np.maximum(x - mouth, 0.0), out) - np.arctan2(back, depth)
+    reduced = before * after / np.maximum(before + after, NEAREST_M)
+    return Passage(clearance, edge, straight, bent, np.clip(crossing, right, left), turn, reduced)
+
+
+def side_walls(
+    site: Site, receiver: ReceiverImage, end_x_m: float | FloatArray, aim_y_m: FloatArray
+) -> FloatArray:
+    """1 where every reflection in a side wall meets wall, 0 where one meets an opening, shape (T,).
+
+    Examples
+    --------
+    >>> plan = Site("SA1", 2.8, 2.8, 4.0, 10.0, 2.8, 2.8, 6.0, left_openings_m=((1.0, 3.0),))
+    >>> image = receiver_images(plan)[1]
+    >>> side_walls(plan, image, 0.0, np.array([0.0, -2.8])).round(2)  # it is met at 2.0 and at 1.33 m
+    array([0.  , 0.07])
+    """
+    openings = site.left_openings_m, site.right_openings_m
+    end_y = float(receiver.mirror(np.zeros(1))[0])
+    weight = np.ones_like(aim_y_m)
+    for wall, plane in receiver.walls:
+        if openings[wall]:
+            share = (plane - end_y) / (aim_y_m - end_y)
+            weight = weight * on_wall(openings[wall], end_x_m + share * (site.corner_ahead_m - end_x_m))
+    return weight
+
+
+def on_wall(openings_m: tuple[tuple[float, float], ...], x_m: FloatArray) -> FloatArray:
+    """1 where a wall stands, 0 in its openings, smooth over the width that a reflection takes.
+
+    Examples
+    --------
+    >>> on_wall(((1.0, 3.0),), np.array([0.0, 2.0, 3.5]))
+    array([1., 0., 1.])
+    """
+    weight = np.ones_like(x_m)
+    for begin, end in openings_m:
+        outside = np.maximum(begin - x_m, x_m - end)
+        weight = weight * smooth_step(0.5 + outside / (2.0 * FACADE_END_M))
+    return weight
 
 
 def near_facade(site: Site, source: SourceImage, source_y: FloatArray, aim_y: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ with the patch's area A, the wall's reflection rho, its scattering coefficient s
 mean one that is drawn once for a site: its face.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,15 @@ from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.ground.typing import FloatArray
 
 from .emission import MovingSource
-from .paths import SourceImage, near_facade, source_images, through_mouth
+from .paths import (
+    ReceiverImage,
+    SourceImage,
+    near_facade,
+    on_wall,
+    side_walls,
+    source_images,
+    through_mouth,
+)
 from .receiver import NEAREST_M
 from .surroundings import Surroundings
 
@@ -30,7 +38,8 @@ PATCH_M = 0.9  # along the wall
 WALL_HEIGHT_M = 3.0  # what of a wall is near enough to matter
 HEIGHTS_M = (0.4, 2.8)
 BEHIND_M = 1.5  # side walls scatter from this far behind the array
-OPPOSITE_REACH = 0.9  # of the part of the opposite wall that is seen through the mouth
+OPPOSITE_PATCH_M = 1.4
+OPPOSITE_REACH = 2.2  # of the part seen through the mouth: the side walls show more of it, from aside
 SCATTER_HZ = 400.0  # relief of a few decimetres: below, a facade is smooth
 IMAGE_ORDERS = 2  # reflections in the crossing street before a patch is met
 
@@ -67,7 +76,7 @@ def patches(site: Site) -> list[Patches]:
     --------
     >>> from worldstate.adapters.simulation.scene.junction import site
     >>> [(len(group.strengths_m), group.beyond_mouth) for group in patches(site("SA1"))]
-    [(12, False), (12, True)]
+    [(12, False), (19, True)]
     """
     rng = site_generator(site.name, "facades")
     groups = [_side_walls(site, rng)]
@@ -83,26 +92,32 @@ def _side_walls(site: Site, rng: np.random.Generator) -> Patches:
     right = np.column_stack([x, np.full_like(x, -site.side_wall_right_m), rng.uniform(*HEIGHTS_M, len(x))])
     normals = np.repeat([[0.0, -1.0], [0.0, 1.0]], [len(left), len(right)], axis=0)
     positions = np.concatenate([left, right])
-    return Patches(positions, normals, _strengths(len(positions), site.side_reflection, rng), False)
+    strengths = _strengths(len(positions), site.side_reflection, rng)
+    walled = [on_wall(site.left_openings_m, left[:, 0]), on_wall(site.right_openings_m, right[:, 0])]
+    return Patches(positions, normals, strengths * np.concatenate(walled), False)
 
 
 def _opposite_wall(site: Site, wall_m: float, rng: np.random.Generator) -> Patches:
     right, left = site.sight_m(wall_m)
-    y = _spread(OPPOSITE_REACH * right, OPPOSITE_REACH * left, rng)
+    y = _spread(OPPOSITE_REACH * right, OPPOSITE_REACH * left, rng, OPPOSITE_PATCH_M)
     positions = np.column_stack([np.full_like(y, wall_m), y, rng.uniform(*HEIGHTS_M, len(y))])
     normals = np.tile([-1.0, 0.0], (len(y), 1))
-    return Patches(positions, normals, _strengths(len(y), site.facade_reflection, rng), True)
+    return Patches(
+        positions, normals, _strengths(len(y), site.facade_reflection, rng, OPPOSITE_PATCH_M), True
+    )
 
 
-def _spread(low: float, high: float, rng: np.random.Generator) -> FloatArray:
+def _spread(low: float, high: float, rng: np.random.Generator, patch_m: float = PATCH_M) -> FloatArray:
     """Places along a wall, one in every patch, not quite in its middle."""
-    count = max(int((high - low) / PATCH_M), 1)
+    count = max(int((high - low) / patch_m), 1)
     return np.asarray(low + (high - low) * (np.arange(count) + rng.uniform(0.2, 0.8, count)) / count)
 
 
-def _strengths(count: int, reflection: float, rng: np.random.Generator) -> FloatArray:
+def _strengths(
+    count: int, reflection: float, rng: np.random.Generator, patch_m: float = PATCH_M
+) -> FloatArray:
     weights = rng.exponential(1.0, count)
-    return np.asarray(reflection * np.sqrt(weights * PATCH_M * WALL_HEIGHT_M / np.pi))
+    return np.asarray(reflection * np.sqrt(weights * patch_m * WALL_HEIGHT_M / np.pi))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +167,20 @@ def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, Float
     return distance, np.sqrt(cosine) / distance
 
 
-def seen_through_mouth(site: Site, place_m: FloatArray, x_m: FloatArray) -> FloatArray:
-    """1 where an ego at `x_m` (T,) sees a place in the crossing street, 0 where a corner is in the way."""
-    passage = through_mouth(site, (float(place_m[0]), np.full_like(x_m, place_m[1])), (x_m, 0.0), 0.0)
-    return passage.lit
+def mirrored(group: Patches, image: ReceiverImage) -> Patches:
+    """Return the patches as they are seen in the side walls: an array hears them from there, too."""
+    turn = np.array([1.0, image.sign])
+    positions = (group.positions_m - np.array([0.0, image.offset_m, 0.0])) * np.array([1.0, image.sign, 1.0])
+    return replace(group, positions_m=positions, normals=group.normals * turn)
+
+
+def seen_through_mouth(
+    site: Site, place_m: FloatArray, ego_x_m: FloatArray, image: ReceiverImage
+) -> FloatArray:
+    """Share that an ego hears of a place in the crossing street by one image, 0 where a corner hides it.
+
+    Shapes: ego_x_m (T,).
+    """
+    end_m = ego_x_m, float(image.mirror(np.zeros(1))[0])
+    passage = through_mouth(site, (float(place_m[0]), np.full_like(ego_x_m, place_m[1])), end_m, 0.0)
+    return passage.lit * image.gain * side_walls(site, image, ego_x_m, passage.aim_y_m)

@@ -7,8 +7,18 @@ from worldstate.ground.typing import Float32Array, FloatArray
 from .delay import add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import Emission, MovingSource
+from .paths import receiver_images
 from .receiver import NEAREST_M, add_turning, distance_m
-from .scatter import FirstLeg, Patches, first_legs, last_leg, patches, seen_through_mouth
+from .scatter import (
+    IMAGE_ORDERS,
+    FirstLeg,
+    Patches,
+    first_legs,
+    last_leg,
+    mirrored,
+    patches,
+    seen_through_mouth,
+)
 from .static_field import StaticSources
 from .surroundings import Surroundings
 
@@ -42,17 +52,44 @@ def _add_leg(
 
 
 def _add_patches(static: StaticSources, arrived: Float32Array, group: Patches, around: Surroundings) -> None:
-    """Let every patch sound to all microphones."""
+    """Let every patch sound to all microphones; those opposite by way of the side walls, too."""
+    if not group.beyond_mouth:
+        _add_shown(static, arrived, group, np.ones((len(arrived), 1)), around)
+        return
+    site, centre = around.site, around.receiver.centre_m
+    x = around.receiver.ego.x_m(around.receiver.knots_s)
+    away = np.linalg.norm(group.positions_m - centre, axis=1)
+    for image in receiver_images(site):
+        shown = mirrored(group, image)
+        if image.order > IMAGE_ORDERS:
+            continue
+        seen = np.stack([seen_through_mouth(site, place, x, image) for place in group.positions_m])
+        if not seen.any():
+            continue
+        # The way by a wall is longer: without its delay every image would be in phase with the patch.
+        later_s = (np.linalg.norm(shown.positions_m - centre, axis=1) - away) / SPEED_OF_SOUND_MPS
+        later = np.round(later_s * static.sample_rate_hz).astype(int)
+        signals = np.stack([_later(one, by) for one, by in zip(arrived, later, strict=True)])
+        _add_shown(static, signals, shown, seen, around)
+
+
+def _later(signal: Float32Array, samples: int) -> Float32Array:
+    return np.concatenate([np.zeros(samples, np.float32), signal[: len(signal) - samples]])
+
+
+def _add_shown(
+    static: StaticSources, arrived: Float32Array, group: Patches, seen: FloatArray, around: Surroundings
+) -> None:
     receiver = around.receiver
     if receiver.ego.stands:
         distance, gain = last_leg(group, receiver.positions_m)
         centre = np.linalg.norm(group.positions_m - receiver.centre_m, axis=1)
         delays = (distance - centre[:, None]) / SPEED_OF_SOUND_MPS + receiver.skew_s
-        static.add(arrived, delays, gain)
+        used = seen[:, 0] > 0.0
+        static.add(arrived[used], delays[used], gain[used] * seen[used, :1])
         return
     x = receiver.ego.x_m(receiver.knots_s)
-    for place, normal, signal in zip(group.positions_m, group.normals, arrived, strict=True):
+    for place, normal, signal, share in zip(group.positions_m, group.normals, arrived, seen, strict=True):
         distance = np.maximum(distance_m(place, x, receiver.centre_m), NEAREST_M)
         cosine = np.abs((x - place[0]) * normal[0] - place[1] * normal[1]) / distance
-        seen = seen_through_mouth(around.site, place, x) if group.beyond_mouth else 1.0
-        add_turning(static.out, signal, place, np.sqrt(np.minimum(cosine, 1.0)) / distance * seen, receiver)
+        add_turning(static.out, signal, place, share * np.sqrt(np.minimum(cosine, 1.0)) / distance, receiver)

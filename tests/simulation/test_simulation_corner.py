@@ -1,0 +1,110 @@
+"""What passes a building's corner and what its street's walls reflect, against closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
+from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
+from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.diffraction import EXTERIOR_RAD, SPEED_OF_SOUND_MPS, edge_gain
+from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
+from worldstate.adapters.simulation.sound.paths import through_mouth, trace_paths
+from worldstate.adapters.simulation.sound.propagation import add_sources
+from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.adapters.simulation.sound.surroundings import Surroundings
+
+C = SPEED_OF_SOUND_MPS
+
+
+def rigid_wedge_db(r, angle, r0, angle0):
+    """Diffracted pressure of a rigid 270-degree wedge in shadow, dB against the free field r + r0 away.
+
+    The impulse response of M. A. Biot and I. Tolstoy, "Formulation of wave propagation in infinite media by
+    normal coordinates", JASA 29 (1957), as H. Medwin put it for a point source, transformed by quadrature.
+    """
+    eta = np.linspace(0.0, 1.0, 100_001)[1:] ** 2 * 14.0
+    nu = np.pi / EXTERIOR_RAD
+    time = np.sqrt(2.0 * r * r0 * np.cosh(eta) + r * r + r0 * r0) / C
+    turns = [nu * (np.pi + a * angle + b * angle0) for a in (1, -1) for b in (1, -1)]
+    beta = sum(np.sin(turn) / (np.cosh(nu * eta) - np.cos(turn)) for turn in turns)
+    kernel = -nu / (2.0 * np.pi) * beta / (C * time)
+    phases = np.exp(-2j * np.pi * OCTAVES_HZ[:, None] * time)
+    return 20.0 * np.log10(np.abs(np.trapezoid(kernel * phases, eta)) * (r + r0))
+
+
+@pytest.mark.parametrize("shadow_deg", [1.0, 5.0, 20.0, 45.0, 75.0])
+@pytest.mark.parametrize(("r", "r0"), [(5.3, 5.4), (8.4, 14.0)])
+def test_a_corner_with_its_wall_is_the_rigid_wedge(r, r0, shadow_deg):
+    """The wave round the edge and the one that its wall mirrors have equal ways and add up."""
+    angle0 = np.radians(12.0)
+    angle = np.pi + angle0 + np.radians(shadow_deg)
+    turns = np.array([angle - angle0, 2.0 * EXTERIOR_RAD - angle - angle0])
+    gain = edge_gain(turns, np.full(2, r * r0 / (r + r0)), np.zeros(2), OCTAVES_HZ).sum(axis=0)
+    np.testing.assert_allclose(20 * np.log10(gain), rigid_wedge_db(r, angle, r0, angle0), atol=1.0)
+
+
+@pytest.mark.parametrize("y", [4.6, 6.0, 20.0])
+def test_a_rendered_corner_is_the_rigid_wedge(y):
+    """A rigid wall up to the corner and nothing else, a standing source up to 60 degrees behind it."""
+    site = Site(
+        "Wedge", 2.8, 30.0, 4.45, None, 2.8, 30.0, 6.0, 0.98, side_order=1, right_openings_m=((-99.0, 99.0),)
+    )
+    tones, blocks, rate = OCTAVES_HZ.astype(int) + 1, 450, 48_000.0  # whole periods in a second
+    time = np.arange((blocks + 60) * KNOT_SAMPLES) / rate
+    sound = np.cos(2 * np.pi * tones[:, None] * time).sum(axis=0)
+    emission = Emission.of(sound.astype(np.float32), -0.1, rate)
+    still = MovingSource(emission, 6.0, np.full(len(emission.knots_s), y))
+    listener = np.array([[0.0, 0.0, SOURCE_HEIGHT_M]])
+    receiver = Receiver(listener, np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / rate)
+    static = StaticSources(np.zeros((1, blocks * KNOT_SAMPLES), np.float32), rate)
+    add_sources(static, [still], Surroundings(site, receiver, 60.0))
+    static.render()
+    r0, r = np.hypot(6.0 - 4.45, y - 2.8), np.hypot(4.45, 2.8)
+    wanted = rigid_wedge_db(r, EXTERIOR_RAD - np.arctan2(2.8, 4.45), r0, np.arctan2(6.0 - 4.45, y - 2.8))
+    spectrum = np.abs(np.fft.rfft(static.out[0, 4800 : 4800 + int(rate)])) * 2 / rate
+    np.testing.assert_allclose(20 * np.log10(spectrum[tones] * (r + r0)), wanted, atol=1.5)
+
+
+@given(st.floats(50.0, 4000.0), st.floats(0.5, 20.0))
+def test_the_corner_is_continuous_through_the_shadow_boundary(frequency, reduced):
+    turn = np.radians(np.linspace(90.0, 260.0, 4001))
+    # Equal legs: the detour of a line that passes inside.
+    detour = 4.0 * reduced * (1.0 - np.sin(np.minimum(turn, np.pi) / 2.0))
+    gain = edge_gain(turn, np.full(turn.shape, reduced), detour, np.array([frequency]))[:, 0]
+    assert np.abs(np.diff(gain)).max() < 0.06
+    assert np.all(np.diff(gain[turn > np.pi]) < 0.0)  # deeper is quieter
+    assert abs(gain[0] - 1.0) < 0.25
+    assert gain[np.argmin(np.abs(turn - np.pi))] == pytest.approx(0.5, abs=0.1)
+
+
+@given(st.floats(3.0, 40.0), st.floats(0.5, 15.0), st.floats(-40.0, 40.0))
+def test_what_is_lit_goes_straight_and_what_is_hidden_goes_round(corner, beyond, y):
+    site = Site("SB1", min(corner, 30.0), 2.5, 4.0, None, 3.0, 3.0, 6.0)
+    passage = through_mouth(site, (4.0 + beyond, np.array([y])), (0.0, 0.0), 1.0)
+    lit = passage.clearance_m[0] > 0.0
+    assert (passage.turn_rad[0] < np.pi) == lit
+    assert passage.bent_m[0] >= passage.straight_m[0] - 1e-9
+
+
+@given(st.floats(-3.0, 3.0), st.floats(0.2, 3.0), st.floats(4.5, 30.0))
+def test_an_opening_takes_the_reflections_that_meet_it(begin, length, y):
+    """A source at (7, y) and a wall at -2.8 m: the reflection point by similar triangles."""
+    opening = (begin, begin + length)
+    plan = {"corner_left_m": 12.0, "corner_right_m": 12.0, "corner_ahead_m": 4.0, "opposite_wall_m": None}
+    walls = {"side_wall_left_m": 12.0, "side_wall_right_m": 2.8, "street_width_m": 6.0, "side_order": 1}
+    whole = trace_paths(Site("SB1", **plan, **walls), 7.0, np.array([y]), 1.4, 60.0)
+    holed = trace_paths(
+        Site("SB1", **plan, **walls, right_openings_m=(opening,)), 7.0, np.array([y]), 1.4, 60.0
+    )
+    aim = min(4.0 / 7.0 * (y + 5.6) - 5.6, 12.0)  # where the line passes the mouth
+    met = 4.0 * 2.8 / (aim + 5.6)
+    share = [float((b.gain / np.maximum(a.gain, 1e-12)).max()) for a, b in zip(whole, holed, strict=True)]
+    assert share[0] == share[1] == 1.0
+    if opening[0] + 0.5 < met < opening[1] - 0.5:
+        assert share[2] == 0.0
+    elif not opening[0] - 0.5 < met < opening[1] + 0.5:
+        assert share[2] == 1.0
