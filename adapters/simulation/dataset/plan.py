@@ -61,7 +61,7 @@ class DatasetSettings:
     Examples
     --------
     >>> DatasetSettings(n_static=6, kind="electric").preset
-    'street-5'
+    'street-6'
     """
 
     n_static: int = 4

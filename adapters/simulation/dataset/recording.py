@@ -130,8 +130,8 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(static, settings.site, settings.preset, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
-    add_background(static, settings.site, settings.preset, positions, to_street)
     static.render()
+    add_background(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
         time = np.arange(receiver.samples) / rate
         sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_channels.spawn(1)[0]).T

@@ -26,6 +26,9 @@ GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0)
 SHIFT_UP_HZ, IDLE_HZ = 80.0, 28.0
 SHIFT_S = 0.4
 WANDER, WANDER_STEP_S = 0.05, 0.5
+# An engine under load is louder, one that is pushed quieter (the source model of IMAGINE, light vehicles);
+# beyond these accelerations nothing more was measured.
+LOAD_DB_PER_MPS2, LOADS_MPS2 = 4.4, (-1.0, 2.0)
 TURN_MPS, TURN_BRAKING_MPS2 = 3.5, 2.0
 TURN_BEGINS_M = 12.0  # braking for the turn begins at most so long before line of sight
 SILENCE_DB = 0.0  # an engine whose every octave is below emits nothing that matters
@@ -129,6 +132,13 @@ def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> Flo
     return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative
 
 
+def load_db(trajectory: Trajectory) -> FloatArray:
+    """How much louder the engine is than at constant speed, shape (T,)."""
+    step = trajectory.time_s[1] - trajectory.time_s[0]
+    acceleration = np.clip(np.gradient(trajectory.speed_mps, step), *LOADS_MPS2)
+    return LOAD_DB_PER_MPS2 * _smooth(acceleration, trajectory.time_s)
+
+
 def _octaves(levels_db: ArrayLike) -> FloatArray:
     return np.asarray(levels_db, dtype=np.float64)[:, None]
 
@@ -148,6 +158,7 @@ def emit(
     sample_rate_hz: float,
     level_offset_db: float,
     rng: np.random.Generator,
+    engine_offset_db: float = 0.0,
 ) -> list[SourceSignal]:
     """Draw what every axle's tyres and the engine emit."""
     # The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
@@ -159,7 +170,8 @@ def emit(
     tyres = rolling / np.sqrt(len(kind.axles_m))
     sources = [SourceSignal(drawing.noise(tyres), behind, TYRE_M) for behind in kind.axles_m]
     if max(kind.propulsion_a_db) > SILENCE_DB:
-        engine = _pressure(propulsion_level_db(trajectory.speed_mps, kind) + level_offset_db)
+        engine_db = level_offset_db + engine_offset_db + load_db(trajectory)
+        engine = _pressure(propulsion_level_db(trajectory.speed_mps, kind) + engine_db)
         sources.append(SourceSignal(drawing.engine(engine), kind.axles_m[0], kind.engine_m))
     return sources
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Named here again: the help is built without importing the simulation. A test compares them.
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
-PRESETS = ("street-5", "street-5-calm")
+PRESETS = ("street-6", "street-6-calm")
 
 EXAMPLE = """\
 examples:

@@ -21,8 +21,7 @@ from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES, add_delayed, emission_times
 from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.adapters.simulation.sound.emission import Emission
-from worldstate.adapters.simulation.sound.receiver import NEAREST_M
-from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.adapters.simulation.sound.receiver import NEAREST_M, Receiver
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -46,6 +45,9 @@ SLOW_KMH = {"bicycle": (12.0, 25.0), "tram": (15.0, 40.0)}
 BACKGROUNDS = 3  # Clips without a vehicle in a recording: as many as of cars and trucks
 # Assumed: CNOSSOS states the mean of a category and not how single vehicles scatter about it.
 VEHICLE_SPREAD_DB = 3.0
+FAR_LEVEL_DB = (
+    8.0  # of a distant vehicle against the ambience: these streets are busier than a blind junction
+)
 # Assumed, per octave: backgrounds differ from day to day by birds, leaves, building sites, the far road.
 COLOUR_SPREAD_DB = 3.0
 JITTER_S = 0.2  # Clips are centred by hand
@@ -186,7 +188,10 @@ def _levels(street: Roadside, rng: np.random.Generator) -> Preset:
         usual,
         ambient_octaves_db=tuple(octaves.tolist()),
         ambient_waves=8,
+        site_ambient_db=0.0,  # a street of this study has a level of its own
+        site_wind_db=0.0,
         far_rate=street.far_rate,
+        far_level_db=FAR_LEVEL_DB,
         wind_100hz_db=usual.wind_100hz_db - street.windshield_db,
         self_noise_db=0.0,
     )
@@ -194,10 +199,10 @@ def _levels(street: Roadside, rng: np.random.Generator) -> Preset:
 
 def _ambience(levels: Preset, rng: np.random.Generator) -> Float32Array:
     """Draw the pressure of a street without a vehicle, Pa, shape (n,)."""
-    static = StaticSources(np.zeros((1, (len(KNOTS_S) - 1) * KNOT_SAMPLES), np.float32), RATE_HZ)
-    add_background(static, site("SB1"), levels, np.array([[0.0, 0.0, MICROPHONE_HEIGHT_M]]), rng)
-    static.render()
-    return np.asarray(static.out[0])
+    receiver = Receiver(np.array([[0.0, 0.0, MICROPHONE_HEIGHT_M]]), np.zeros(1), KNOTS_S)
+    heard = np.zeros((1, receiver.samples), np.float32)
+    add_background(heard, receiver, site("SB1"), levels, rng)
+    return np.asarray(heard[0])
 
 
 def _passage(street: Roadside, kind: str, rng: np.random.Generator) -> Float32Array:

@@ -1,0 +1,119 @@
+"""What an empty street sounds like: diffuse fields as coherent as textbooks say, a face that a site keeps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.special
+
+from worldstate.adapters.simulation import preset, site
+from worldstate.adapters.simulation.scene.ambience import site_ambience
+from worldstate.adapters.simulation.scene.occlusions import occluded_scene
+from worldstate.adapters.simulation.scene.vehicle import Trajectory, load_db
+from worldstate.adapters.simulation.sound.background import add_background, opening_images
+from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
+from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.static_field import plane_wave_delays, unit_vectors
+from worldstate.adapters.simulation.sound.wave_field import BlockGrid, WaveField
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.studies.streets.simulated_windows import RATE_HZ, window_feature
+
+FS = 8000.0
+
+
+def field(seconds: float, offsets_m: np.ndarray, noise: float = 0.0) -> WaveField:
+    """A field from 72 directions round the horizon, 1 Pa^2/Hz in all, and noise of each microphone."""
+    grid, azimuth = BlockGrid(round(seconds * FS), FS), 2.0 * np.pi * np.arange(72) / 72
+    delays = plane_wave_delays(unit_vectors(azimuth, np.zeros(72)), offsets_m)
+    bins, blocks = len(grid.frequencies_hz), len(grid.middles_s)
+    return WaveField(grid, delays, np.ones(bins), np.full((blocks, 72), 1 / 72), np.full(bins, noise))
+
+
+def heard(one: WaveField, seed: int = 1) -> np.ndarray:
+    out = np.zeros((one.delays_s.shape[1], one.grid.samples), np.float32)
+    one.add_to(out, np.random.default_rng(seed))
+    return out
+
+
+def test_sound_from_all_round_is_as_coherent_as_the_bessel_function_says():
+    """Two dimensions, diffuse: coherence J0(kd), and with as much noise beside it half of that."""
+    distance_m = 0.25
+    for noise, share in ((0.0, 1.0), (1.0, 0.5)):
+        pair = heard(field(12.0, np.array([[0.0, 0.0, 0.0], [0.0, distance_m, 0.0]]), noise))
+        f, cross = scipy.signal.csd(*pair, fs=FS, nperseg=256)
+        power = [scipy.signal.welch(one, fs=FS, nperseg=256)[1] for one in pair]
+        found = cross / np.sqrt(power[0] * power[1])
+        expected = share * scipy.special.j0(2.0 * np.pi * f * distance_m / SPEED_OF_SOUND_MPS)
+        band = (f > 100.0) & (f < 3000.0)
+        assert np.abs(found - expected)[band].max() < 0.15
+        assert np.abs(power[0][band].mean() - (1.0 + noise)) < 0.03 * (1.0 + noise)
+
+
+def test_the_level_is_the_same_at_every_sample_however_the_blocks_lie():
+    one = replace(field(60.0, np.zeros((1, 3))), delays_s=np.zeros((1, 1)))
+    sound = heard(replace(one, power=np.ones((len(one.power), 1))))[0]
+    hop = one.grid.hop
+    folded = (sound[: len(sound) // hop * hop].reshape(-1, hop) ** 2).mean(axis=0)
+    assert folded.mean() == pytest.approx(0.5 * FS, rel=0.02)
+    assert folded.std() < 0.05 * folded.mean()  # a window whose squares do not add up to one: .35
+
+
+def test_stretches_are_what_is_added_at_once():
+    one = field(3.1, np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]), 0.3)
+    parts = np.concatenate(list(one.stretches(np.random.default_rng(1))), axis=1)
+    assert np.array_equal(parts[:, : one.grid.samples], heard(one))
+
+
+def empty_window(name: str, seed: int, levels=None) -> np.ndarray:
+    rng, positions = np.random.default_rng(seed), ovad_array().centred_m
+    out = np.zeros((len(positions), round(RATE_HZ)), np.float32)
+    receiver = Receiver(positions, np.zeros(len(positions)), np.array([0.0, KNOT_SAMPLES]) / RATE_HZ)
+    add_background(out, receiver, site(name), levels or preset(), rng)
+    return window_feature(out.T)
+
+
+def test_a_site_keeps_its_face_from_recording_to_recording():
+    calm, names = replace(preset(), far_rate=0.0), ("SA1", "SB1", "SB2")
+    log = np.log([[empty_window(name, seed, calm) for seed in range(4)] for name in names])
+    pattern = log - log.mean(axis=2, keepdims=True)
+    between, within = pattern.mean(axis=1).std(axis=0).mean(), pattern.std(axis=1).mean()
+    alone = within / np.sqrt(4.0)  # what recordings of one and the same place would differ by
+    assert between > 1.5 * alone
+
+
+def test_a_town_all_round_has_no_direction_and_a_street_has():
+    everywhere = replace(preset(), sky_share=1.0, far_rate=0.0, wave_fluctuation_db=0.0, wind_100hz_db=20.0)
+    flat, street = (
+        np.log([empty_window("SB1", seed, one) for seed in range(3)]).std(axis=1).mean()
+        for one in (everywhere, replace(everywhere, sky_share=0.0))
+    )
+    assert 1.5 * flat < street
+
+
+def test_arms_of_a_symmetric_street_mirror_each_other_and_none_has_a_corner_in_the_open():
+    plan = site("SB1")
+    even = replace(plan, side_wall_left_m=3.0, side_wall_right_m=3.0)
+    (left, loud), (right, as_loud), *_ = opening_images(even)
+    order, other = np.argsort(left), np.argsort(-right)
+    assert np.allclose(left[order], -right[other])
+    assert np.allclose(loud[order], as_loud[other])
+    assert np.degrees(opening_images(occluded_scene("merge").site)[0][0]).tolist() == [90.0]
+
+
+def test_a_wall_opposite_keeps_out_what_comes_from_ahead():
+    walled, open_ = (
+        site_ambience(replace(site("SA1"), opposite_wall_m=wall), preset()) for wall in (9.9, None)
+    )
+    assert walled.openings_db[2] < open_.openings_db[2] - 5.0
+    assert np.array_equal(walled.octaves_db, open_.octaves_db)
+
+
+def test_an_engine_is_louder_when_it_accelerates_and_quieter_when_pushed():
+    time = np.arange(0.0, 6.0, 0.01)
+    acceleration = np.where(time < 2.0, 0.0, np.where(time < 4.0, 1.5, -0.5))
+    speed = 5.0 + np.cumsum(acceleration) * 0.01
+    change = load_db(Trajectory(time, np.cumsum(speed) * 0.01, speed, 6.0, 1))
+    assert change[[100, 300, 500]] == pytest.approx([0.0, 6.6, -2.2], abs=0.05)
+    assert np.abs(np.diff(change)).max() < 0.5  # no click
