@@ -9,11 +9,13 @@ import scipy.special
 
 from worldstate.adapters.simulation import preset, site
 from worldstate.adapters.simulation.scene.ambience import site_ambience
+from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.occlusions import occluded_scene
 from worldstate.adapters.simulation.scene.vehicle import Trajectory, load_db
 from worldstate.adapters.simulation.sound.background import add_background, opening_images
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
+from worldstate.adapters.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes
 from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.static_field import plane_wave_delays, unit_vectors
 from worldstate.adapters.simulation.sound.wave_field import BlockGrid, WaveField
@@ -117,3 +119,25 @@ def test_an_engine_is_louder_when_it_accelerates_and_quieter_when_pushed():
     change = load_db(Trajectory(time, np.cumsum(speed) * 0.01, speed, 6.0, 1))
     assert change[[100, 300, 500]] == pytest.approx([0.0, 6.6, -2.2], abs=0.05)
     assert np.abs(np.diff(change)).max() < 0.5  # no click
+
+
+def test_walls_give_back_the_own_sound_from_the_sides_and_louder_when_they_are_near():
+    azimuth = np.radians(np.arange(-180.0, 180.0, 5.0))
+    near = replace(site("DB1"), side_wall_left_m=2.8, side_wall_right_m=2.8)
+    far = replace(near, side_wall_left_m=5.6, side_wall_right_m=5.6)
+    assert echo_gain(near) == pytest.approx(4.0 * echo_gain(far))
+    lobes = echo_lobes(near, azimuth)
+    beside = np.abs(np.abs(np.degrees(azimuth)) - 66.0) < 30.0
+    assert lobes.sum() == pytest.approx(1.0)
+    assert lobes[beside].mean() > 5.0 * lobes[~beside].mean()
+
+
+@pytest.mark.parametrize("where", ["street", "open"])
+def test_an_ego_in_the_open_has_no_echo_and_one_that_stops_falls_silent(where):
+    plan = site("DB1") if where == "street" else occluded_scene("merge").site
+    knots = np.arange(251) * KNOT_SAMPLES / FS
+    receiver = Receiver(np.zeros((1, 3)), np.zeros(1), knots, EgoMotion(6.0, knots[-1] - 1.0))
+    out = np.zeros((1, receiver.samples), np.float32)
+    add_ego_echo(out, receiver, plan, -60.0, np.random.default_rng(1))
+    before, after = (np.abs(part).mean() for part in (out[0, : round(FS)], out[0, -round(0.5 * FS) :]))
+    assert before > 10.0 * after if where == "street" else not out.any()

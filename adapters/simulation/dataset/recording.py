@@ -20,7 +20,7 @@ from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.vehicle import Trajectory
 from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.ego_sound import ego_noise
+from worldstate.adapters.simulation.sound.ego_sound import add_ego_echo, ego_noise
 from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.vehicle_sound import add_vehicle
@@ -133,8 +133,10 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     static.render()
     add_background(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
-        time = np.arange(receiver.samples) / rate
-        sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_channels.spawn(1)[0]).T
+        time, engine_db = np.arange(receiver.samples) / rate, settings.preset.ego_engine_db
+        to_ego, to_echo = to_channels.spawn(2)
+        sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_ego, engine_db).T
+        add_ego_echo(sound, receiver, settings.site, engine_db, to_echo)
     return _to_samples(sound, settings, to_channels)
 
 

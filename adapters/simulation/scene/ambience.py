@@ -4,7 +4,7 @@ A court at night and a street beside a main road differ by more than two recordi
 spectrum and openings of a site are drawn once from its name and kept from recording to recording.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,9 @@ TILT_DB_PER_OCTAVE, OCTAVE_SPREAD_DB = 0.7, 0.7
 OVER_THE_WALL_DB = (
     -8.0
 )  # a facade opposite, two or three floors high, leaves so much of what comes from ahead
+# Between walls hardly, on an open corner much: levels of the released windows of SB1, hidden and in front
+# alike, spread three times as far as those of SA1 and SB2.
+GUSTINESS = (0.4, 2.0)
 TURNED_RAD = 0.12  # no street is exactly in line with another
 
 
@@ -28,6 +31,7 @@ class Ambience:
 
     octaves_db: FloatArray  # shape (8,): Level of the whole field, dB re 20 uPa
     wind_db: float  # Of the wind at the microphones, against the preset's
+    gustiness: float  # How much more it differs from recording to recording than the preset says
     openings_db: FloatArray  # shape (4,): Share of each of `OPENINGS` of that level, dB
     turned_rad: FloatArray  # shape (4,): Azimuth of each against its nominal one
 
@@ -50,13 +54,14 @@ def site_ambience(site: Site, preset: Preset) -> Ambience:
     if site.opposite_wall_m is not None:
         openings[OPENINGS.index("ahead")] += OVER_THE_WALL_DB
     wind_db = preset.site_wind_db * fixed.standard_normal()
-    return Ambience(octaves, wind_db, openings, TURNED_RAD * fixed.standard_normal(len(OPENINGS)))
+    turned = TURNED_RAD * fixed.standard_normal(len(OPENINGS))
+    return Ambience(octaves, wind_db, fixed.uniform(*GUSTINESS), openings, turned)
 
 
 def recording_ambience(of_site: Ambience, preset: Preset, rng: np.random.Generator) -> Ambience:
     """Draw what one recording makes of it."""
     # No two draws depend on each other: how loud the town is, how it blows, which street is busy.
     octaves = of_site.octaves_db + preset.ambient_spread_db * rng.standard_normal()
-    wind_db = of_site.wind_db + preset.wind_spread_db * rng.standard_normal()
+    wind_db = of_site.wind_db + of_site.gustiness * preset.wind_spread_db * rng.standard_normal()
     openings = of_site.openings_db + preset.opening_spread_db * rng.standard_normal(len(OPENINGS))
-    return Ambience(octaves, wind_db, openings, of_site.turned_rad)
+    return replace(of_site, octaves_db=octaves, wind_db=wind_db, openings_db=openings)

@@ -50,6 +50,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "vehicle_level_db": (-30.0, 30.0),
     "vehicle_spread_db": (0.0, 20.0),
     "engine_spread_db": (0.0, 20.0),
+    "ego_engine_db": (-60.0, 20.0),
     "screen_cap_db": (5.0, 60.0),
     "wall_scattering": (0.0, 1.0),
     "late_lobe_share": (0.0, 1.0),
@@ -98,7 +99,11 @@ class Preset:
         Mean level of vehicles against CNOSSOS on its reference asphalt (brick paving: some 3 to 6 dB more)
         and its standard deviation.
     engine_spread_db : float
-        Standard deviation of an engine's level against its vehicle's: make, gear and load.
+        Standard deviation of an engine's level against its vehicle's: make, gear and load, from coasting
+        or driving on a battery to full power.
+    ego_engine_db : float
+        Level of a moving ego's engine and exhaust against a car's of CNOSSOS; a hybrid drives up to a
+        corner on its battery.
     screen_cap_db : float
         Largest screen attenuation.
     wall_scattering : float
@@ -140,8 +145,9 @@ class Preset:
     late_open_db: float = -38.0
     late_decay_s: float = 0.7
     vehicle_level_db: float = 0.5
-    vehicle_spread_db: float = 3.5
-    engine_spread_db: float = 3.0
+    vehicle_spread_db: float = 3.0
+    engine_spread_db: float = 6.0
+    ego_engine_db: float = -15.0
     screen_cap_db: float = 24.0
     wall_scattering: float = 0.15
     late_lobe_share: float = 0.75

@@ -3,8 +3,10 @@
 Every source stands still against the array, so that its sound reaches each microphone after a delay of its
 own that never changes: coherent across the array, a few directions, all of them near. What lies below the
 roof comes over the nearest point of the roof's edge, once from itself and once from its image in the road.
-Wind is the turbulence at the microphones themselves and knows nothing of its neighbour. Neither reflections
-in the body's upper side nor in the street are rendered.
+Wind is the turbulence at the microphones themselves and knows nothing of its neighbour. What a street's
+walls give back is a field of its own (`add_ego_echo`): near the horizon, over the roof's edge with hardly
+any loss, and so as loud as the screened sources themselves. Reflections in the body's upper side are not
+rendered.
 """
 
 from dataclasses import dataclass
@@ -12,9 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.adapters.simulation.scene.junction import Site, site_generator
 from worldstate.adapters.simulation.scene.octave_bands import (
     OCTAVES_HZ,
     REFERENCE_PA,
+    level_curve,
     octave_masks,
     split_octaves,
 )
@@ -31,7 +35,9 @@ from worldstate.ground.typing import Float32Array, FloatArray
 
 from .background import noise_frequencies, shaped_noise, wind_density
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
-from .static_field import StaticSources
+from .receiver import Receiver
+from .static_field import StaticSources, plane_wave_delays, unit_vectors
+from .wave_field import BlockGrid, WaveField
 
 # Places in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
 TYRES_M = np.array([[1.1, 0.75, 0.1], [1.1, -0.75, 0.1], [-1.5, 0.75, 0.1], [-1.5, -0.75, 0.1]])
@@ -46,7 +52,9 @@ SCREEN_CAP_DB = 24.0
 EXHAUST_SHARE = 0.3  # of the propulsion power; the rest leaves through the engine bay
 FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # at 1 m, per octave and pillar
 FLOW_EXPONENT = 60.0  # dB per decade of speed: a dipole's power grows with the sixth power of the flow
-WIND_AT_10_DB = 76.0  # octave of 100 Hz at 10 m/s behind a windscreen
+# Octave of 100 Hz at 10 m/s behind a windscreen. With 76 dB, as before, windows of DA1 and DB1 are more
+# coherent than simulated ones at any level of the rest.
+WIND_AT_10_DB = 71.0
 WIND_EXPONENT = 40.0  # dB per decade: pseudo-sound is dynamic pressure
 
 # Firing frequency of four cylinders over speed in gears 1 to 5, Hz per m/s; the engine idles at 800 rpm.
@@ -54,6 +62,11 @@ GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0, 3.2)
 IDLE_HZ, SHIFT_UP_HZ = 26.7, 45.0
 ENGINE_WANDER, WANDER_STEP_S = 0.01, 0.5
 HARMONICS = 24
+
+ECHO_WAVES, ECHO_ORDERS, ECHO_AT_MPS = 36, 4, 5.0
+# Images of a car in the walls beside it stand at its sides; reveals and parked cars ahead give back what goes
+# forward. Set on the pattern of the empty windows of DA1 and DB1.
+ECHO_RAD, ECHO_CONCENTRATION, ECHO_AROUND, ECHO_SPREAD_DB = 1.15, 9.0, 0.2, 3.0
 
 HEAD_START_S = 0.05  # no way on the vehicle is as long
 KNOT = 1024  # levels are evaluated so often, samples
@@ -69,14 +82,22 @@ class EgoSound:
 
 
 def ego_noise(
-    positions_m: ArrayLike, speed_mps: ArrayLike, sample_rate_hz: float, rng: np.random.Generator
+    positions_m: ArrayLike,
+    speed_mps: ArrayLike,
+    sample_rate_hz: float,
+    rng: np.random.Generator,
+    engine_db: float = 0.0,
 ) -> Float32Array:
     """Render the noise of the ego vehicle at its own microphones: `ego_sound` without the engine's speed."""
-    return ego_sound(positions_m, speed_mps, sample_rate_hz, rng).pressure_pa
+    return ego_sound(positions_m, speed_mps, sample_rate_hz, rng, engine_db).pressure_pa
 
 
 def ego_sound(
-    positions_m: ArrayLike, speed_mps: ArrayLike, sample_rate_hz: float, rng: np.random.Generator
+    positions_m: ArrayLike,
+    speed_mps: ArrayLike,
+    sample_rate_hz: float,
+    rng: np.random.Generator,
+    engine_db: float = 0.0,
 ) -> EgoSound:
     r"""Render the noise of the ego vehicle at its own microphones.
 
@@ -103,9 +124,59 @@ def ego_sound(
     to_engine, to_noise, to_wind = rng.spawn(3)
     firing = _firing_hz(driven, rate, to_engine)
     out = np.zeros((len(positions), len(driven)), np.float32)
-    _add_sources(out, positions, driven, firing, rate, to_noise)
+    _add_sources(out, positions, driven, firing, rate, to_noise, engine_db)
     _add_wind(out, driven, rate, to_wind)
     return EgoSound(np.ascontiguousarray(out[:, lead:].T), firing[lead:])
+
+
+def add_ego_echo(
+    out: Float32Array, receiver: Receiver, site: Site, engine_db: float, rng: np.random.Generator
+) -> None:
+    """Add what the walls beside a moving ego give back of its own sound.
+
+    Shapes: out (M, n).
+    """
+    if site.is_open:
+        return
+    grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
+    speed = receiver.ego.at_mps(grid.middles_s)
+    levels = _levels_db(np.append(speed, ECHO_AT_MPS), engine_db)
+    power = np.sum([_pressure_pa(level) ** 2 for level in levels], axis=0)
+    loudness = power[:, :-1].sum(axis=0) / power[:, -1].sum()
+    octaves_db = 10.0 * np.log10(power[:, -1] * echo_gain(site) / REFERENCE_PA**2)
+    azimuth = 2.0 * np.pi * (np.arange(ECHO_WAVES) + rng.random()) / ECHO_WAVES
+    offsets = receiver.positions_m - receiver.centre_m
+    field = WaveField(
+        grid,
+        plane_wave_delays(unit_vectors(azimuth, np.zeros(ECHO_WAVES)), offsets) + receiver.skew_s,
+        level_curve(octaves_db, grid.frequencies_hz),
+        loudness[:, None] * echo_lobes(site, azimuth),
+        np.zeros(len(grid.frequencies_hz)),
+    )
+    field.add_to(out, rng)
+
+
+def echo_gain(site: Site) -> float:
+    """Power of all images in both side walls at the array over that at 1 m.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.simulation.scene.junction import site
+    >>> bool(0.02 < echo_gain(site("DB1")) < 0.1)
+    True
+    """
+    order = np.arange(1, ECHO_ORDERS + 1)
+    width = site.side_wall_left_m + site.side_wall_right_m
+    return float(2.0 * (site.side_reflection ** (2 * order) / (order * width) ** 2).sum())
+
+
+def echo_lobes(site: Site, azimuth_rad: FloatArray) -> FloatArray:
+    """Share of every direction in what the walls give back, shape (Q,)."""
+    # No two walls are equal: which side gives back more belongs to the site.
+    level = 10.0 ** (ECHO_SPREAD_DB * site_generator(site.name, "echo").standard_normal(2) / 10.0)
+    beside = np.exp(ECHO_CONCENTRATION * (np.cos(azimuth_rad[:, None] - [ECHO_RAD, -ECHO_RAD]) - 1.0))
+    lobes = (beside / beside.sum(axis=0)) @ (level / level.sum())
+    return np.asarray((1.0 - ECHO_AROUND) * lobes + ECHO_AROUND / len(azimuth_rad))
 
 
 def _checked(positions_m: ArrayLike, speed_mps: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -127,9 +198,10 @@ def _add_sources(
     firing: FloatArray,
     rate: float,
     rng: np.random.Generator,
+    engine_db: float,
 ) -> None:
     roof = _roof_edge(float(positions[:, 2].min()) - ROOF_BELOW_ARRAY_M)
-    levels, static = _levels_db(speed[::KNOT]), StaticSources(out, rate)
+    levels, static = _levels_db(speed[::KNOT], engine_db), StaticSources(out, rate)
     for place, level_db, lines in zip(_places(), levels, _line_shares(), strict=True):
         bands = split_octaves(_emission(firing, lines, rate, rng), rate)
         bands *= _at_samples(_pressure_pa(level_db), len(speed))
@@ -150,13 +222,13 @@ def _line_shares() -> tuple[float, ...]:
     return (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
 
 
-def _levels_db(speed: FloatArray) -> list[FloatArray]:
+def _levels_db(speed: FloatArray, engine_db: float) -> list[FloatArray]:
     """Pressure level at 1 m of every source per octave, (8, knots), dB re 20 uPa."""
     slowest = SLOWEST_KMH / 3.6
     # The law ends above a standstill; below, rolling noise fades with the speed itself.
     fade = 20.0 * np.log10(np.clip(speed / slowest, 1e-5, 1.0))
     tyre = rolling_level_db(speed) + POWER_TO_1M_DB - 10.0 * np.log10(len(TYRES_M)) + fade
-    propulsion = propulsion_level_db(speed) + POWER_TO_1M_DB
+    propulsion = propulsion_level_db(speed) + POWER_TO_1M_DB + engine_db
     bay = propulsion + 10.0 * np.log10(1.0 - EXHAUST_SHARE)
     exhaust = propulsion + 10.0 * np.log10(EXHAUST_SHARE)
     relative = np.log10(np.maximum(speed, 0.1) / (70.0 / 3.6))

@@ -68,7 +68,9 @@ def _add_patches(static: StaticSources, arrived: Float32Array, group: Patches, a
             continue
         # The way by a wall is longer: without its delay every image would be in phase with the patch.
         later_s = (np.linalg.norm(shown.positions_m - centre, axis=1) - away) / SPEED_OF_SOUND_MPS
-        later = np.round(later_s * static.sample_rate_hz).astype(int)
+        # What lies beyond the plane of a wall is not mirrored by it: its image would be the nearer one.
+        seen *= (later_s >= 0.0)[:, None]
+        later = np.round(np.maximum(later_s, 0.0) * static.sample_rate_hz).astype(int)
         signals = np.stack([_later(one, by) for one, by in zip(arrived, later, strict=True)])
         _add_shown(static, signals, shown, seen, around)
 
