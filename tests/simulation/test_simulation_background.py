@@ -10,6 +10,7 @@ import scipy.special
 from worldstate.adapters.simulation import preset, site
 from worldstate.adapters.simulation.scene.ambience import site_ambience
 from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
+from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.occlusions import occluded_scene
 from worldstate.adapters.simulation.scene.vehicle import Trajectory, load_db
 from worldstate.adapters.simulation.sound.background import add_background, opening_images
@@ -77,7 +78,7 @@ def empty_window(name: str, seed: int, levels=None) -> np.ndarray:
 
 
 def test_a_site_keeps_its_face_from_recording_to_recording():
-    calm, names = replace(preset(), far_rate=0.0), ("SA1", "SB1", "SB2")
+    calm, names = replace(preset(), far_rate=0.0, sky_share=0.2), ("SA1", "SB1", "SB2")
     log = np.log([[empty_window(name, seed, calm) for seed in range(4)] for name in names])
     pattern = log - log.mean(axis=2, keepdims=True)
     between, within = pattern.mean(axis=1).std(axis=0).mean(), pattern.std(axis=1).mean()
@@ -95,8 +96,7 @@ def test_a_town_all_round_has_no_direction_and_a_street_has():
 
 
 def test_arms_of_a_symmetric_street_mirror_each_other_and_none_has_a_corner_in_the_open():
-    plan = site("SB1")
-    even = replace(plan, side_wall_left_m=3.0, side_wall_right_m=3.0)
+    even = Site("SB1", 2.8, 2.8, 4.5, None, 3.0, 3.0, 6.0)
     (left, loud), (right, as_loud), *_ = opening_images(even)
     order, other = np.argsort(left), np.argsort(-right)
     assert np.allclose(left[order], -right[other])
