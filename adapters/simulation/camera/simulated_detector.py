@@ -78,7 +78,7 @@ def detect(
 
 def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generator) -> list[Frame]:
     """Boxes of a car that stands at the far kerb for the whole recording."""
-    x = site.corner_ahead_m + site.street_width_m - 0.5 * WIDTH_M
+    x = site.far_kerb_m - 0.5 * WIDTH_M
     right, left = site.sight_m(x, camera.position_m[:2])
     middle = rng.uniform(0.6 * right, 0.6 * left)
     low, high = max(middle - LENGTH_M / 2.0, right), min(middle + LENGTH_M / 2.0, left)

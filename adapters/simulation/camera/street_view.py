@@ -88,7 +88,7 @@ def _opposite(site: Site, front: Facade, height_m: float) -> list[Panel]:
     across = (-FAR_M, FAR_M)
     if site.opposite_wall_m is not None:
         return [Panel(0, site.opposite_wall_m, (across, (ROAD_Z_M, ROAD_Z_M + height_m)), front.paint)]
-    hedge = site.corner_ahead_m + site.street_width_m + HEDGE_AHEAD_M - 9.0
+    hedge = site.far_kerb_m + HEDGE_AHEAD_M - 9.0
     green = partial(leaves, seed=front.seed)
     return [
         Panel(0, hedge, (across, (ROAD_Z_M, ROAD_Z_M + HEDGE_HEIGHT_M)), green),
@@ -104,7 +104,7 @@ class _Ground:
     seed: int
 
     def paint(self, ahead: Float32Array, left: Float32Array) -> Float32Array:
-        near, far = self.site.corner_ahead_m, self.site.corner_ahead_m + self.site.street_width_m
+        near, far = self.site.corner_ahead_m + self.site.verge_m, self.site.far_kerb_m
         image = paving(left, ahead, self.seed)
         _put(image, asphalt(ahead, left, self.seed), (ahead > near) & (ahead < far))
         beyond = flags(left, ahead, self.seed) if self.site.opposite_wall_m else grass(ahead, left, self.seed)
@@ -119,7 +119,7 @@ class _Ground:
         return image
 
     def _marked(self, ahead: Float32Array, left: Float32Array) -> BoolArray:
-        middle = self.site.corner_ahead_m + 0.5 * self.site.street_width_m
+        middle = self.site.far_kerb_m - 0.5 * self.site.street_width_m
         line = (np.abs(ahead - middle) < 0.05) & (np.mod(left, 3.0) < 1.2)
         depth = ahead - (self.site.corner_ahead_m - 0.75)
         centre = 0.75 * (np.floor(left / 0.75) + 0.5)

@@ -93,7 +93,7 @@ def write_video(path: str | Path, frames: Iterable[ImageArray], frame_rate_hz: f
 
 def parked_lane_m(site: Site) -> float:
     """Distance ahead of the middle of a car that is parked at the far kerb."""
-    return site.corner_ahead_m + site.street_width_m - 0.5 * WIDTH_M
+    return site.far_kerb_m - 0.5 * WIDTH_M
 
 
 def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:

@@ -7,6 +7,7 @@ attenuation. The side images decide where a hidden vehicle is heard: the corner'
 opposite side wall lies in much shallower shadow than the corner itself.
 """
 
+import math
 from dataclasses import dataclass
 from itertools import product
 
@@ -111,11 +112,11 @@ def receiver_images(site: Site) -> list[ReceiverImage]:
     left, right = site.side_wall_left_m, site.side_wall_right_m
     images = [DIRECT]
     for order in range(1, site.side_order + 1):
-        gain = site.side_reflection**order
         shift = (order // 2) * 2.0 * (left + right)
         for first, sign, near in ((LEFT, 1.0, left), (RIGHT, -1.0, right)):
             # Unfolded outwards the walls alternate, a street's width apart.
             walls = tuple(((first + k) % 2, sign * (near + k * (left + right))) for k in range(order))
+            gain = math.prod(site.side_reflection * site.side_shares[wall] for wall, _ in walls)
             offset = sign * (shift + 2.0 * near * (order % 2))
             images.append(ReceiverImage(-1 if order % 2 else 1, offset, gain, order, walls))
     return images
@@ -129,20 +130,21 @@ def trace_paths(
     cap_db: float,
     *,
     receiver_x_m: float | FloatArray = 0.0,
-    specular: FloatArray | None = None,
+    specular: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Path]:
     """All paths from a source that moves in the crossing street to the array's centre at (receiver_x_m, 0).
 
-    Shapes: lane_x_m (T,), source_y_m (T,), receiver_x_m (T,), specular (8,).
+    Shapes: lane_x_m (T,), source_y_m (T,), receiver_x_m (T,), specular two of (8,): what the
+    facades of the crossing street and the side walls mirror.
     """
-    mirror = np.ones(len(OCTAVES_HZ)) if specular is None else specular
+    facades, sides = (np.ones(len(OCTAVES_HZ)),) * 2 if specular is None else specular
     paths = []
     for source, receiver in product(source_images(site, lane_x_m), receiver_images(site)):
         end_m = receiver_x_m, float(receiver.mirror(np.zeros(1))[0])
         passage = through_mouth(site, (source.x_m, source_y_m), end_m, height_m)
         walls = source.gain * receiver.gain * near_facade(site, source, source_y_m, passage.aim_y_m)
         walls = walls * side_walls(site, receiver, receiver_x_m, passage.aim_y_m)
-        gain = walls[:, None] * mirror ** (source.order + receiver.order) * passage.screen_gain(cap_db)
+        gain = walls[:, None] * facades**source.order * sides**receiver.order * passage.screen_gain(cap_db)
         edge_y = np.where(passage.edge == LEFT, site.corner_left_m, -site.corner_right_m)
         before = np.hypot(source.x_m - site.corner_ahead_m, source_y_m - edge_y)
         paths.append(Path(source, receiver, passage.lit, passage.edge, passage.bent_m, gain, before, edge_y))

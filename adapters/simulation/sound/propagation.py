@@ -44,12 +44,12 @@ def _paths(source: MovingSource, around: Surroundings) -> list[Path]:
     above = receiver.above(source.height_m)
     flat = source.y_m**2 + above**2
     _, heard_x = receiver.arrivals(source.emission.knots_s, partial(_slant, source.x_m, flat))
-    mirrored = np.sqrt(1.0 - around.scattering)
+    mirrored = np.sqrt(1.0 - around.scattered(True)), np.sqrt(1.0 - around.scattered(False))
     place = source.x_m, source.y_m, above
     paths = trace_paths(around.site, *place, around.cap_db, receiver_x_m=heard_x, specular=mirrored)
     beside = in_own_street(around.site, source.x_m, source.y_m)
     if beside.any():
-        paths = [_beside(path, source, beside, mirrored, heard_x, above) for path in paths]
+        paths = [_beside(path, source, beside, mirrored[1], heard_x, above) for path in paths]
     return [replace(path, gain=path.gain * _media(path.bent_m, source, around)) for path in paths]
 
 

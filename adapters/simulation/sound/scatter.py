@@ -93,7 +93,11 @@ def _side_walls(site: Site, rng: np.random.Generator) -> Patches:
     normals = np.repeat([[0.0, -1.0], [0.0, 1.0]], [len(left), len(right)], axis=0)
     positions = np.concatenate([left, right])
     strengths = _strengths(len(positions), site.side_reflection, rng)
-    walled = [on_wall(site.left_openings_m, left[:, 0]), on_wall(site.right_openings_m, right[:, 0])]
+    sides = (site.left_openings_m, left), (site.right_openings_m, right)
+    walled = [
+        share * on_wall(openings, places[:, 0])
+        for share, (openings, places) in zip(site.side_shares, sides, strict=True)
+    ]
     return Patches(positions, normals, strengths * np.concatenate(walled), False)
 
 

@@ -1,5 +1,7 @@
 """What rough walls send on of a moving source, rendered at every microphone."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -31,7 +33,8 @@ def add_scattered(static: StaticSources, source: MovingSource, around: Surroundi
         arrived = np.zeros((len(group.strengths_m), around.receiver.samples), np.float32)
         for index, signal in enumerate(arrived):
             for leg in first_legs(group, index, source, around):
-                _add_leg(signal, source.emission, leg, around, group.positions_m[index])
+                sent = replace(leg, gain=leg.gain * np.sqrt(around.scattered(group.beyond_mouth)))
+                _add_leg(signal, source.emission, sent, around, group.positions_m[index])
         _add_patches(static, arrived, group, around)
 
 
@@ -39,7 +42,7 @@ def _add_leg(
     out: Float32Array, emission: Emission, leg: FirstLeg, around: Surroundings, patch_m: FloatArray
 ) -> None:
     """Add what one patch sends on, as late as the array's centre hears it."""
-    made = emission.table(leg.gain * np.sqrt(around.scattering))
+    made = emission.table(leg.gain)
     if made is None:
         return
     table, span = made

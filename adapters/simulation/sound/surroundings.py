@@ -25,6 +25,10 @@ class Surroundings:
     scattering: FloatArray = field(default_factory=lambda: np.zeros(len(OCTAVES_HZ)))
     outdoors: bool = False  # Whether air and road change the sound
 
+    def scattered(self, beyond_mouth: bool) -> FloatArray:
+        """Share that the crossing street's facades, or the side walls, scatter, shape (8,)."""
+        return np.minimum(self.scattering * self.site.roughness[int(beyond_mouth)], 1.0)
+
 
 def in_own_street(site: Site, x_m: float | FloatArray, y_m: FloatArray) -> FloatArray:
     """1 where a source stands between the side walls of the ego's street, 0 beyond its mouth, shape (T,).

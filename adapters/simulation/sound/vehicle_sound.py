@@ -30,7 +30,7 @@ def add_vehicle(
 ) -> None:
     """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
     rate = receiver.sample_rate_hz
-    level = preset.vehicle_level_db + preset.vehicle_spread_db * rng.standard_normal()
+    level = preset.vehicle_level_db + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
     engine_db = preset.engine_spread_db * rng.standard_normal()
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
