@@ -94,7 +94,7 @@ def test_energy_is_continuous_across_line_of_sight_entry(name, side):
         assert np.abs(np.diff(level_db, axis=0)).max() < 0.1
         seen = np.abs(y) < 1.0
         hidden = np.abs(y) > 10.0
-        assert level_db[seen].mean() > level_db[hidden].mean() + 6.0
+        assert level_db[seen].mean() > level_db[hidden].mean() + 5.0  # hard walls opposite each other
 
 
 @given(st.floats(3.0, 30.0), st.floats(1.02, 2.0))
