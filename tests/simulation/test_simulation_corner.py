@@ -108,3 +108,22 @@ def test_an_opening_takes_the_reflections_that_meet_it(begin, length, y):
         assert share[2] == 0.0
     elif not opening[0] - 0.5 < met < opening[1] + 0.5:
         assert share[2] == 1.0
+
+
+@given(st.floats(1.5, 3.5), st.floats(4.0, 7.0), st.floats(2.0, 8.0), st.floats(0.1, 40.0))
+def test_a_hidden_vehicle_is_lit_by_one_image_after_another(aside, ahead, lane, y):
+    """Between walls w to either side the image of order n stands at atan((2 n w + y) / (D + l)).
+
+    It is lit from atan((2 n - 1) w / D) to atan((2 n + 1) w / D): with hard walls what is heard of a vehicle
+    that approaches from the left goes from the left's wide angles (n = 2) to the right's middle ones (n = 1).
+    """
+    site = Site("SB1", aside, aside, ahead, None, aside, aside, 6.0)
+    paths = trace_paths(site, ahead + lane, np.array([y]), 0.0, 60.0)
+    for order in range(4):
+        offsets = [path.receiver.offset_m for path in paths]
+        path = paths[int(np.argmin(np.abs(np.array(offsets) + 2.0 * order * aside)))]
+        assert path.receiver.order == order
+        tangent = (2.0 * order * aside + y) / (ahead + lane)
+        inside = min(tangent - (2 * order - 1) * aside / ahead, (2 * order + 1) * aside / ahead - tangent)
+        if abs(inside) * ahead > 0.25:  # not in the transition
+            assert path.lit[0] == float(inside > 0.0), order

@@ -35,7 +35,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS
-FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, side_order=0, facade_order=0)
+FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, in_the_open=True)
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
 HEAD_BLOCKS = 375
 THROUGH_US, BENT = ((9.0, 30.0), (0.0, 0.0)), ((5.0, -20.0), (5.2, -20.0), (-40.0, 9.0))

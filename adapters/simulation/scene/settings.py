@@ -18,7 +18,7 @@ MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
 MAX_OTHERS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 64, 0.1
 # Narrow streets and a blind junction ahead: most drivers slow down before it, and a wall makes them slower.
-SPEEDS_MPS, WALLED_SPEEDS_MPS = (5.5, 10.5), (4.2, 5.6)
+SPEEDS_MPS, WALLED_SPEEDS_MPS = (4.5, 9.0), (4.2, 5.6)
 BRAKING_SHARE, BRAKING_MPS2 = 0.85, (1.0, 3.5)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
 
@@ -176,7 +176,7 @@ def draw_settings(
 ) -> SimulationSettings:
     """Draw how a vehicle drives, in sight at 65 to 75 % of the time.
 
-    Most brake; before that they do 20 to 38 km/h, 15 to 20 where a wall stands opposite (type A).
+    Most brake; before that they do 16 to 32 km/h, 15 to 20 where a wall stands opposite (type A).
 
     Parameters
     ----------

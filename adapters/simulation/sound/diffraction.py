@@ -31,7 +31,7 @@ def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: 
 
 
 def edge_gain(
-    turn_rad: FloatArray, reduced_m: FloatArray, detour_m: FloatArray, frequency_hz: FloatArray
+    turn_rad: FloatArray, reduced_m: FloatArray, detour_m: FloatArray, frequency_hz: ArrayLike
 ) -> FloatArray:
     r"""Amplitude of a wave that passes a building's corner, against the free field, shape (T, F).
 
@@ -53,7 +53,7 @@ def edge_gain(
     >>> (20 * np.log10(gain[:, 0])).round(1)
     array([ -0. ,  -5.9, -24.3])
     """
-    wave = 2.0 * np.pi * frequency_hz / SPEED_OF_SOUND_MPS
+    wave = 2.0 * np.pi * np.asarray(frequency_hz) / SPEED_OF_SOUND_MPS
     root = np.sqrt(2.0 * reduced_m[:, None] * wave)
     n = EXTERIOR_RAD / np.pi
     turn = np.where(np.abs(turn_rad - np.pi) < LEAST_RAD, np.pi + LEAST_RAD, turn_rad)

@@ -172,7 +172,7 @@ class Passage:
     def screen_gain(self, cap_db: float) -> FloatArray:
         """Amplitude that the corner leaves, shape (T, 8)."""
         gain = edge_gain(self.turn_rad, self.reduced_m, self.bent_m - self.straight_m, OCTAVES_HZ)
-        return np.maximum(gain, 10.0 ** (-cap_db / 20.0))
+        return np.asarray(np.maximum(gain, 10.0 ** (-cap_db / 20.0)))
 
 
 def through_mouth(

@@ -20,19 +20,27 @@ from .static_field import StaticSources
 from .surroundings import Surroundings, in_own_street
 
 TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
+ANY_ORDER = range(99)
 FAINTEST = 1e-3  # a path below this share of the whole is left out
 
 
-def add_sources(static: StaticSources, sources: Sequence[MovingSource], around: Surroundings) -> None:
-    """Add moving sources, by every path, to all microphones."""
+def add_sources(
+    static: StaticSources,
+    sources: Sequence[MovingSource],
+    around: Surroundings,
+    reflections: range = ANY_ORDER,
+) -> None:
+    """Add moving sources to all microphones, by every path with so many reflections."""
     if around.site.is_open:
-        for source in sources:
+        for source in sources if 0 in reflections else ():
             _add_open(static.out, source, around)
         return
     images = receiver_images(around.site)
     bent = np.zeros((len(images), 2, around.receiver.samples), np.float32)
     for source in sources:
         for path in _audible(_paths(source, around)):
+            if path.source.order + path.receiver.order not in reflections:
+                continue
             for edge in (LEFT, RIGHT):
                 _add_bent(bent[images.index(path.receiver), edge], source, path, edge, around)
             _add_lit(static.out, source, path, around.receiver)

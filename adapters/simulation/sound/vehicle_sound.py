@@ -10,7 +10,7 @@ from worldstate.ground.typing import Float32Array
 from .delay import KNOT_SAMPLES
 from .emission import Emission, MovingSource
 from .late_field import add_late_field, street_field
-from .propagation import add_sources
+from .propagation import ANY_ORDER, add_sources
 from .receiver import Receiver
 from .scatter import scattering
 from .scattered_sound import add_scattered
@@ -18,6 +18,8 @@ from .static_field import StaticSources
 from .surroundings import Surroundings
 
 LATE_DISTANCE_M = 8.0
+# After so many reflections a vehicle is far enough to be one point; its parts would cost three times as much.
+POINT_REFLECTIONS = 2
 
 
 def add_vehicle(
@@ -35,10 +37,12 @@ def add_vehicle(
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
     around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
-    add_sources(static, sources, around)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
-    add_scattered(static, _moving(path, whole, middle, SOURCE_HEIGHT_M, rate), around)
+    far = _moving(path, whole, middle, SOURCE_HEIGHT_M, rate)
+    add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])
+    add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
+    add_scattered(static, far, around)
     dry = whole * _late_gain(site, preset, path, receiver)
     heard = dry[: round((receiver.knots_s[0] - path.time_s[0]) * rate) + receiver.samples]
     field = street_field(site, preset.late_lobe_share)
