@@ -194,8 +194,8 @@ def site(name: str) -> Site:
 # rest is fitted: a coarse search for the least difference between the expected pattern (energies of all
 # paths, the array's beams) and the mean released one, hidden and front, by side and half, empty windows taken
 # off. It leaves .10, .15 and .07 nepers rms. Where the walls of type B begin is set by hand between two aims:
-# farther ahead, no image stands beyond 65 degrees, as in the released windows; farther back, the second image,
-# on the vehicle's own side, is as strong as there.
+# farther ahead, no image stands beyond 65 degrees, as in the released windows; farther back, the second
+# image, on the vehicle's own side, is as strong as there.
 PLANS = {
     "SA1": Site(
         "SA1",

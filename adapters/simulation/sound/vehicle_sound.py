@@ -18,8 +18,9 @@ from .static_field import StaticSources
 from .surroundings import Surroundings
 
 LATE_DISTANCE_M = 8.0
-# After so many reflections a vehicle is far enough to be one point; its parts would cost three times as much.
-POINT_REFLECTIONS = 2
+# From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
+# whether the second image is lit, on the vehicle's own side, hangs on a metre.
+POINT_REFLECTIONS = 3
 
 
 def add_vehicle(
