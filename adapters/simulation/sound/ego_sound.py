@@ -162,7 +162,7 @@ def echo_gain(site: Site) -> float:
     Examples
     --------
     >>> from worldstate.adapters.simulation.scene.junction import site
-    >>> bool(0.02 < echo_gain(site("DB1")) < 0.1)
+    >>> bool(0.02 < echo_gain(site("DB1")) < 0.2)
     True
     """
     order = np.arange(1, ECHO_ORDERS + 1)
