@@ -54,11 +54,12 @@ def test_behind_a_screen_alone_the_vehicle_is_heard_at_the_corner(approach, asid
 
 @pytest.mark.parametrize("approach", ["left", "right"])
 def test_side_walls_move_it_away_from_the_corner(approach):
-    """A street with mirrors for walls: heard at lateral images, first on the other side than the vehicle."""
+    """A street with mirrors for walls: heard at lateral images, now on the one side and now on the other."""
     plan = replace(site("SB1"), side_reflection=0.9)
     found = loudest_deg(plan, approach, 2) * (1 if approach == "left" else -1)
     assert np.mean(np.abs(found) > 40.0) >= 0.8
-    assert (found[:2] < -40.0).all()
+    assert (found < -40.0).any()
+    assert (found > 40.0).any()
 
 
 @pytest.mark.slow
