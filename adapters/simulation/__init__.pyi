@@ -18,3 +18,5 @@ from .scene.presets import preset as preset
 from .scene.settings import SimulationSettings as SimulationSettings
 from .scene.settings import VehicleSettings as VehicleSettings
 from .scene.settings import draw_settings as draw_settings
+from .scene.sound_kinds import SOUNDS as SOUNDS
+from .scene.sound_settings import SoundSettings as SoundSettings

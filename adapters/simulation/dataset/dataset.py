@@ -27,6 +27,7 @@ from worldstate.adapters.datasets.ovad_layout import (
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import deferred_signals, write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
+from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
 from worldstate.adapters.simulation.scene.presets import preset
@@ -217,10 +218,12 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     write_text(Path(root) / LOG_NAME, text.getvalue())
 
 
-def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray | None, plan: Plan) -> LogRow:
+def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
     settings = replace(drawn, preset=preset(wanted.preset))
+    if wanted.sounds:
+        settings = with_sounds(settings, wanted.sounds, array.n_microphones, rng.spawn(1)[0])
     recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = None

@@ -9,6 +9,8 @@ from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
 from worldstate.adapters.simulation.scene.occlusions import occluded_scene
 from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
+from worldstate.adapters.simulation.scene.settings import MAX_SOUNDS
+from worldstate.adapters.simulation.scene.sound_kinds import sound_kind
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
@@ -50,6 +52,8 @@ class DatasetSettings:
         a standing ego at a junction.
     video_width_px : int
         Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
+    sounds : tuple of str
+        What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
     preset : str
         Name of the levels of everything that is not geometry.
 
@@ -73,6 +77,7 @@ class DatasetSettings:
     video: bool = False
     video_width_px: int = PinholeCamera().width_px
     preset: str = DEFAULT_PRESET
+    sounds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
@@ -82,6 +87,9 @@ class DatasetSettings:
         in_range("duration_s", self.duration_s, 0.5, 60.0)
         in_range("video_width_px", self.video_width_px, 64, PinholeCamera().width_px)
         vehicle_kind(self.kind)
+        in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
+        for name in self.sounds:
+            sound_kind(name)
         preset(self.preset)
         if self.scene != JUNCTION:
             occluded_scene(self.scene)

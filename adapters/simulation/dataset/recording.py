@@ -15,6 +15,7 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
     line_of_sight,
     park,
 )
+from worldstate.adapters.simulation.emitters.placed_sound import add_signal, add_sound
 from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.vehicle import Trajectory
@@ -114,7 +115,9 @@ def simulate_recording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
         t0_frame=_t0_frame(len(frames), sights),
-        detections=_detections(settings, seen, len(frames), camera, to_camera),
+        detections=_through_rain(
+            _detections(settings, seen, len(frames), camera, to_camera), settings, to_camera
+        ),
         truth=describe(settings, frames, seen, sights),
         array=array,
     )
@@ -131,11 +134,29 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
         add_vehicle(static, settings.site, settings.preset, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
     add_background(static, settings.site, settings.preset, positions, to_street)
+    # Generators of their own, and only where something sounds: the rest stays what it is without.
+    _add_sounds(static, settings, paths, receiver, rng)
     static.render()
     if not settings.ego.stands:
         time = np.arange(receiver.samples) / rate
         sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_channels.spawn(1)[0]).T
     return _to_samples(sound, settings, to_channels)
+
+
+def _add_sounds(
+    static: StaticSources,
+    settings: SimulationSettings,
+    paths: list[Trajectory],
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add what vehicles warn with, and what else sounds."""
+    site, preset = settings.site, settings.preset
+    for path, vehicle in zip(paths, settings.traffic, strict=True):
+        if vehicle.signal:
+            add_signal(static, vehicle.signal, path, site, preset, receiver, rng.spawn(1)[0])
+    for sound in settings.sounds:
+        add_sound(static, sound, site, preset, receiver, rng.spawn(1)[0])
 
 
 def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
@@ -192,3 +213,20 @@ def _detections(
         passing = detect(path, settings.site, camera, rng)
         boxes = [standing + moving for standing, moving in zip(boxes, passing, strict=True)]
     return tuple(boxes)
+
+
+def _through_rain(
+    detections: tuple[Frame, ...], settings: SimulationSettings, rng: np.random.Generator
+) -> tuple[Frame, ...]:
+    """Lose the detections that drops on the lens take while it rains."""
+    missed = np.zeros(len(detections))
+    time = np.arange(len(detections)) / FRAME_RATE_HZ
+    for sound in settings.sounds:
+        raining = (time >= sound.start_s) & (time < sound.end_s)
+        missed = np.maximum(missed, sound.lens_missed * raining)
+    if not missed.any():
+        return detections
+    return tuple(
+        tuple(box for box in frame if rng.random() >= share)
+        for frame, share in zip(detections, missed, strict=True)
+    )

@@ -7,11 +7,12 @@ import numpy as np
 
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 from worldstate.adapters.simulation.scene.vehicle import Trajectory
 from worldstate.ground.typing import BoolArray, FloatArray
 
 SCHEMA = "worldstate.simulation.truth"
-SCHEMA_VERSION = "1.1.0"
+SCHEMA_VERSION = "1.2.0"
 
 
 def describe(
@@ -22,7 +23,7 @@ def describe(
     # `azimuth_rad` (of the front axle, left positive), `range_m`, `line_of_sight`, `time_to_visible_s`
     # (negative afterwards). `frames` are those of the vehicle that `approach` names, `others` those of the
     # rest. Without a vehicle there are no frames and `entry_s` is null. `ego` has the ego's way along its
-    # street, 0 where it stops.
+    # street, 0 where it stops. `sounds` has the azimuth and range of what else sounds at a place, and when.
     ego_x = settings.ego.x_m(frames_s)
     frames = [
         _frames(path, sight, vehicle.entry_s, ego_x)
@@ -36,7 +37,27 @@ def describe(
         "entry_s": settings.entry_s if frames else None,
         "frames": frames[0] if frames else [],
         "others": frames[1:],
+        "sounds": [_sound(sound, frames_s, ego_x) for sound in settings.sounds],
         "ego": {"x_m": ego_x.round(6).tolist(), "speed_mps": settings.ego.at_mps(frames_s).round(6).tolist()},
+    }
+
+
+def _sound(sound: SoundSettings, frames_s: FloatArray, ego_x_m: FloatArray) -> dict[str, Any]:
+    sounding = (frames_s >= sound.start_s) & (frames_s < sound.end_s)
+    told = {
+        "kind": sound.kind,
+        "label": sound.what.label,
+        "of": sound.what.origin,
+        "start_s": sound.start_s,
+        "end_s": sound.end_s,
+        "sounding": sounding.tolist(),
+    }
+    if not sound.has_place:
+        return told
+    x, y = sound.at(frames_s)
+    return told | {
+        "azimuth_rad": np.arctan2(y, x - ego_x_m).round(6).tolist(),
+        "range_m": np.hypot(y, x - ego_x_m).round(6).tolist(),
     }
 
 

@@ -12,11 +12,13 @@ from .junction import MOVING_SITES, Site, site
 from .kinds import vehicle_kind
 from .occlusions import scene_of
 from .presets import Preset, preset
+from .sound_kinds import SIGNALS
+from .sound_settings import SoundSettings
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
 MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
-MAX_OTHERS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 64, 0.1
+MAX_OTHERS, MAX_SOUNDS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 16, 64, 0.1
 # Narrow streets and a blind junction ahead: most drivers slow down before it, and a wall makes them slower.
 SPEEDS_MPS, WALLED_SPEEDS_MPS = (6.5, 14.0), (4.2, 5.6)
 BRAKING_SHARE, BRAKING_MPS2 = 0.85, (1.0, 3.5)
@@ -43,6 +45,8 @@ class VehicleSettings:
         "pass" or "turn": turn into the ego's street, and stop there.
     route_m : tuple of (float, float)
         Where it goes instead of along the crossing street: points x, y, at least 2; empty for none.
+    signal : str
+        What it warns with all the time, one of `SIGNALS`; empty for nothing.
 
     Raises
     ------
@@ -62,9 +66,11 @@ class VehicleSettings:
     kind: str = "light"
     manoeuvre: str = "pass"
     route_m: tuple[tuple[float, float], ...] = ()
+    signal: str = ""
 
     def __post_init__(self) -> None:
         _one_of("approach", self.approach, ("left", "right"))
+        _one_of("signal", self.signal, ("", *SIGNALS))
         _one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
         vehicle_kind(self.kind)
         in_range("entry_s", self.entry_s, -60.0, 120.0)
@@ -110,12 +116,14 @@ class SimulationSettings:
         8 to 96 kHz.
     preset : Preset
         Levels of everything else.
-    kind, manoeuvre, route_m
+    kind, manoeuvre, route_m, signal
         Of the vehicle: see `VehicleSettings`.
     others : tuple of VehicleSettings
         More vehicles, at most 8; none where `approach` is "none".
     ego : EgoMotion
         How the ego moves; it stands if not given.
+    sounds : tuple of SoundSettings
+        What else sounds, at most 16.
 
     Raises
     ------
@@ -142,6 +150,8 @@ class SimulationSettings:
     route_m: tuple[tuple[float, float], ...] = ()
     others: tuple[VehicleSettings, ...] = ()
     ego: EgoMotion = field(default_factory=EgoMotion)
+    signal: str = ""
+    sounds: tuple[SoundSettings, ...] = ()
 
     def __post_init__(self) -> None:
         _one_of("approach", self.approach, APPROACHES)
@@ -152,6 +162,7 @@ class SimulationSettings:
         in_range("sample_rate_hz", self.sample_rate_hz, 8_000.0, 96_000.0)
         most = 0 if self.approach == "none" else MAX_OTHERS
         in_range("others: number of vehicles", len(self.others), 0, most)
+        in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
         self.traffic  # noqa: B018  (building the first vehicle checks what is left)
 
     @property
@@ -167,6 +178,7 @@ class SimulationSettings:
             self.kind,
             self.manoeuvre,
             self.route_m,
+            self.signal,
         )
         return (first, *self.others)
 

@@ -9,6 +9,10 @@ are hazard-free.
 The same seed gives the same bytes, whatever the number of jobs. --video adds what the camera sees,
 ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same.
 
+--sounds adds what is no vehicle at a drawn place, in every recording: people, bells, tools, music, birds,
+rain that may soil the lens, gusts. Sirens, horns and beepers are the vehicle's where there is one, and come
+from another street where there is none.
+
 --scene hides the vehicle in the open instead, behind a van ahead, a bridge pier at a ramp, or a barrier that
 ends at a merge; there the ego stands and every approach is from the left.
 """
@@ -27,7 +31,11 @@ if TYPE_CHECKING:
 
 # Named here again: the help is built without importing the simulation. A test compares them.
 SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
-KINDS = ("light", "medium", "heavy", "electric", "bicycle", "tram")
+KINDS = ("light", "medium", "heavy", "electric", "bicycle", "scooter", "tram")
+SOUNDS = (
+    *("voice", "steps", "bell", "saw", "drill", "music", "birds", "siren", "wail", "horn", "beeper"),
+    *("bicycle-bell", "rain", "gusts"),
+)
 PRESETS = ("street-5", "street-5-calm")
 
 EXAMPLE = """\
@@ -46,6 +54,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_choice(parser, "--scene", "what hides the vehicle", *SCENES)
     add_choice(parser, "--kind", "vehicle", *KINDS)
     add_choice(parser, "--preset", "how busy the street is", *PRESETS)
+    told = f"what else sounds, separated by commas: {', '.join(SOUNDS)}"
+    add("--sounds", type=_words, default=(), metavar="KINDS", help=told)
     add_array_options(parser, "OVAD's")
     add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -71,7 +81,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "out": str(arguments.out),
         "recordings": len(rows),
         "approaches": sum(row.approach != "none" for row in rows),
-        **{name: getattr(arguments, name) for name in ("scene", "kind", "preset", "seed")},
+        **{name: getattr(arguments, name) for name in ("scene", "kind", "sounds", "preset", "seed")},
         "folders": [row.folder.as_posix() for row in rows],
     }
     return CommandResult(summary)
@@ -91,4 +101,9 @@ def _settings(arguments: argparse.Namespace) -> "DatasetSettings":
         video=arguments.video,
         video_width_px=arguments.video_width,
         preset=arguments.preset,
+        sounds=arguments.sounds,
     )
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(","))
