@@ -9,8 +9,8 @@ from .scene.junction import SITES as SITES
 from .scene.junction import Site as Site
 from .scene.junction import site as site
 from .scene.kinds import KINDS as KINDS
-from .scene.occlusions import OCCLUSIONS as OCCLUSIONS
-from .scene.occlusions import occluded_scene as occluded_scene
+from .scene.places import PLACES as PLACES
+from .scene.places import place as place
 from .scene.presets import DEFAULT_PRESET as DEFAULT_PRESET
 from .scene.presets import PRESETS as PRESETS
 from .scene.presets import Preset as Preset

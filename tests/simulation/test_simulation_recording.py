@@ -15,7 +15,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.simulation import (
     KINDS,
-    OCCLUSIONS,
+    PLACES,
     SITES,
     DatasetSettings,
     SimulationSettings,
@@ -295,7 +295,7 @@ def test_the_command_writes_and_reports(tmp_path, capsys):
 
 def test_the_command_offers_what_the_simulation_has():
     assert sorted(cli.KINDS) == sorted(KINDS)
-    assert sorted(cli.SCENES) == sorted(["junction", *OCCLUSIONS])
+    assert sorted(cli.SCENES) == sorted(["junction", *PLACES, "all"])
     assert list(cli.PRESETS) == list(PRESETS)
     assert cli.PRESETS[0] == DEFAULT_PRESET
 

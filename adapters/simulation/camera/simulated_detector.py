@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import LIGHT, VehicleKind
-from worldstate.adapters.simulation.scene.occluders import hidden_by
+from worldstate.adapters.simulation.scene.sight import in_view
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
 from worldstate.ground.typing import BoolArray, FloatArray
 
@@ -47,12 +47,8 @@ def visible_part(
 def line_of_sight(
     trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
 ) -> BoolArray:
-    """Tell when the camera sees the middle of the vehicle's front, shape (T,)."""
-    ahead, across = trajectory.behind(0.0)
-    eye = (ego_x_m + camera.position_m[0], camera.position_m[1])
-    right, left = site.sights_m(ahead, eye)
-    between = (across > right) & (across < left)
-    return np.asarray(between & ~hidden_by(site.occluders, ahead, across, eye))
+    """Tell when the middle of the vehicle's front is in the camera's view, shape (T,)."""
+    return in_view(site, camera, *trajectory.behind(0.0), ego_x_m)
 
 
 def detect(
@@ -64,7 +60,7 @@ def detect(
     frames: list[Frame] = []
     for x, low, high, sight in zip(trajectory.behind(0.0)[0], right, left, seen, strict=True):
         share = (high - low) / min(kind.length_m, LENGTH_M)
-        clear = share > LEAST_VISIBLE and (sight or not site.occluders)
+        clear = share > LEAST_VISIBLE and (sight or not site.is_open)
         box = _project(camera, x, low, high, kind) if clear else None
         missed = rng.random() < _miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)

@@ -29,7 +29,7 @@ from worldstate.adapters.files.atomic import deferred_signals, write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
 from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
-from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
+from worldstate.adapters.simulation.scene.places import PLACES, place
 from worldstate.adapters.simulation.scene.presets import preset
 from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -44,9 +44,9 @@ from .recording import SimulatedRecording, simulate_recording
 from .rendered_video import camera_frames, write_video
 
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
-# OVAD's location numbers 00 to 09, then the scenes in the open.
-PLACES = (*SITES, *MOVING_SITES, *(occluded_scene(name).site.name for name in OCCLUSIONS))
-UNKNOWN_PLACE = 99
+# OVAD's location numbers 00 to 09, then the other places.
+LOCATIONS = (*SITES, *MOVING_SITES, *(place(name).site.name for name in PLACES))
+UNKNOWN_LOCATION = 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +233,7 @@ def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, p
 
 
 def _log_row(environment: str, approach: str, number: int, t0_frame: int) -> LogRow:
-    location = PLACES.index(environment) if environment in PLACES else UNKNOWN_PLACE
+    location = LOCATIONS.index(environment) if environment in LOCATIONS else UNKNOWN_LOCATION
     identity = f"{APPROACHES.index(approach) + 1}_{location:02d}_{number:04d}"
     return LogRow(identity, environment, approach, t0_frame)
 

@@ -114,7 +114,7 @@ def simulate_recording(
     return SimulatedRecording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
-        t0_frame=_t0_frame(len(frames), sights),
+        t0_frame=_t0_frame(len(frames), sights if settings.approach != "none" else []),
         detections=_through_rain(
             _detections(settings, seen, len(frames), camera, to_camera), settings, to_camera
         ),

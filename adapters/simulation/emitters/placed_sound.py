@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.scene.occluders import OccludingBody
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, split_octaves
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.sound_kinds import SoundKind, sound_kind
@@ -34,7 +33,6 @@ SILENT_BLOCKS = 8
 GROUND_GAIN = np.sqrt(2.0)
 # What stands in neither street is heard over the roofs: two storeys high, as near to the array as this.
 ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
-NOWHERE = OccludingBody(((-9000.0, 0.0), (-9000.0, 1.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +114,8 @@ def _add_from(
     add_sources(static, [_source(towards, track, kind, rate)], around)
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN
     add_scattered(static, _source(mean, track, kind, rate), around)
+    if site.is_open:
+        return  # nothing stands there that could send late sound
     fed = mean * late_gain(site, preset, track.x_m, track.y_m, track.time_s, receiver)
     dry = _until_the_end(fed, track.time_s[0], receiver)
     add_late_field(
@@ -147,7 +147,7 @@ def mean_gain(kind: SoundKind) -> FloatArray:
 def in_the_streets(site: Site, track: SoundTrack) -> BoolArray:
     """Tell when a sound stands in the ego's or in the crossing street, or in the open, shape (T,)."""
     x, y = track.x_m, track.y_m
-    if site.occluders:
+    if site.is_open:
         return np.ones(len(x), np.bool_)
     own = (x <= site.corner_ahead_m) & (y <= site.side_wall_left_m) & (y >= -site.side_wall_right_m)
     end = site.corner_ahead_m + site.street_width_m if site.opposite_wall_m is None else site.opposite_wall_m
@@ -168,7 +168,7 @@ def over_roofs(track: SoundTrack, height_m: float, receiver: Receiver, cap_db: f
 
 def in_the_open(site: Site) -> Site:
     """Return a site of the same name without streets."""
-    return replace(site, opposite_wall_m=None, occluders=(NOWHERE,))
+    return replace(site, opposite_wall_m=None, in_the_open=True)
 
 
 def _gained(signal: Float32Array, gain: FloatArray, rate_hz: float) -> Float32Array:

@@ -1,6 +1,6 @@
 """What is simulated: a site, an approach, and how the vehicles drive."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from .ego_motion import EgoMotion
 from .junction import MOVING_SITES, Site, site
 from .kinds import vehicle_kind
-from .occlusions import scene_of
+from .places import Way, place_of
 from .presets import Preset, preset
 from .sound_kinds import SIGNALS
 from .sound_settings import SoundSettings
@@ -119,7 +119,7 @@ class SimulationSettings:
     kind, manoeuvre, route_m, signal
         Of the vehicle: see `VehicleSettings`.
     others : tuple of VehicleSettings
-        More vehicles, at most 8; none where `approach` is "none".
+        More vehicles, at most 8; with `approach` "none" all there are, none of them a hidden hazard.
     ego : EgoMotion
         How the ego moves; it stands if not given.
     sounds : tuple of SoundSettings
@@ -160,8 +160,7 @@ class SimulationSettings:
         in_range("speed_mps", self.speed_mps, 1.0, 30.0)
         in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
         in_range("sample_rate_hz", self.sample_rate_hz, 8_000.0, 96_000.0)
-        most = 0 if self.approach == "none" else MAX_OTHERS
-        in_range("others: number of vehicles", len(self.others), 0, most)
+        in_range("others: number of vehicles", len(self.others), 0, MAX_OTHERS)
         in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
         self.traffic  # noqa: B018  (building the first vehicle checks what is left)
 
@@ -169,7 +168,7 @@ class SimulationSettings:
     def traffic(self) -> tuple[VehicleSettings, ...]:
         """All vehicles, the one that `approach` names first."""
         if self.approach == "none":
-            return ()
+            return self.others
         first = VehicleSettings(
             self.approach,
             self.entry_s,
@@ -193,8 +192,9 @@ def draw_settings(
     Parameters
     ----------
     site_name : str
-        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h, or of a
-        scene in the open, where the vehicle takes the scene's route.
+        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h, or of
+        one of `PLACES`, where a vehicle takes one of the place's ways; half of the hazard-free recordings
+        there have one that is in plain view, or never in view.
     approach : str
         "left", "right" or "none".
     rng : numpy.random.Generator
@@ -212,7 +212,7 @@ def draw_settings(
     Raises
     ------
     InvalidArgumentError
-        For an unknown name, or a scene that has no such approach.
+        For an unknown name, or a place that has no such approach.
 
     Examples
     --------
@@ -220,23 +220,34 @@ def draw_settings(
     'SB1'
     """
     in_range("duration_s", duration_s, 0.5, 60.0)
-    scene = scene_of(site_name)
-    if scene is not None:
-        _one_of("approach", approach, (scene.approach, "none"))
+    known = place_of(site_name)
+    if known is not None:
+        _one_of("approach", approach, (*known.approaches, "none"))
     brakes = rng.random() < BRAKING_SHARE
-    place = site(site_name) if scene is None else scene.site
-    return SimulationSettings(
-        site=place,
+    plan = site(site_name) if known is None else known.site
+    drawn = SimulationSettings(
+        site=plan,
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
-        speed_mps=rng.uniform(*(SPEEDS_MPS if place.opposite_wall_m is None else WALLED_SPEEDS_MPS)),
+        speed_mps=rng.uniform(*(SPEEDS_MPS if plan.opposite_wall_m is None else WALLED_SPEEDS_MPS)),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
-        parked_car=bool(rng.random() < 0.3) and scene is None,
+        parked_car=bool(rng.random() < 0.3) and known is None,
         kind=kind,
-        route_m=() if scene is None else scene.route_m,
         ego=_draw_ego(rng, duration_s) if site_name in MOVING_SITES else EgoMotion(),
     )
+    way = None if known is None else known.drawn_way(approach, rng)
+    return drawn if way is None else _on_way(drawn, way)
+
+
+def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
+    """Return a recording of a vehicle that takes a way: the one of the approach, or one that is no hazard."""
+    if way.approach != "none":
+        return replace(settings, route_m=way.route_m)
+    plain = VehicleSettings(
+        "left", settings.entry_s, settings.speed_mps, 0.0, settings.kind, route_m=way.route_m
+    )
+    return replace(settings, others=(plain,))
 
 
 def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:

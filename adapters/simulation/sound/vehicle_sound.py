@@ -38,6 +38,8 @@ def add_vehicle(
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
     add_scattered(static, _moving(path, whole, middle, SOURCE_HEIGHT_M, rate), around)
+    if site.is_open:
+        return  # nothing stands there that could send late sound
     dry = whole * late_gain(site, preset, *path.behind(0.0), path.time_s, receiver)
     heard = dry[: round((receiver.knots_s[0] - path.time_s[0]) * rate) + receiver.samples]
     field = street_field(site, preset.late_lobe_share)

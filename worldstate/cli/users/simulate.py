@@ -13,8 +13,9 @@ ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound
 rain that may soil the lens, gusts. Sirens, horns and beepers are the vehicle's where there is one, and come
 from another street where there is none.
 
---scene hides the vehicle in the open instead, behind a van ahead, a bridge pier at a ramp, or a barrier that
-ends at a merge; there the ego stands and every approach is from the left.
+--scene is another place, where the ego stands: a van ahead, piers at a ramp, a wall that ends at a merge, an
+open road, a wide crossing, a house on one side only, a parked van; "all" is every place and junction in turn.
+Half of their hazard-free recordings have a vehicle in plain view, or one that is never in view.
 """
 
 import argparse
@@ -30,7 +31,10 @@ if TYPE_CHECKING:
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
 
 # Named here again: the help is built without importing the simulation. A test compares them.
-SCENES = ("junction", "lead-vehicle", "bridge-pier", "merge")
+SCENES = (
+    "junction", "lead-vehicle", "bridge-pier", "merge", "open-road", "wide-crossing", "one-corner",
+    "parked-van", "all",
+)  # fmt: skip
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "scooter", "tram")
 SOUNDS = (
     *("voice", "steps", "bell", "saw", "drill", "music", "birds", "siren", "wail", "horn", "beeper"),
