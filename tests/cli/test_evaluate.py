@@ -7,9 +7,6 @@ import pytest
 
 from worldstate.cli.main import main
 
-# The minute of the fixture is paid once: all of its tests run in one process.
-pytestmark = pytest.mark.xdist_group("evaluation")
-
 TABLE_ONE = (
     "Vision-only",
     "Radar field-of-view model",
