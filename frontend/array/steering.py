@@ -118,7 +118,7 @@ class Steering:
 
 
 # Every stream of an array needs the same two sets of beams, and they are nine tenths of the 50 ms that a
-# front-end for 56 microphones takes to make. Few are kept: a set for 1024 microphones holds 30 MB.
+# front-end for 56 microphones takes to make. Few are kept: a set for 1024 microphones holds 15 MB.
 @lru_cache(maxsize=4)
 def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: bytes, speed: float) -> Steering:
     """Build the beams of `Steering.towards` from the bytes of its arguments, which can be compared."""
