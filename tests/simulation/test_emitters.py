@@ -1,5 +1,7 @@
 """Synthesised sounds: their level, their spectra, their rhythm, at any sample rate."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from scipy.signal import bilinear_zpk, find_peaks, sosfilt, stft, zpk2sos
 from worldstate.adapters.simulation.emitters.emitter import SYNTHESES, emitted
 from worldstate.adapters.simulation.emitters.tools import saw, saw_motion
 from worldstate.adapters.simulation.scene.octave_bands import split_octaves
-from worldstate.adapters.simulation.scene.sound_kinds import SOUNDS
+from worldstate.adapters.simulation.scene.sound_kinds import MICROPHONES, SOUNDS
 
 FS = 32_000.0
 SECONDS = 10
@@ -174,3 +176,15 @@ def test_an_unknown_sound_is_refused_by_name():
 
     with pytest.raises(InvalidArgumentError, match="vuvuzela"):
         sound_kind("vuvuzela")
+
+
+def test_the_documentation_lists_every_sound_with_its_level():
+    text = (Path(__file__).parents[2] / "docs/simulation.md").read_text()
+    rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
+    for kind in SOUNDS.values():
+        cells = [cell.strip() for cell in rows[kind.name].strip("|").split("|")]
+        assert cells[1] == kind.label
+        assert float(cells[2].split()[0]) == kind.level_db
+        if kind.origin != MICROPHONES:
+            assert cells[3].startswith(f"{kind.back_db[4]:g} / {kind.back_db[6]:g}")
+            assert cells[4] == f"{kind.height_m:g} m"

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.ground.typing import Float32Array, FloatArray
 
-from .kinds import LIGHT, TYRE_M, VehicleKind
+from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
 from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 from .route import Route
 
@@ -18,6 +18,7 @@ SOURCE_HEIGHT_M = 0.3
 REFERENCE_KMH = 70.0
 # Sound power to pressure at 1 m over hard ground: -11 dB of a free sphere, +3 dB of the ground's half-space.
 POWER_TO_1M_DB = -8.0
+FADE_KMH = 5.0  # a warning sound that ends at some speed is gone so much above it
 SLOWEST_KMH = 10.0  # the law is fitted above 20; a log of zero speed would be silence
 HARMONIC_SHARE = 0.5  # of the propulsion power; the rest is broadband
 HARMONICS = 24
@@ -125,8 +126,10 @@ def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatA
 
 def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
     """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T)."""
-    relative = 3.6 * speed_mps / REFERENCE_KMH - 1.0
-    return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative
+    speed_kmh = 3.6 * speed_mps
+    fade_db = SILENT_DB * np.clip((speed_kmh - kind.propulsion_until_kmh) / FADE_KMH, 0.0, 1.0)
+    relative = speed_kmh / REFERENCE_KMH - 1.0
+    return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative + fade_db
 
 
 def _octaves(levels_db: ArrayLike) -> FloatArray:
