@@ -39,7 +39,7 @@ SEEDS = (1, 2, 3)
 EXAMPLE = """\
 examples:
   worldstate realism extracted_features.csv --jobs 2 --out realism
-  worldstate realism extracted_features.csv --sites SA1 SB1 SB2 --simulated realism/windows-*.csv
+  worldstate realism extracted_features.csv --sites SA1 SB1 SB2 --measures-only --real-only
   worldstate realism extracted_features.csv --group dynamic --json"""
 
 
@@ -52,6 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--preset", metavar="NAME", help="levels of the simulation (default: the newest)")
     add("--simulated", type=Path, nargs="+", metavar="CSV", help="simulated windows, instead of simulating")
     add("--permuted", type=Path, nargs="+", metavar="CSV", help="the same windows, positions permuted")
+    add("--measures-only", action="store_true", help="no classifier: what streets are tuned on (a second)")
     add("--real-only", action="store_true", help="real against real alone")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--out", type=Path, metavar="DIR", help="write realism.json, realism.png and windows")
@@ -71,7 +72,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     pairs = _simulated(arguments, real)
     simulated = {name: right for name, (right, _) in pairs.items()}
     permuted = {name: wrong for name, (_, wrong) in pairs.items() if wrong is not None}
-    found = measure_realism(real, simulated, np.random.default_rng(SEEDS[0]), permuted=permuted)
+    found = measure_realism(
+        real,
+        simulated,
+        np.random.default_rng(SEEDS[0]),
+        permuted=permuted,
+        classifiers=not arguments.measures_only,
+    )
     report: dict[str, object] = {"group": arguments.group, **found.to_dict()}
     if arguments.out is not None:
         write_report(arguments.out / "realism.json", report)

@@ -46,6 +46,7 @@ def measure_realism(
     rng: np.random.Generator,
     *,
     permuted: Mapping[str, FeatureTable] | None = None,
+    classifiers: bool = True,
     draws: int = DRAWS,
 ) -> Realism:
     """Hold sets of simulated windows against real ones, and real junctions against one another.
@@ -60,6 +61,9 @@ def measure_realism(
         Folds and bootstrap.
     permuted : mapping of str to FeatureTable, optional
         The same simulated windows, row by row, with the microphones' positions permuted.
+    classifiers : bool
+        False leaves out whatever a classifier is trained for (C2ST, transfer, side, positions): streets are
+        tuned on single measures alone.
     draws : int
         Bootstrap samples of recordings for the intervals of the transfers.
 
@@ -94,20 +98,17 @@ def measure_realism(
     # The figures of real against real are the same beside any simulation.
     of_real, of_simulated = rng.spawn(2)
     transfers = {}
-    for name, table in simulated.items():
+    for name, table in simulated.items() if classifiers else ():
         transfers[f"{name} -> real"] = published_transfer(table, real, of_simulated, draws)
         transfers[f"real -> {name}"] = published_transfer(real, table, of_simulated, draws)
-    lost = {
-        name: position_figures(real, simulated[name], table, of_simulated)
-        for name, table in (permuted or {}).items()
-    }
-    rows = [
-        *pair_rows(real, simulated, transfers, groupings, (of_real, of_simulated)),
-        *median_figures(real, simulated),
-        *set_rows(real, simulated, groupings[0]),
-        *side_rows(real, simulated),
-        *position_rows(lost),
-    ]
+    rows = pair_rows(real, simulated, transfers, groupings, (of_real, of_simulated) if classifiers else None)
+    rows += [*median_figures(real, simulated), *set_rows(real, simulated, groupings[0])]
+    if classifiers:
+        lost = {
+            name: position_figures(real, simulated[name], table, of_simulated)
+            for name, table in (permuted or {}).items()
+        }
+        rows += [*side_rows(real, simulated), *position_rows(lost)]
     moving = any(name.startswith("D") for name in sites)
     asked = [asked_of(row.figure, row.windows, row.real, moving=moving) for row in rows]
     profiles = {

@@ -55,20 +55,25 @@ def pair_rows(
     simulated: Mapping[str, FeatureTable],
     transfers: Mapping[str, Transfer],
     groupings: tuple[Sequence[Grouping], Sequence[Grouping]],
-    rngs: tuple[np.random.Generator, np.random.Generator],
+    rngs: tuple[np.random.Generator, np.random.Generator] | None,
 ) -> list[RealismRow]:
-    """Return what tells two sets apart, what a classifier of one makes of the other, and agreeing medians."""
-    by_halves, by_junction = (_spans(_real_pairs(real, some, rngs[0])) for some in groupings)
+    """Return what tells two sets apart, what a classifier of one makes of the other, and agreeing medians.
+
+    Without generators no classifier is trained; the single measures are left.
+    """
+    of_real, of_simulated = rngs or (None, None)
+    by_halves, by_junction = (_spans(_real_pairs(real, some, of_real)) for some in groupings)
     ours = {}
     for name, table in simulated.items():
-        ours[name] = distance_figures(real, table, rngs[1]) | agreeing_medians(real, table)
-        ours[name] |= _transfer_figures(transfers[f"real -> {name}"], ", real to simulated")
-        ours[name] |= _transfer_figures(transfers[f"{name} -> real"], ", simulated to real")
-    keys = dict.fromkeys(key for figures in ours.values() for key in figures) if ours else by_halves
+        ours[name] = distance_figures(real, table, of_simulated) | agreeing_medians(real, table)
+        ways = {f"real -> {name}": ", real to simulated", f"{name} -> real": ", simulated to real"}
+        for which, way in ways.items() if transfers else ():
+            ours[name] |= _transfer_figures(transfers[which], way)
+    keys = dict.fromkeys(key for figures in (ours or {"": by_halves}).values() for key in figures)
     rows = []
     for figure, windows in keys:
-        of_real = figure.partition(",")[0], windows
-        between, within = by_halves.get(of_real), by_junction.get(of_real)
+        undirected = figure.partition(",")[0], windows
+        between, within = by_halves.get(undirected), by_junction.get(undirected)
         # A single measure may be as far off as between any two real junctions; the rest as between groupings.
         spans = [span for span in (between, within if figure.startswith("AUROC of") else None) if span]
         key = figure, windows
@@ -78,14 +83,14 @@ def pair_rows(
 
 
 def _real_pairs(
-    real: FeatureTable, groupings: Iterable[Grouping], rng: np.random.Generator
+    real: FeatureTable, groupings: Iterable[Grouping], rng: np.random.Generator | None
 ) -> Iterator[dict[FigureKey, float]]:
     for grouping in groupings:
         one, other = grouping.tables(real)
         yield distance_figures(one, other, rng)
         for train, test in ((one, other), (other, one)):
             yield agreeing_medians(train, test)
-            if all(table.hazards.any() and table.hazard_free.any() for table in (train, test)):
+            if rng and all(table.hazards.any() and table.hazard_free.any() for table in (train, test)):
                 yield _transfer_figures(published_transfer(train, test, rng))
 
 
