@@ -41,9 +41,9 @@ from worldstate.ground.typing import ImageArray
 
 from .plan import DatasetSettings, Plan
 from .recording import SimulatedRecording, simulate_recording
+from .recording_folder import put_in_place, refuse_foreign, sound_format
 from .rendered_video import camera_frames, write_video
 
-WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
 # OVAD's location numbers 00 to 09, then the other places.
 LOCATIONS = (*SITES, *MOVING_SITES, *(place(name).site.name for name in PLACES))
 UNKNOWN_LOCATION = 99
@@ -129,7 +129,7 @@ def write_dataset(
     if (folder / ARRAY_NAME).exists():
         _name_array(folder / ARRAY_NAME, listening)
     for plan in plans:
-        _refuse_foreign(folder / _log_row(plan.environment, plan.approach, plan.number, 0).folder)
+        refuse_foreign(folder / _log_row(plan.environment, plan.approach, plan.number, 0).folder)
     rows = []
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as unlisted:
         simulate = partial(_simulate_one, Path(unlisted), wanted, listening)
@@ -140,7 +140,7 @@ def write_dataset(
                 _name_array(folder / ARRAY_NAME, listening)
                 with deferred_signals():
                     try:
-                        _replace(folder / row.folder, Path(unlisted) / row.folder)
+                        put_in_place(folder / row.folder, Path(unlisted) / row.folder)
                     finally:
                         write_log(folder, [one for one in listed.values() if (folder / one.folder).is_dir()])
                 if progress is not None:
@@ -193,7 +193,7 @@ def write_recording(
     settings = recording.truth["settings"]
     row = _log_row(settings["site"]["name"], settings["approach"], number, recording.t0_frame)
     target = Path(root) / row.folder
-    _refuse_foreign(target)
+    refuse_foreign(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     _name_array(Path(root) / ARRAY_NAME, recording.array)
     with TemporaryDirectory(prefix=".simulated-", dir=target.parent) as folder:
@@ -205,7 +205,7 @@ def write_recording(
         _write_json(temporary / TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
-        _replace(target, temporary)
+        put_in_place(target, temporary)
     return row
 
 
@@ -256,22 +256,9 @@ def _listed(root: Path) -> dict[Path, LogRow]:
     return {row.folder: row for row in rows}
 
 
-def _refuse_foreign(target: Path) -> None:
-    if target.exists() and not (target / TRUTH_NAME).is_file():
-        raise InputFileError(target, "expected a free name or a simulated recording, found something else")
-
-
-def _replace(target: Path, finished: Path) -> None:
-    """Put a finished recording in the place of an old one, which goes with the folder of the new one."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if target.exists():
-        target.replace(finished.with_suffix(".old"))
-    finished.replace(target)
-
-
 def _write_audio(path: Path, recording: SimulatedRecording) -> None:
     samples, channels = recording.audio.shape
-    kind = "RF64" if 3 * samples * channels > WAV_LIMIT_BYTES else "WAV"
+    kind = sound_format(samples, channels)
     rate = round(recording.sample_rate_hz)
     try:
         soundfile.write(path, recording.audio, rate, subtype="PCM_24", format=kind)

@@ -25,6 +25,18 @@ BRAKING_SHARE, BRAKING_MPS2 = 0.85, (1.0, 3.5)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
 
 
+def rate_for(bandwidth_hz: float) -> float:
+    """Return the sample rate that sound of a bandwidth is rendered at, about three times it.
+
+    Examples
+    --------
+    >>> rate_for(2000.0), rate_for(16_000.0)
+    (5999.75, 47998.0)
+    """
+    # A whole part of the full rate, so that the bins of an STFT fall where those of the full rate do.
+    return SAMPLE_RATE_HZ / max(round(SAMPLE_RATE_HZ / (3.0 * bandwidth_hz)), 1)
+
+
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
     """One vehicle.

@@ -16,6 +16,11 @@ from another street where there is none.
 --scene is another place, where the ego stands: a van ahead, piers at a ramp, a wall that ends at a merge, an
 open road, a wide crossing, a house on one side only, a parked van; "all" is every place and junction in turn.
 Half of their hazard-free recordings have a vehicle in plain view, or one that is never in view.
+
+--minutes M simulates one continuous stream at --site instead, with traffic as arrivals: D/<name>/ with the
+sound, array.xml, camera results, truth.json, events.json (an entry a vehicle), vehicles.csv (a row a vehicle
+and tenth of a second: position, speed, in view, time to visible, level at the array) and stream.png.
+--traffic no-hazard is busy, but nothing comes out of a hidden arm: whatever warns there is wrong.
 """
 
 import argparse
@@ -26,9 +31,11 @@ from worldstate.cli.common.array_options import add_array_options, given_array
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
+from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from worldstate.adapters.simulation.dataset.plan import DatasetSettings
+    from worldstate.adapters.simulation.stream.settings import StreamSettings
 
 # Named here again: the help is built without importing the simulation. A test compares them.
 SCENES = (
@@ -41,11 +48,15 @@ SOUNDS = (
     *("bicycle-bell", "rain", "gusts"),
 )
 PRESETS = ("street-5", "street-5-calm")
+STREAM_SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")
+TRAFFICS = ("calm", "busy", "no-hazard", "empty")
+FIGURE_NAME = "stream.png"
 
 EXAMPLE = """\
 examples:
   worldstate simulate --out sim --static 4 --seed 1
   worldstate simulate --out sim --dynamic 10 --kind electric --jobs 2
+  worldstate simulate --out hours --minutes 60 --site SA1 --traffic busy --bandwidth 2000 --jobs 2
   worldstate run sim/SA1/left/1_00_0000"""
 
 
@@ -66,10 +77,24 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--duration", type=float, default=10.0, help="seconds each (default: %(default)g)")
     add("--video", action="store_true", help="render the camera's video, too")
     add("--video-width", type=int, default=1936, metavar="PX", help="of its images (default: 1936)")
+    _add_stream_options(parser)
+
+
+def _add_stream_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("a continuous stream").add_argument
+    add("--minutes", type=float, metavar="M", help="its length")
+    # Any word is taken: the library refuses a moving ego with its reason.
+    add("--site", default=STREAM_SITES[0], help=f"{', '.join(STREAM_SITES)} (default: {STREAM_SITES[0]})")
+    add("--traffic", choices=TRAFFICS, default=TRAFFICS[0], help=f"how much drives (default: {TRAFFICS[0]})")
+    add("--bandwidth", type=float, metavar="HZ", help="render up to here only, at about three times it")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
+    if arguments.minutes is not None:
+        return _run_stream(arguments)
+    if arguments.bandwidth is not None:
+        raise InvalidArgumentError("--bandwidth: expected with --minutes only; recordings have the full rate")
     from worldstate.adapters.simulation.dataset.dataset import write_dataset
 
     settings = _settings(arguments)
@@ -89,6 +114,55 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "folders": [row.folder.as_posix() for row in rows],
     }
     return CommandResult(summary)
+
+
+def _run_stream(arguments: argparse.Namespace) -> CommandResult:
+    from worldstate.adapters.simulation.stream.writing import write_stream
+    from worldstate.operations.recordings.stream_figure import write_stream_figure
+
+    if arguments.static or arguments.dynamic or arguments.video or arguments.scene != SCENES[0]:
+        raise InvalidArgumentError("--minutes: expected without --static, --dynamic, --video and --scene")
+    settings = _stream_settings(arguments)
+    with progress_bar("simulating", settings.duration_s) as bar:
+        stream = write_stream(
+            arguments.out,
+            settings,
+            array=given_array(arguments),
+            jobs=arguments.jobs,
+            progress=bar.advance,
+        )
+    write_stream_figure(stream, stream.folder / FIGURE_NAME)
+    summary = {
+        "out": str(stream.folder),
+        "minutes": settings.minutes,
+        "vehicles": len(stream.vehicles),
+        "hazards": sum(one.hazard for one in stream.vehicles),
+        "site": settings.site.name,
+        "sample_rate_hz": settings.sample_rate_hz,
+        **{name: getattr(arguments, name) for name in ("traffic", "preset", "seed")},
+    }
+    return CommandResult(summary, lines=["", f"see {stream.folder / FIGURE_NAME}"])
+
+
+def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
+    from worldstate.adapters.simulation.scene.junction import site
+    from worldstate.adapters.simulation.scene.presets import preset
+    from worldstate.adapters.simulation.scene.settings import SAMPLE_RATE_HZ, rate_for
+    from worldstate.adapters.simulation.stream.settings import StreamSettings
+    from worldstate.adapters.simulation.stream.traffic import traffic_named
+    from worldstate.ground.checks import in_range
+
+    band = arguments.bandwidth
+    return StreamSettings(
+        site=site(arguments.site),
+        minutes=arguments.minutes,
+        seed=arguments.seed,
+        traffic=traffic_named(arguments.traffic),
+        preset=preset(arguments.preset),
+        sample_rate_hz=SAMPLE_RATE_HZ
+        if band is None
+        else rate_for(in_range("--bandwidth", band, 700.0, 32e3)),
+    )
 
 
 def _settings(arguments: argparse.Namespace) -> "DatasetSettings":

@@ -1,0 +1,84 @@
+"""When the camera sees the vehicles of a stream, and what its detector makes of them."""
+
+import numpy as np
+
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.simulation.camera.simulated_detector import (
+    Frame,
+    SimulatedDetection,
+    detect,
+    line_of_sight,
+    park,
+)
+from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.vehicle import Trajectory
+from worldstate.ground.typing import BoolArray
+
+from .arrivals import VehicleEvent
+from .settings import StreamSettings
+
+CLOCK_S = 0.01  # resolution of the first line of sight
+PARKED_SHARE = 0.3  # of the streams have a car at the far kerb, as recordings do
+# A box is reported once the vehicle is this far ahead: nearer, it fills the image from edge to edge.
+NEAREST_BOX_M = 3.0
+# Boxes that are nothing, one to three images long; most scores lie below what the readers of a detector keep
+# (.75). The rate is an assumption: a good detector in daylight, about one such box a minute.
+CLUTTER_PER_HOUR, CLUTTER_IMAGES, CLUTTER_SCORE = 60.0, (1, 3), (0.3, 0.9)
+CLUTTER_WIDTH_PX, CLUTTER_SHAPE = (60.0, 400.0), (0.4, 1.0)
+
+
+def in_view(path: Trajectory, site: Site) -> BoolArray:
+    """Tell when the camera sees the middle of a vehicle's front, wherever it is, shape (T,)."""
+    camera = PinholeCamera()
+    ahead, across = path.behind(0.0)
+    eye_x, eye_y, _ = camera.position_m
+    azimuth = np.abs(np.arctan2(across - eye_y, ahead - eye_x))
+    between = (across < site.side_wall_left_m) & (across > -site.side_wall_right_m)
+    # Beyond the mouth the corners decide, as in a recording; in the ego's own street the image's edges do.
+    own = between & (azimuth < camera.half_angle_rad)
+    return np.where(ahead < site.corner_ahead_m, own, line_of_sight(path, site, camera))
+
+
+def visible_s(event: VehicleEvent, site: Site) -> float | None:
+    """Time of the stream at which a vehicle first comes into view; None where it never does."""
+    clock = np.arange(0.0, event.manoeuvre.motion.duration_s, CLOCK_S)
+    seen = in_view(event.manoeuvre.motion.trajectory(clock), site)
+    return round(event.start_s + float(clock[seen.argmax()]), 6) if seen.any() else None
+
+
+def camera_frames(
+    settings: StreamSettings, events: list[VehicleEvent], rng: np.random.Generator
+) -> list[Frame]:
+    """Boxes of a whole stream: vehicles with misses, a parked car in some streets, and clutter."""
+    camera, to_park, to_clutter, to_vehicles = PinholeCamera(), *rng.spawn(3)
+    count = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
+    frames: list[Frame] = [()] * count
+    if to_park.random() < PARKED_SHARE:
+        frames = park(settings.site, camera, count, to_park)
+    for event, draws in zip(events, to_vehicles.spawn(len(events)), strict=True):
+        numbers = np.arange(
+            max(int(np.ceil(event.start_s * FRAME_RATE_HZ)), 0),
+            min(int(np.ceil(event.end_s * FRAME_RATE_HZ)), count),
+        )
+        path = event.manoeuvre.motion.trajectory(numbers / FRAME_RATE_HZ - event.start_s)
+        # What is beside or behind the camera has no picture in it.
+        ahead = path.behind(0.0)[0] > NEAREST_BOX_M
+        boxes = detect(path.at(path.time_s[ahead]), settings.site, camera, draws)
+        for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
+            frames[number] += seen
+    return _with_clutter(frames, camera, to_clutter)
+
+
+def _with_clutter(frames: list[Frame], camera: PinholeCamera, rng: np.random.Generator) -> list[Frame]:
+    for _ in range(rng.poisson(CLUTTER_PER_HOUR * len(frames) / FRAME_RATE_HZ / 3600.0)):
+        first = int(rng.integers(len(frames)))
+        width = rng.uniform(*CLUTTER_WIDTH_PX)
+        height = width * rng.uniform(*CLUTTER_SHAPE)
+        left = rng.uniform(0.0, camera.width_px - width)
+        top = rng.uniform(0.3, 0.7) * (camera.height_px - height)
+        left, top, right, bottom = (round(float(v), 1) for v in (left, top, left + width, top + height))
+        score = round(float(rng.uniform(*CLUTTER_SCORE)), 4)
+        for number in range(first, min(first + int(rng.integers(*CLUTTER_IMAGES) + 1), len(frames))):
+            frames[number] += (SimulatedDetection((left, top, right, bottom), score),)
+    return frames
