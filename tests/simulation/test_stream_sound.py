@@ -182,7 +182,8 @@ def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
         assert main(["simulate", "--out", str(tmp_path), *words.split()]) == 2
         assert problem in capsys.readouterr().err
     (tmp_path / "SB1-empty-1").mkdir()
-    assert main(["simulate", "--out", str(tmp_path), *"--minutes 1 --site SB1 --traffic empty".split()]) == 1
+    words = ["--minutes", "1", "--site", "SB1", "--traffic", "empty"]
+    assert main(["simulate", "--out", str(tmp_path), *words]) == 2
     assert "something else" in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.simulation import preset, site
 from worldstate.adapters.simulation.scene.kinds import LIGHT, vehicle_kind
-from worldstate.adapters.simulation.scene.occlusions import occluded_scene
+from worldstate.adapters.simulation.scene.places import place
 from worldstate.adapters.simulation.scene.route import along
 from worldstate.adapters.simulation.stream.arrivals import VehicleEvent, draw_events
 from worldstate.adapters.simulation.stream.manoeuvres import Driver, emerges
@@ -31,8 +31,8 @@ from worldstate.ground.errors import InvalidArgumentError
 NEVER_SEEN = {"turns_away", "parks", "far"}
 
 
-def events_of(name: str, place: str, seed: int, duration_s: float = 3600.0) -> list[VehicleEvent]:
-    return draw_events(site(place), traffic_named(name), preset(), duration_s, np.random.default_rng(seed))
+def events_of(name: str, where: str, seed: int, duration_s: float = 3600.0) -> list[VehicleEvent]:
+    return draw_events(site(where), traffic_named(name), preset(), duration_s, np.random.default_rng(seed))
 
 
 def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
@@ -50,10 +50,10 @@ def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
         assert chi2.ppf(1e-4, seeds) < dispersion < chi2.ppf(1.0 - 1e-4, seeds), flow
 
 
-@pytest.mark.parametrize("place", ["SA1", "SB1"])
-def test_a_busy_hour_holds_every_event_and_only_hazards_come_out_of_an_arm(place: str) -> None:
-    settings = StreamSettings(site(place), 60.0, traffic=traffic_named("busy"))
-    events = events_of("busy", place, seed=1)
+@pytest.mark.parametrize("name", ["SA1", "SB1"])
+def test_a_busy_hour_holds_every_event_and_only_hazards_come_out_of_an_arm(name: str) -> None:
+    settings = StreamSettings(site(name), 60.0, traffic=traffic_named("busy"))
+    events = events_of("busy", name, seed=1)
     vehicles = [vehicle_truth(number, event, settings) for number, event in enumerate(events)]
     told = describe_events(vehicles)
     assert {one["flow"] for one in told} == {*FLOWS, "follows"}
@@ -95,15 +95,15 @@ def test_no_hazard_traffic_has_no_hazards_and_the_other_flows_do_not_change() ->
 
 @given(
     arm=st.sampled_from(["left", "right"]),
-    place=st.sampled_from(["SA1", "SA2", "SB1", "SB3"]),
+    where=st.sampled_from(["SA1", "SA2", "SB1", "SB3"]),
     speed=st.floats(3.0, 15.0),
     kind=st.sampled_from(["light", "heavy", "bicycle"]),
     start_s=st.floats(-5.0, 50.0),
 )
 def test_at_constant_speed_the_time_to_visible_is_the_way_over_the_speed(
-    arm: str, place: str, speed: float, kind: str, start_s: float
+    arm: str, where: str, speed: float, kind: str, start_s: float
 ) -> None:
-    plan = site(place)
+    plan = site(where)
     driver = Driver(plan, vehicle_kind(kind), arm, speed, 0.0, 40.0)
     event = VehicleEvent(arm, emerges(driver, np.random.default_rng(0)), start_s)
     settings = StreamSettings(plan, 2.0)
@@ -168,7 +168,7 @@ def test_streams_refuse_what_they_cannot_be() -> None:
     with pytest.raises(InvalidArgumentError, match="no moving ego"):
         StreamSettings(site("DA1"), 1.0)
     with pytest.raises(InvalidArgumentError, match="junction"):
-        StreamSettings(occluded_scene("merge").site, 1.0)
+        StreamSettings(place("merge").site, 1.0)
     with pytest.raises(InvalidArgumentError, match="per_hour"):
         Traffic("test", {"up": 3.0})
     with pytest.raises(InvalidArgumentError, match="minutes"):

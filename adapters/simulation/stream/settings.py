@@ -63,7 +63,7 @@ class StreamSettings:
             raise InvalidArgumentError(
                 f"site: expected one where the ego stands, got {self.site.name}: streams have no moving ego"
             )
-        if self.site.occluders:
+        if self.site.is_open:
             raise InvalidArgumentError(
                 f"site: expected a junction, got {self.site.name}: no arms to come out of"
             )

@@ -12,8 +12,6 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
     park,
 )
 from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.scene.vehicle import Trajectory
-from worldstate.ground.typing import BoolArray
 
 from .arrivals import VehicleEvent
 from .settings import StreamSettings
@@ -28,22 +26,10 @@ CLUTTER_PER_HOUR, CLUTTER_IMAGES, CLUTTER_SCORE = 60.0, (1, 3), (0.3, 0.9)
 CLUTTER_WIDTH_PX, CLUTTER_SHAPE = (60.0, 400.0), (0.4, 1.0)
 
 
-def in_view(path: Trajectory, site: Site) -> BoolArray:
-    """Tell when the camera sees the middle of a vehicle's front, wherever it is, shape (T,)."""
-    camera = PinholeCamera()
-    ahead, across = path.behind(0.0)
-    eye_x, eye_y, _ = camera.position_m
-    azimuth = np.abs(np.arctan2(across - eye_y, ahead - eye_x))
-    between = (across < site.side_wall_left_m) & (across > -site.side_wall_right_m)
-    # Beyond the mouth the corners decide, as in a recording; in the ego's own street the image's edges do.
-    own = between & (azimuth < camera.half_angle_rad)
-    return np.where(ahead < site.corner_ahead_m, own, line_of_sight(path, site, camera))
-
-
 def visible_s(event: VehicleEvent, site: Site) -> float | None:
     """Time of the stream at which a vehicle first comes into view; None where it never does."""
     clock = np.arange(0.0, event.manoeuvre.motion.duration_s, CLOCK_S)
-    seen = in_view(event.manoeuvre.motion.trajectory(clock), site)
+    seen = line_of_sight(event.manoeuvre.motion.trajectory(clock), site, PinholeCamera())
     return round(event.start_s + float(clock[seen.argmax()]), 6) if seen.any() else None
 
 

@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
 from worldstate.adapters.simulation.dataset.truth import SCHEMA, SCHEMA_VERSION
 from worldstate.ground.typing import BoolArray, FloatArray
 
 from .arrivals import VehicleEvent
 from .rendering import row_times
 from .settings import StreamSettings
-from .sight import in_view, visible_s
+from .sight import visible_s
 from .traffic import HAZARDS
 
 COLUMNS = (
@@ -67,7 +69,7 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
         axle_rad=np.arctan2(axle_y, axle_x),
         axle_m=np.hypot(axle_x, axle_y),
         speed_mps=path.speed_mps,
-        in_view=in_view(path, settings.site),
+        in_view=line_of_sight(path, settings.site, PinholeCamera()),
     )
 
 
