@@ -69,7 +69,8 @@ def pair_rows(
         ways = {f"real -> {name}": ", real to simulated", f"{name} -> real": ", simulated to real"}
         for which, way in ways.items() if transfers else ():
             ours[name] |= _transfer_figures(transfers[which], way)
-    keys = dict.fromkeys(key for figures in (ours or {"": by_halves}).values() for key in figures)
+    known: Iterable[Iterable[FigureKey]] = ours.values() if ours else [by_halves]
+    keys = dict.fromkeys(key for figures in known for key in figures)
     rows = []
     for figure, windows in keys:
         undirected = figure.partition(",")[0], windows
