@@ -27,6 +27,7 @@ from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.vehicle_sound import add_vehicle
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 from .truth import describe
@@ -89,11 +90,16 @@ def simulate_recording(
     rng : numpy.random.Generator
         Source of randomness; the same state gives the same recording.
     array : MicrophoneArray, optional
-        Default `ovad_array`; its centre stands 1.7 m above the road.
+        Default `ovad_array`. Its centre stands 1.7 m above the road, whatever heights its positions name.
 
     Returns
     -------
     SimulatedRecording
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a microphone would stand below the road.
 
     Examples
     --------
@@ -161,6 +167,9 @@ def _add_sounds(
 
 def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
     positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
+    if positions[:, 2].min() <= 0.0:
+        got = f"one {ARRAY_HEIGHT_M - positions[:, 2].min():.2f} m below its centre"
+        raise InvalidArgumentError(f"array: expected microphones above the road, got {got}")
     skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
     blocks = -(-_samples(settings) // KNOT_SAMPLES)
     knots = np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz
