@@ -164,7 +164,7 @@ def test_no_setting_gives_silence_or_nan(scene, seed):
 @given(st.sampled_from(SITES), st.sampled_from(["left", "right"]), st.integers(0, 1000))
 def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed):
     rng = np.random.default_rng(seed)
-    scene = replace(draw_settings(name, approach, rng, 10.0), parked_car=False, sample_rate_hz=8_000.0)
+    scene = replace(draw_settings(name, approach, rng, 5.0), parked_car=False, sample_rate_hz=8_000.0)
     recording = simulate_recording(scene, rng, PAIR)
     t0 = recording.t0_frame
     frames = recording.truth["frames"]
