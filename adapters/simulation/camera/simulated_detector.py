@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.simulation.scene.ego_motion import ARRAY_HEIGHT_M
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import LIGHT, VehicleKind
-from worldstate.adapters.simulation.scene.sight import in_view
+from worldstate.adapters.simulation.scene.sight import camera_sees
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
 from worldstate.ground.typing import BoolArray, FloatArray
 
-ARRAY_HEIGHT_M = 1.7  # origin of `base_link` above the road: the array's centre on the roof
 LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs
 # Miss rates measured in the paper: 4 % at boresight, 14 % at 20-30 deg.
 MISS_AZIMUTH_DEG = (0.0, 10.0, 25.0)
@@ -48,7 +48,7 @@ def line_of_sight(
     trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
 ) -> BoolArray:
     """Tell when the middle of the vehicle's front is in the camera's view, shape (T,)."""
-    return in_view(site, camera, *trajectory.behind(0.0), ego_x_m)
+    return camera_sees(site, camera, *trajectory.behind(0.0), ego_x_m)
 
 
 def detect(

@@ -9,7 +9,6 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation.camera.simulated_detector import (
-    ARRAY_HEIGHT_M,
     Frame,
     detect,
     line_of_sight,
@@ -22,12 +21,11 @@ from worldstate.adapters.simulation.scene.vehicle import Trajectory
 from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.ego_sound import ego_noise
-from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.receiver import Receiver, standing_m
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.vehicle_sound import add_vehicle
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 from .truth import describe
@@ -166,10 +164,7 @@ def _add_sounds(
 
 
 def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
-    positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
-    if positions[:, 2].min() <= 0.0:
-        got = f"one {ARRAY_HEIGHT_M - positions[:, 2].min():.2f} m below its centre"
-        raise InvalidArgumentError(f"array: expected microphones above the road, got {got}")
+    positions = standing_m(array)
     skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
     blocks = -(-_samples(settings) // KNOT_SAMPLES)
     knots = np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz

@@ -11,7 +11,7 @@ from .junction import Site
 from .kinds import vehicle_kind
 from .route import along, turn_in
 from .settings import SimulationSettings, VehicleSettings
-from .sight import image_edges_rad, in_view
+from .sight import camera_sees, image_edges_rad
 from .vehicle import Trajectory, drive, follow
 
 SEARCH_STEP_M = 0.1
@@ -76,7 +76,7 @@ def _first_sight(site: Site, vehicle: VehicleSettings) -> tuple[float, str]:
     length = float(np.hypot(*np.diff(np.array(vehicle.route_m), axis=0).T).sum())
     driven = np.arange(0.0, length, SEARCH_STEP_M)
     x, y = route.at(driven)
-    seen = in_view(site, PinholeCamera(), x, y)
+    seen = camera_sees(site, PinholeCamera(), x, y)
     if seen.any() and not seen[0]:
         return float(driven[_longest_begins(seen)]), "hidden at first"
     return float(driven[np.hypot(x, y).argmin()]), "in view at first" if seen.any() else "never"

@@ -49,7 +49,9 @@ class Place:
 # Nothing ever sees these: one turns off behind the ego, the other crosses there.
 TURNS_OFF_BEHIND = Way("none", ((-80.0, 0.0), (-20.0, 0.0), (-16.0, -4.0), (-16.0, -80.0)))
 CROSSES_BEHIND = Way("none", ((-12.0, 60.0), (-12.0, -60.0)))
+# These are in view at first, and then beside.
 ONCOMING = Way("none", ((90.0, 3.2), (-60.0, 3.2)))
+TURNS_OFF_AHEAD = Way("none", ((90.0, 3.2), (16.0, 3.2), (11.5, -3.0), (11.5, -60.0)))
 
 
 def lead_vehicle() -> Place:
@@ -89,13 +91,13 @@ def one_corner() -> Place:
     """Return a crossing with a house on the left alone: from the right a vehicle is in plain direction."""
     house = OccludingBody(((-60.0, 2.8), (4.5, 2.8), (4.5, 60.0), (-60.0, 60.0)))
     ways = Way("left", ((6.5, 60.0), (6.5, -60.0))), Way("right", ((9.5, -60.0), (9.5, 60.0)))
-    return _open("SC1", (*ways, TURNS_OFF_BEHIND), house)
+    return _open("SC1", (*ways, TURNS_OFF_AHEAD, TURNS_OFF_BEHIND), house)
 
 
 def parked_van() -> Place:
     """Return a crossing in the open, before which a van parked on our left hides who comes from there."""
     ways = Way("left", ((8.5, 60.0), (8.5, -60.0))), Way("right", ((11.5, -60.0), (11.5, 60.0)))
-    return _open("SV1", (*ways, CROSSES_BEHIND, TURNS_OFF_BEHIND), box(1.5, 6.5, 2.0, 4.0))
+    return _open("SV1", (*ways, TURNS_OFF_AHEAD, CROSSES_BEHIND), box(1.5, 6.5, 2.0, 4.0))
 
 
 PLACES = {

@@ -21,7 +21,7 @@ def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:
     return float(right), float(left)
 
 
-def in_view(
+def camera_sees(
     site: Site, camera: PinholeCamera, x_m: FloatArray, y_m: FloatArray, ego_x_m: float | FloatArray = 0.0
 ) -> BoolArray:
     """Tell when the camera sees a point that moves, shape (T,).
@@ -30,7 +30,7 @@ def in_view(
     --------
     >>> from worldstate.adapters.simulation.scene.junction import site
     >>> x, y = np.array([8.0, 8.0, 2.0, -8.0]), np.array([3.0, 8.0, 2.5, 0.0])
-    >>> in_view(site("SA1"), PinholeCamera(), x, y)
+    >>> camera_sees(site("SA1"), PinholeCamera(), x, y)
     array([ True, False, False, False])
     """
     eye = (ego_x_m + camera.position_m[0], camera.position_m[1])

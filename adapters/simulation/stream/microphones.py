@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.simulation.camera.simulated_detector import ARRAY_HEIGHT_M
+from worldstate.adapters.simulation.sound.receiver import standing_m
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import FloatArray
 
@@ -25,7 +25,7 @@ def draw_microphones(
     settings: StreamSettings, array: MicrophoneArray, rng: np.random.Generator
 ) -> Microphones:
     """Draw what differs between the channels, once for a whole stream."""
-    positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
+    positions = standing_m(array)
     skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
     gains = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(positions)) / 20.0)
     return Microphones(positions, skew, gains, settings.sample_rate_hz)
