@@ -14,7 +14,7 @@ from worldstate.adapters.simulation.scene.octave_bands import split_octaves
 from worldstate.adapters.simulation.scene.sound_kinds import MICROPHONES, SOUNDS
 
 FS = 32_000.0
-SECONDS = 10
+SECONDS = 8
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_music_keeps_time(sounds):
     assert 60 / 130 - 0.02 <= beat <= 60 / 95 + 0.02
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     st.sampled_from(sorted(SYNTHESES)),
     st.floats(6_000.0, 50_000.0),
