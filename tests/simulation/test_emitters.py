@@ -14,7 +14,7 @@ from worldstate.adapters.simulation.scene.octave_bands import split_octaves
 from worldstate.adapters.simulation.scene.sound_kinds import MICROPHONES, SOUNDS
 
 FS = 32_000.0
-SECONDS = 8
+SECONDS = 6
 
 
 @pytest.fixture(scope="module")
@@ -117,13 +117,15 @@ def test_a_minor_third_rings_in_a_church_bell(sounds):
 
 def test_a_saw_sings_at_the_frequency_of_its_teeth():
     samples = int(4 * FS)
-    teeth, _, load = saw_motion(samples, FS, np.random.default_rng(3))
+    teeth, turns, load = saw_motion(samples, FS, np.random.default_rng(3))
     sound = saw(samples, FS, np.random.default_rng(3))
     # Mixed down by the teeth's own phase the tone stands still; beside it there is only noise.
     for shift, strong in ((0.0, True), (40.0, False), (-40.0, False)):
         phase = 2 * np.pi * np.cumsum(teeth + shift) / FS
         line = abs((sound * np.exp(-1j * phase)).mean()) ** 2 / (sound**2).mean()
         assert (line > 1e-2) == strong
+    np.testing.assert_allclose(teeth, np.round(teeth[0] / turns[0]) * turns)
+    assert teeth[0] / turns[0] >= 24 and 40.0 < turns.min() <= turns.max() < 80.0
     busy = load > 0.9
     assert sound[busy].std() > 1.5 * sound[load < 0.1].std()
     assert teeth[busy].mean() < 0.9 * teeth[load < 0.1].mean()
@@ -160,7 +162,7 @@ def test_any_rate_and_length_gives_the_samples_asked_and_the_same_for_the_same_s
     assert first.tobytes() == again.tobytes()
 
 
-@pytest.mark.parametrize("name", ["voice", "horn", "saw", "bell"])
+@pytest.mark.parametrize("name", ["horn", "saw", "bell"])
 def test_a_low_rate_hears_the_same_sound_band_limited(name):
     """48 kHz is twice 24 kHz, 6 kHz a quarter: the sound drawn at 24 kHz is one and the same."""
     low = emitted(SOUNDS[name], 12_000, 6_000.0, np.random.default_rng(5))

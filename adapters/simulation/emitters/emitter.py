@@ -54,17 +54,22 @@ def emitted(kind: SoundKind, samples: int, sample_rate_hz: float, rng: np.random
     return _band_limited(piece, factor).astype(np.float32)
 
 
-def a_weighted(signal: FloatArray, rate_hz: float) -> FloatArray:
-    r"""Apply the A-weighting of IEC 61672-1, without delay.
+def a_weight(frequency_hz: FloatArray) -> FloatArray:
+    r"""Amplitude of the A-weighting of IEC 61672-1, shape of `frequency_hz`.
 
     .. math:: R_A(f) = \frac{12194^2 f^4}{(f^2 + 20.6^2) \sqrt{(f^2 + 107.7^2)(f^2 + 737.9^2)}
               (f^2 + 12194^2)}, \qquad A(f) = R_A(f) / R_A(1000)
     """
-    n = next_fast_len(len(signal), real=True)
-    f2 = rfftfreq(n, 1.0 / rate_hz) ** 2
+    f2 = np.square(frequency_hz)
     root = np.sqrt((f2 + 107.7**2) * (f2 + 737.9**2))
     weight = 12194.0**2 * f2**2 / ((f2 + 20.6**2) * root * (f2 + 12194.0**2))
-    return np.asarray(irfft(rfft(signal, n) * weight * 10.0 ** (2.0 / 20.0), n)[: len(signal)])
+    return np.asarray(weight * 10.0 ** (2.0 / 20.0))
+
+
+def a_weighted(signal: FloatArray, rate_hz: float) -> FloatArray:
+    """Apply the A-weighting without delay, shape of `signal`."""
+    n = next_fast_len(len(signal), real=True)
+    return np.asarray(irfft(rfft(signal, n) * a_weight(rfftfreq(n, 1.0 / rate_hz)), n)[: len(signal)])
 
 
 def loud_pressure(signal: FloatArray, rate_hz: float) -> float:
