@@ -17,8 +17,9 @@ from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.simulation import SITES, preset, site
 from worldstate.adapters.simulation.scene.kinds import LIGHT
+from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 from worldstate.adapters.simulation.stream.ambience import OVERLAP_S
-from worldstate.adapters.simulation.stream.arrivals import VehicleEvent
+from worldstate.adapters.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
 from worldstate.adapters.simulation.stream.event_sound import event_sound, levels_db
 from worldstate.adapters.simulation.stream.manoeuvres import MANOEUVRES, Driver
 from worldstate.adapters.simulation.stream.microphones import draw_microphones
@@ -56,7 +57,7 @@ def event_at(start_s: float, flow: str = "left", reach_m: float = 20.0) -> Vehic
     return VehicleEvent(flow, MANOEUVRES[flow](driver, np.random.default_rng(1)), start_s)
 
 
-def sound_of(scene: StreamScene, events: Sequence[VehicleEvent]) -> Float32Array:
+def sound_of(scene: StreamScene, events: Sequence[Event]) -> Float32Array:
     return np.concatenate([block.pressure_pa for block in render_blocks(scene, events)], axis=1)
 
 
@@ -65,7 +66,8 @@ def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -
     # The first began before the stream, the second and third overlap over the edge of a piece (30 s), the
     # last goes on after the end.
     early, late = event_at(-1.0, reach_m=8.0), event_at(34.5, reach_m=8.0)
-    events = [early, event_at(28.5, reach_m=8.0), event_at(29.5, "turns_away", 10.0), late]
+    steps = SoundEvent(SoundSettings("steps", 2.0, 3.0, (3.0, 2.0)), 27.0)
+    events = [early, event_at(28.5, reach_m=8.0), event_at(29.5, "turns_away", 10.0), late, steps]
     added = sound_of(scene, events) - sound_of(scene, ())
     expected = np.zeros((2, 36 * 3000))
     for number, event in enumerate(events):
@@ -155,7 +157,7 @@ def test_a_stream_on_disk_is_read_like_a_recording(
     log = recording.read_detections()
     assert log is not None and len(log.frames) == 150
     np.testing.assert_allclose(choose_array(folder).positions_m, PAIR.positions_m, atol=1e-6)
-    events = json.loads((folder / "events.json").read_text())["events"]
+    events = json.loads((folder / "events.json").read_text())["vehicles"]
     tracks = read_true_tracks(folder)
     with (folder / "vehicles.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -14,7 +14,13 @@ from worldstate.adapters.simulation import preset, site
 from worldstate.adapters.simulation.scene.kinds import LIGHT, vehicle_kind
 from worldstate.adapters.simulation.scene.places import place
 from worldstate.adapters.simulation.scene.route import along
-from worldstate.adapters.simulation.stream.arrivals import VehicleEvent, draw_events
+from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
+from worldstate.adapters.simulation.stream.arrivals import (
+    SoundEvent,
+    VehicleEvent,
+    draw_events,
+    draw_sounds,
+)
 from worldstate.adapters.simulation.stream.manoeuvres import Driver, emerges
 from worldstate.adapters.simulation.stream.motion import SpeedLimit, drive_along
 from worldstate.adapters.simulation.stream.settings import StreamSettings
@@ -55,7 +61,7 @@ def test_a_busy_hour_holds_every_event_and_only_hazards_come_out_of_an_arm(name:
     settings = StreamSettings(site(name), 60.0, traffic=traffic_named("busy"))
     events = events_of("busy", name, seed=1)
     vehicles = [vehicle_truth(number, event, settings) for number, event in enumerate(events)]
-    told = describe_events(vehicles)
+    told = describe_events(vehicles, (), {})["vehicles"]
     assert {one["flow"] for one in told} == {*FLOWS, "follows"}
     assert {one["kind"] for one in told} >= {"light", "medium", "heavy", "electric", "bicycle"}
     for one, vehicle in zip(told, vehicles, strict=True):
@@ -147,8 +153,8 @@ def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
 def test_boxes_follow_what_is_in_view_with_misses_and_clutter() -> None:
     settings = StreamSettings(site("SB1"), 10.0, traffic=Traffic("test", {"left": 240.0}, kinds={"light": 1}))
     events = draw_events(settings.site, settings.traffic, preset(), 600.0, np.random.default_rng(2))
-    frames = camera_frames(settings, events, np.random.default_rng(1))
-    alone = camera_frames(settings, [], np.random.default_rng(1))
+    frames = camera_frames(settings, events, [], np.random.default_rng(1))
+    alone = camera_frames(settings, [], [], np.random.default_rng(1))
     assert len(frames) == len(alone) == 6000
     added = np.array([len(a) - len(b) for a, b in zip(frames, alone, strict=True)])
     vehicles = [vehicle_truth(i, event, settings) for i, event in enumerate(events)]
@@ -162,6 +168,23 @@ def test_boxes_follow_what_is_in_view_with_misses_and_clutter() -> None:
     boxes = sum(len(frame) for frame in alone) - (6000 if len(alone[0]) else 0)
     expected = CLUTTER_PER_HOUR / 6 * np.mean(CLUTTER_IMAGES)
     assert abs(boxes - expected) < 5 * np.sqrt(expected * 2.5)
+
+
+def test_other_sounds_come_at_their_rate_and_rain_takes_boxes() -> None:
+    rates = {"rain": 60.0, "voice": 240.0, "siren": 30.0}
+    traffic = replace(traffic_named("busy"), sounds=rates)
+    settings = StreamSettings(site("SB1"), 60.0, traffic=traffic)
+    sounds = draw_sounds(settings, 4, np.random.default_rng(1))
+    for kind, rate in rates.items():
+        number = sum(one.sound.kind == kind for one in sounds)
+        assert abs(number - rate) < 4.5 * np.sqrt(rate)
+    assert all(0.0 <= one.start_s < 3600.0 for one in sounds)
+    short = replace(settings, minutes=2.0)
+    soaked = SoundEvent(SoundSettings("rain", 2.0, 58.0, lens_missed=0.999), 0.0)
+    dry, wet = (camera_frames(short, [], rain, np.random.default_rng(9)) for rain in ([], [soaked]))
+    assert sum(map(len, dry[20:600])) > 500  # this seed has a parked car
+    assert sum(map(len, wet[20:600])) < 20
+    assert wet[620:] == dry[620:]
 
 
 def test_streams_refuse_what_they_cannot_be() -> None:

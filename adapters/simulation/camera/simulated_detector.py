@@ -1,6 +1,7 @@
 """What the camera's detector reports: boxes that begin at line of sight, with its small imperfections."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,6 +86,17 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
     return [
         (SimulatedDetection(_inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)
+    ]
+
+
+def lost(frames: Sequence[Frame], missed: FloatArray, rng: np.random.Generator) -> list[Frame]:
+    """Lose a share of the boxes of every frame.
+
+    Shapes: missed (frames,).
+    """
+    return [
+        tuple(box for box in frame if rng.random() >= share)
+        for frame, share in zip(frames, missed, strict=True)
     ]
 
 

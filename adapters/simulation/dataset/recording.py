@@ -12,6 +12,7 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
     Frame,
     detect,
     line_of_sight,
+    lost,
     park,
 )
 from worldstate.adapters.simulation.emitters.placed_sound import add_signal, add_sound
@@ -228,9 +229,4 @@ def _through_rain(
     for sound in settings.sounds:
         raining = (time >= sound.start_s) & (time < sound.end_s)
         missed = np.maximum(missed, sound.lens_missed * raining)
-    if not missed.any():
-        return detections
-    return tuple(
-        tuple(box for box in frame if rng.random() >= share)
-        for frame, share in zip(detections, missed, strict=True)
-    )
+    return tuple(lost(detections, missed, rng)) if missed.any() else detections

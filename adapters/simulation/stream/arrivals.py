@@ -1,20 +1,25 @@
 """Who comes when: every flow is a Poisson process, every arrival one vehicle or several."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.adapters.simulation.scene.presets import Preset
+from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 
 from .manoeuvres import LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
+from .settings import StreamSettings
 from .traffic import Traffic
 
 HEADWAY_S = (1.5, 4.0)
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
-PARTICIPANT_ROUNDS = 8  # longest queue
+LONGEST_QUEUE = 8
+SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # the fades of an event lie beside the sound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +34,22 @@ class VehicleEvent:
     def end_s(self) -> float:
         """Time of the stream at which it is out of earshot."""
         return self.start_s + self.manoeuvre.motion.duration_s
+
+
+@dataclass(frozen=True, slots=True)
+class SoundEvent:
+    """A sound of a stream that is no vehicle's."""
+
+    sound: SoundSettings
+    start_s: float  # Time of the stream at which its clock is 0
+
+    @property
+    def end_s(self) -> float:
+        """Time of the stream at which it is over, with what comes late."""
+        return self.start_s + self.sound.end_s + SOUND_MARGIN_S
+
+
+Event = VehicleEvent | SoundEvent
 
 
 def draw_events(
@@ -62,13 +83,25 @@ def _arrival(
         if arm is None:
             continue
         last = leader
-        for _ in range(PARTICIPANT_ROUNDS):
+        for _ in range(LONGEST_QUEUE):
             if rng.random() >= traffic.follower_share:
                 break
             # Who follows on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
             kind = leader.motion.kind if rng.random() < 0.5 else vehicle_kind("light")
             last = behind(last, rng.uniform(*HEADWAY_S), kind)
             yield _event("follows", arrival_s + late_s, last)
+
+
+def draw_sounds(settings: StreamSettings, microphones: int, rng: np.random.Generator) -> list[SoundEvent]:
+    """Draw all sounds of a stream that are no vehicle's, each kind a Poisson process of its own."""
+    events: list[SoundEvent] = []
+    kinds = settings.traffic.sounds
+    for (kind, rate), own in zip(sorted(kinds.items()), rng.spawn(len(kinds)), strict=True):
+        for arrival_s in own.uniform(0.0, settings.duration_s, own.poisson(rate * settings.minutes / 60.0)):
+            empty = SimulationSettings(settings.site, "none", duration_s=own.uniform(*SOUND_S))
+            sound = with_sounds(empty, [kind], microphones, own).sounds[0]
+            events.append(SoundEvent(replace(sound, start_s=SOUND_MARGIN_S), float(arrival_s)))
+    return sorted(events, key=lambda event: event.start_s)
 
 
 def _event(flow: str, arrival_s: float, manoeuvre: Manoeuvre) -> VehicleEvent:

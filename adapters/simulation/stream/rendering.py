@@ -14,7 +14,7 @@ from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .ambience import ambience_piece, overlap_samples
-from .arrivals import VehicleEvent
+from .arrivals import Event
 from .event_sound import ROW_S, event_blocks, event_sound, levels_db
 from .microphones import Microphones
 from .settings import StreamSettings
@@ -44,7 +44,7 @@ class Piece:
     """The events that begin in one piece of the stream, with their numbers."""
 
     number: int
-    events: dict[int, VehicleEvent]
+    events: dict[int, Event]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,16 +55,14 @@ class Block:
     levels_db: dict[int, FloatArray]  # At the rows of every event
 
 
-def row_times(event: VehicleEvent, settings: StreamSettings) -> FloatArray:
+def row_times(event: Event, settings: StreamSettings) -> FloatArray:
     """Return the tenths of a second of the stream in which an event is heard or seen, shape (R,)."""
     first, last = max(event.start_s, 0.0), min(event.end_s, settings.duration_s)
     begin, end = (int(np.ceil(time_s / ROW_S - 1e-9)) for time_s in (first, last))
     return ROW_S * np.arange(begin, end, dtype=np.float64)
 
 
-def render_blocks(
-    scene: StreamScene, events: Sequence[VehicleEvent], jobs: int = 1
-) -> Generator[Block, None, None]:
+def render_blocks(scene: StreamScene, events: Sequence[Event], jobs: int = 1) -> Generator[Block, None, None]:
     """Yield a stream from its beginning; what comes out does not depend on the number of jobs."""
     length, left = scene.piece, scene.settings.samples
     pending = np.zeros((len(scene.microphones.positions_m), 0), np.float32)
@@ -77,7 +75,7 @@ def render_blocks(
             pending, left = sound[:, length:].copy(), left - length
 
 
-def pieces(scene: StreamScene, events: Sequence[VehicleEvent]) -> list[Piece]:
+def pieces(scene: StreamScene, events: Sequence[Event]) -> list[Piece]:
     """Deal the events to the pieces that they begin in; those before the stream to the first one."""
     first = np.maximum([event.start_s for event in events], 0.0) * scene.settings.sample_rate_hz
     owner = (first // scene.piece).astype(int)

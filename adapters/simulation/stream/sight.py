@@ -1,5 +1,7 @@
 """When the camera sees the vehicles of a stream, and what its detector makes of them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -9,11 +11,12 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
     SimulatedDetection,
     detect,
     line_of_sight,
+    lost,
     park,
 )
 from worldstate.adapters.simulation.scene.junction import Site
 
-from .arrivals import VehicleEvent
+from .arrivals import SoundEvent, VehicleEvent
 from .settings import StreamSettings
 
 CLOCK_S = 0.01  # resolution of the first line of sight
@@ -34,10 +37,13 @@ def visible_s(event: VehicleEvent, site: Site) -> float | None:
 
 
 def camera_frames(
-    settings: StreamSettings, events: list[VehicleEvent], rng: np.random.Generator
+    settings: StreamSettings,
+    events: Sequence[VehicleEvent],
+    sounds: Sequence[SoundEvent],
+    rng: np.random.Generator,
 ) -> list[Frame]:
-    """Boxes of a whole stream: vehicles with misses, a parked car in some streets, and clutter."""
-    camera, to_park, to_clutter, to_vehicles = PinholeCamera(), *rng.spawn(3)
+    """Boxes of a whole stream: vehicles with misses, a parked car in some, clutter; rain takes some."""
+    camera, to_park, to_clutter, to_vehicles, to_rain = PinholeCamera(), *rng.spawn(4)
     count = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
     frames: list[Frame] = [()] * count
     if to_park.random() < PARKED_SHARE:
@@ -53,7 +59,11 @@ def camera_frames(
         boxes = detect(path.at(path.time_s[ahead]), settings.site, camera, draws)
         for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
             frames[number] += seen
-    return _with_clutter(frames, camera, to_clutter)
+    missed, time = np.zeros(count), np.arange(count) / FRAME_RATE_HZ
+    for one in sounds:
+        raining = (time >= one.start_s + one.sound.start_s) & (time < one.end_s)
+        missed = np.maximum(missed, one.sound.lens_missed * raining)
+    return lost(_with_clutter(frames, camera, to_clutter), missed, to_rain)
 
 
 def _with_clutter(frames: list[Frame], camera: PinholeCamera, rng: np.random.Generator) -> list[Frame]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
+from worldstate.adapters.simulation.scene.sound_kinds import sound_kind
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
@@ -23,12 +24,16 @@ class Traffic:
     per_hour: Mapping[str, float]  # Of each of `FLOWS`; those not named never come
     follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has another one behind it
     kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normed
+    sounds: Mapping[str, float] = field(default_factory=dict)  # What else sounds, by kind, an hour
 
     def __post_init__(self) -> None:
         for flow, rate in self.per_hour.items():
             if flow not in FLOWS:
                 raise InvalidArgumentError(f"per_hour: expected flows {', '.join(FLOWS)}, got {flow!r}")
             in_range(f"per_hour[{flow!r}]", rate, 0.0, MOST_PER_HOUR)
+        for sound, rate in self.sounds.items():
+            sound_kind(sound)
+            in_range(f"sounds[{sound!r}]", rate, 0.0, MOST_PER_HOUR)
         # A share of one would make a queue without an end.
         in_range("follower_share", self.follower_share, 0.0, 0.9)
         for kind, share in self.kinds.items():

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from worldstate.adapters.simulation.camera.simulated_detector import line_of_sig
 from worldstate.adapters.simulation.dataset.truth import SCHEMA, SCHEMA_VERSION
 from worldstate.ground.typing import BoolArray, FloatArray
 
-from .arrivals import VehicleEvent
+from .arrivals import SoundEvent, VehicleEvent
 from .rendering import row_times
 from .settings import StreamSettings
 from .sight import visible_s
@@ -73,9 +73,11 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
     )
 
 
-def describe_events(vehicles: Sequence[VehicleTruth]) -> list[dict[str, Any]]:
-    """Return one entry a vehicle for `events.json`."""
-    return [
+def describe_events(
+    vehicles: Sequence[VehicleTruth], sounds: Sequence[SoundEvent], levels_db: Mapping[int, FloatArray]
+) -> dict[str, list[dict[str, Any]]]:
+    """Return `events.json`: one entry a vehicle, and one a sound that is none."""
+    told = [
         {
             "vehicle": one.number,
             "flow": one.event.flow,
@@ -88,6 +90,17 @@ def describe_events(vehicles: Sequence[VehicleTruth]) -> list[dict[str, Any]]:
         }
         for one in vehicles
     ]
+    others = [
+        {
+            "kind": one.sound.kind,
+            "place_m": list(one.sound.place_m) if one.sound.has_place else None,
+            "first_s": round(one.start_s + one.sound.start_s, 3),
+            "last_s": round(one.start_s + one.sound.end_s, 3),
+            "level_db": round(float(levels_db[number].max()), 1) if levels_db[number].size else None,
+        }
+        for number, one in enumerate(sounds, start=len(vehicles))
+    ]
+    return {"vehicles": told, "sounds": others}
 
 
 def describe_stream(settings: StreamSettings, vehicles: Sequence[VehicleTruth]) -> dict[str, Any]:
@@ -123,7 +136,7 @@ def _frames(one: VehicleTruth) -> list[dict[str, Any]]:
     ]
 
 
-def rows_csv(vehicles: Sequence[VehicleTruth], levels_db: dict[int, FloatArray]) -> str:
+def rows_csv(vehicles: Sequence[VehicleTruth], levels_db: Mapping[int, FloatArray]) -> str:
     """Return `vehicles.csv`: one row a vehicle and tenth of a second; no time to visible is an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

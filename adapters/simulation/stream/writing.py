@@ -27,7 +27,7 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import FloatArray
 
 from .ambience import stream_preset
-from .arrivals import VehicleEvent, draw_events
+from .arrivals import SoundEvent, draw_events, draw_sounds
 from .microphones import draw_microphones
 from .rendering import Block, StreamScene, render_blocks
 from .settings import StreamSettings
@@ -36,7 +36,7 @@ from .spectrogram import Spectrogram
 from .truth import VehicleTruth, describe_events, describe_stream, rows_csv, vehicle_truth
 
 EVENTS_NAME, ROWS_NAME = "events.json", "vehicles.csv"
-ARRIVALS, CHANNELS, LEVEL, CAMERA = 0, 1, 2, 5  # purposes of generators; 3 and 4 are the pieces'
+ARRIVALS, CHANNELS, LEVEL, CAMERA, SOUNDS = 0, 1, 2, 5, 6  # purposes of generators; 3 and 4 are the pieces'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +46,7 @@ class WrittenStream:
     folder: Path
     settings: StreamSettings
     vehicles: tuple[VehicleTruth, ...]
+    sounds: tuple[SoundEvent, ...]
     spectrogram: Spectrogram  # Of the microphone nearest to the array's centre
 
 
@@ -61,8 +62,8 @@ def write_stream(
 
     The folder is named after site, traffic and seed. It holds `out_multi.wav` (RF64 beyond 4 GiB, written
     block by block), `array.xml`, camera detections, `truth.json` in the form of a recording's, `events.json`
-    with one entry a vehicle and `vehicles.csv` with one row a vehicle and tenth of a second. The same
-    settings give the same bytes, whatever the number of jobs. Interrupted, it leaves nothing.
+    with one entry a vehicle or other sound, and `vehicles.csv` with one row a vehicle and tenth of a second.
+    The same settings give the same bytes, whatever the number of jobs. Interrupted, it leaves nothing.
 
     Parameters
     ----------
@@ -114,16 +115,17 @@ def write_stream(
         settings.site, settings.traffic, settings.preset, settings.duration_s, settings.generator(ARRIVALS)
     )
     vehicles = tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events))
+    sounds = draw_sounds(settings, listening.n_microphones, settings.generator(SOUNDS))
     heard = Spectrogram(settings.sample_rate_hz)
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
         temporary = Path(hidden) / target.name
         temporary.mkdir()
-        with closing(render_blocks(scene, events, jobs)) as blocks:
+        with closing(render_blocks(scene, [*events, *sounds], jobs)) as blocks:
             levels = _write_sound(temporary / AUDIO_NAME, scene, blocks, heard, progress)
         write_array_xml(temporary / ARRAY_NAME, listening)
-        _write_beside(temporary, settings, events, vehicles, levels)
+        _write_beside(temporary, settings, vehicles, sounds, levels)
         put_in_place(target, temporary)
-    return WrittenStream(target, settings, vehicles, heard)
+    return WrittenStream(target, settings, vehicles, tuple(sounds), heard)
 
 
 def _write_sound(
@@ -161,14 +163,15 @@ def _write_sound(
 def _write_beside(
     folder: Path,
     settings: StreamSettings,
-    events: list[VehicleEvent],
     vehicles: tuple[VehicleTruth, ...],
+    sounds: list[SoundEvent],
     levels: dict[int, FloatArray],
 ) -> None:
-    frames = camera_frames(settings, events, settings.generator(CAMERA))
+    events = [one.event for one in vehicles]
+    frames = camera_frames(settings, events, sounds, settings.generator(CAMERA))
     _write_json(folder / DETECTION_NAMES[0], to_json(frames))
     _write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
-    _write_json(folder / EVENTS_NAME, {"events": describe_events(vehicles)})
+    _write_json(folder / EVENTS_NAME, describe_events(vehicles, sounds, levels))
     (folder / ROWS_NAME).write_text(rows_csv(vehicles, levels), encoding="utf-8", newline="\n")
 
 

@@ -21,6 +21,7 @@ Half of their hazard-free recordings have a vehicle in plain view, or one that i
 sound, array.xml, camera results, truth.json, events.json (an entry a vehicle), vehicles.csv (a row a vehicle
 and tenth of a second: position, speed, in view, time to visible, level at the array) and stream.png.
 --traffic no-hazard is busy, but nothing comes out of a hidden arm: whatever warns there is wrong.
+--sounds come twelve times an hour each.
 """
 
 import argparse
@@ -51,6 +52,7 @@ PRESETS = ("street-5", "street-5-calm")
 STREAM_SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")
 TRAFFICS = ("calm", "busy", "no-hazard", "empty")
 FIGURE_NAME = "stream.png"
+PER_HOUR = 12.0  # of every kind of --sounds in a stream
 
 EXAMPLE = """\
 examples:
@@ -145,6 +147,8 @@ def _run_stream(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
+    from dataclasses import replace
+
     from worldstate.adapters.simulation.scene.junction import site
     from worldstate.adapters.simulation.scene.presets import preset
     from worldstate.adapters.simulation.scene.settings import SAMPLE_RATE_HZ, rate_for
@@ -157,7 +161,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
         site=site(arguments.site),
         minutes=arguments.minutes,
         seed=arguments.seed,
-        traffic=traffic_named(arguments.traffic),
+        traffic=replace(traffic_named(arguments.traffic), sounds=dict.fromkeys(arguments.sounds, PER_HOUR)),
         preset=preset(arguments.preset),
         sample_rate_hz=SAMPLE_RATE_HZ
         if band is None

@@ -96,6 +96,12 @@ def _draw_events(axes: "Axes", stream: WrittenStream) -> None:
     flows = list(FLOW_COLOURS)
     for one in stream.vehicles:
         _draw_event(axes, one, flows.index(one.event.flow))
+    for sound in stream.sounds:
+        axes.broken_barh(
+            [(sound.start_s, sound.end_s - sound.start_s)], (len(flows) - 0.35, 0.7), color="0.8"
+        )
+        axes.text(sound.start_s, len(flows), sound.sound.kind, fontsize=6, va="center", clip_on=True)
+    flows.append("other sounds")
     axes.set(yticks=range(len(flows)), yticklabels=[flow.replace("_", " ") for flow in flows])
     axes.set(xlabel="time (s); pale: in earshot, full: in view, tick: first line of sight")
     axes.set_ylim(len(flows) - 0.4, -0.6)
