@@ -192,7 +192,7 @@ def band_db(x: np.ndarray) -> float:
     return float(10 * np.log10(power[(frequency > 500) & (frequency < 2000)].sum()))
 
 
-@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@settings(max_examples=12, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.data())
 def test_no_scene_gives_silence_nan_or_a_click(data):
     """Any site, kind, way and ego: finite, never still, and no sample leaps out of its neighbourhood."""

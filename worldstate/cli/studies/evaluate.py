@@ -52,7 +52,7 @@ examples:
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59
-SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
+SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 6.0
 # Images of OVAD's size take more than half of the time of a simulated recording.
 SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5

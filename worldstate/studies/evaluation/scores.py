@@ -262,12 +262,11 @@ class Score:
     def _random_detection(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> FloatArray:
         """Return what as many onsets at random moments before T0 would detect, shape (S, D)."""
         rates = np.full(sums["before_s"].shape, np.nan)
-        times = (weights * ~self._free).astype(np.intp)
-        for s, d in zip(*np.nonzero(sums["before_s"] > 0.0), strict=True):
-            windows_s = np.repeat(self.counts["window_s"][s], times[d])
-            rates[s, d] = random_detection(
-                windows_s, int(sums["onsets_before"][s, d]), sums["before_s"][s, d]
-            )
+        times = weights * ~self._free
+        for s, before_s in enumerate(sums["before_s"]):
+            scored = before_s > 0.0
+            onsets, windows_s = np.floor(sums["onsets_before"][s]), self.counts["window_s"][s]
+            rates[s, scored] = random_detection(windows_s, onsets[scored], before_s[scored], times[scored])
         return rates
 
 
