@@ -1,6 +1,7 @@
 """The comparison of simulated with real windows, on sets whose answer is known and on the released ones."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -269,17 +270,25 @@ def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(("group", "sites"), [("static", ("SA1", "SB1")), ("dynamic", ("DA1", "DB1"))])
 def test_the_command_simulates_the_junctions_of_a_table(group, sites, tmp_path, capsys, monkeypatch):
-    """Simulated windows of one seed against those of another, which take the part of the real ones."""
-    monkeypatch.setattr(command, "WINDOWS", 8)
-    monkeypatch.setattr(command, "SEEDS", (1,))
-    write_features(tmp_path / "real.csv", simulated_windows(8, seed=9, sites=sites))
+    monkeypatch.setattr(command, "WINDOWS", 2)
+    monkeypatch.setattr(command, "SEEDS", (4,))
+    table = windows(np.random.default_rng(0))
+    write_features(tmp_path / "real.csv", replace(table, environments=np.tile(sites, len(table) // 2)))
     words = ["realism", str(tmp_path / "real.csv"), "--group", group, "--out", str(tmp_path / "r"), "--json"]
     assert main(words) == 0
     report = json.loads(capsys.readouterr().out)
-    c2st = [one for one in report["rows"] if (one["figure"], one["windows"]) == ("C2ST", "all")]
-    assert [one["simulated"]["seed 1"] < 0.75 for one in c2st] == [True]
-    pair = [read_features(tmp_path / "r" / f"{name}-1.csv") for name in ("windows", "permuted")]
+    assert set(report["profiles"]) == {"real", "seed 4"}
+    assert set(report["profiles"]["seed 4"]) == set(sites)
+    pair = [read_features(tmp_path / "r" / f"{name}-4.csv") for name in ("windows", "permuted")]
     assert pair[0].labels.tolist() == pair[1].labels.tolist()
+    given = [*words, "--simulated", str(tmp_path / "r" / "windows-4.csv"), "--measures-only"]
+    assert main(given) == 0
+    again = {
+        (one["figure"], one["windows"]): one["simulated"]
+        for one in json.loads(capsys.readouterr().out)["rows"]
+    }
+    first = {(one["figure"], one["windows"]): one["simulated"] for one in report["rows"]}
+    assert again["sd of log level", "none"] == {"windows-4": first["sd of log level", "none"]["seed 4"]}
 
 
 def test_a_table_without_the_group_is_refused_before_the_work(tmp_path, capsys):

@@ -97,6 +97,7 @@ def measure_realism(
     groupings = (halves(sites) if len(sites) > 1 else (), within_types(sites))
     # The figures of real against real are the same beside any simulation.
     of_real, of_simulated = rng.spawn(2)
+    # Each way once, with its interval: the rows show the same areas.
     transfers = {}
     for name, table in simulated.items() if classifiers else ():
         transfers[f"{name} -> real"] = published_transfer(table, real, of_simulated, draws)

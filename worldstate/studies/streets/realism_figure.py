@@ -46,7 +46,8 @@ def write_realism_figure(
 def _draw_measure(
     axes: "Axes", tables: Mapping[str, list[FeatureTable]], sites: list[str], name: str, windows: str
 ) -> None:
-    """Draw the middle 90 and 50 % and the median at each junction; all simulated sets together."""
+    """Draw the middle 90 and 50 % and the median at each junction."""
+    # All simulated sets together: one of ten windows a side and site would show its draws.
     for place, site in enumerate(sites):
         for shift, (origin, some) in zip((0.18, -0.18), tables.items(), strict=True):
             values = [_values(table, site, windows, name) for table in some]
@@ -58,6 +59,7 @@ def _draw_measure(
                 axes.plot(middle, height, "o", color=COLOURS[origin], markersize=4.0)
     axes.set(yticks=range(len(sites), 0, -1), yticklabels=sites, xlabel=LABELS.get(name, name))
     if not name.endswith("deg"):
+        # A factor of loudness is the same length everywhere.
         axes.set_xscale("log")
         axes.minorticks_off()
         axes.xaxis.set_major_formatter("{x:.3g}")

@@ -139,6 +139,7 @@ def set_rows(
     real: FeatureTable, simulated: Mapping[str, FeatureTable], groupings: Iterable[Grouping]
 ) -> list[RealismRow]:
     """Return what one set has by itself, beside the halves of the real junctions."""
+    # Halves stand for streets of which only so many were recorded: spreads of two or three junctions.
     parts = [part for grouping in groupings for part in grouping.tables(real)]
     # A share between sites needs two of them.
     spans = _spans(set_figures(part) for part in parts if len(set(part.environments.tolist())) > 1)

@@ -38,6 +38,7 @@ def position_figures(
 
 
 def _out_of_fold(right: FeatureTable, permuted: FeatureTable, rng: np.random.Generator) -> FloatArray:
+    # Trained with the right positions alone; other recordings, or it would know the windows themselves.
     folds = folds_by_recording(right, rng)
     scores = np.empty((2, len(right)))
     for held_out in np.unique(folds):
