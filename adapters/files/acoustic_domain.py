@@ -18,7 +18,9 @@ from .array_match import array_difference, microphone_order
 OVAD_RATE_HZ = 47_998.0
 # Frames have a fixed number of samples: two per cent move the top of the band by a third of a bin.
 RATE_TOLERANCE = 0.02
-WAY_OUT = "Train a model for it (extract-features, train), or go on with --uncalibrated (uncalibrated=True)"
+# Only `run` goes on with a model of another array; the other commands have no such option to name.
+TRAIN = "Train a model for it (extract-features, train)"
+WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,7 +43,7 @@ def ovad_domain(environments: Sequence[str]) -> ModelDomain:
     return domain_of(ovad_array(), [OVAD_RATE_HZ], environments)
 
 
-def check_array(domain: ModelDomain, array: MicrophoneArray) -> IndexArray:
+def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
     """Return the channels of an array in the order that a model was made with.
 
     Raises
@@ -54,7 +56,7 @@ def check_array(domain: ModelDomain, array: MicrophoneArray) -> IndexArray:
         difference = array_difference(domain.positions_m, array)
         made_for = f"{domain.array}, {len(domain.positions_m)} microphones"
         raise OutOfDomainError(
-            f"{array.name}: not the array of the model ({made_for}): {difference}. {WAY_OUT}"
+            f"{array.name}: not the array of the model ({made_for}): {difference}. {way_out}"
         )
     return order
 
@@ -75,7 +77,7 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
     if domain is None:
         _LOG.warning("the model names no array that it was made for: no budget is stated")
         return False
-    check_array(domain, array)
+    check_array(domain, array, WAY_OUT)
     if moving_ego and domain.ego_motion == "standing":
         _LOG.warning("the model was made for a standing ego, this one moves: no budget is stated")
         return False
@@ -83,7 +85,11 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
 
 
 def feature_order(
-    domain: ModelDomain, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings
+    domain: ModelDomain,
+    array: MicrophoneArray,
+    sample_rate_hz: float,
+    settings: FrontEndSettings,
+    way_out: str = WAY_OUT,
 ) -> tuple[int, ...] | None:
     """Return the channels in the model's order where it is another one, or refuse what it was not made for.
 
@@ -95,12 +101,12 @@ def feature_order(
     low, high = domain.sample_rate_hz
     if not low <= sample_rate_hz <= high:
         expected = f"a model made for {low:.0f} to {high:.0f} Hz expects such sound"
-        raise OutOfDomainError(f"sample rate: {expected}, got {sample_rate_hz:g} Hz. {WAY_OUT}")
+        raise OutOfDomainError(f"sample rate: {expected}, got {sample_rate_hz:g} Hz. {way_out}")
     made_with = _feature(domain.feature, domain.band_hz)
     got = _feature(FEATURE_VERSION, settings.feature_band_hz, settings.nfft)
     if got != made_with:
-        raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {WAY_OUT}")
-    order = check_array(domain, array)
+        raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {way_out}")
+    order = check_array(domain, array, way_out)
     if (np.diff(order) == 1).all():
         return None
     _LOG.warning("%s: the model's microphones in another order; channels are put in the model's", array.name)
