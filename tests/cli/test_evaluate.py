@@ -123,6 +123,7 @@ def test_streets_whose_simulation_was_interrupted_are_completed(smoke, tmp_path)
     assert found["protocols"] == report["protocols"]
 
 
+@pytest.mark.slow
 def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys):
     """Three recordings are left, and no protocol can be run on one approach."""
     out, _ = smoke
@@ -137,6 +138,22 @@ def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys
     assert "2 approaches with a T0, found 1" in said
     assert f"not heard: {sound.parent.name}: " in said and "cut short" in said
     assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_figures(smoke, tmp_path, monkeypatch):
+    """Two workers, which were started in another folder than the command and its relative paths."""
+    import distributed
+
+    out, report = smoke
+    shutil.copytree(out / "smoke", tmp_path / "again" / "smoke", copy_function=os.link)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
+        monkeypatch.chdir(tmp_path)
+        there = ["--engine", "dask", "--scheduler", workers.scheduler_address]
+        assert main(["evaluate", "--smoke", "--out", "again", *there]) == 0
+    found = json.loads((tmp_path / "again" / "evaluation.json").read_text())
+    assert found.pop("against") == []
+    assert found == {name: value for name, value in report.items() if name != "against"}
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, for the signature study")
     add("--against", type=Path, metavar="DIR", help="a finished evaluation to compare this one with")
     add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
-    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times")
+    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times, all filmed recordings swept")
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     add("--jobs", type=int, default=cores, help="processes (default: one a core)")
@@ -103,6 +103,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.studies.trials.hearing import Hearing
 
     _check(arguments)
+    if arguments.scheduler is not None:
+        _in_full(arguments)
     output_folder(arguments.out, "evaluation.json")
     takes = _takes(arguments)
     lacking_data(takes)
@@ -166,6 +168,7 @@ def _degradation(
     """
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.degradation.looks import StagedDetector, motion_detectors
+    from worldstate.studies.evaluation.camera_failure import whole_sweep
     from worldstate.studies.trials.training_windows import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
@@ -178,7 +181,8 @@ def _degradation(
         onnx = argparse.Namespace(**vars(arguments), detector="onnx")
         second = detector_name(onnx), detector_maker(onnx), detector_filter(onnx)
         detectors = detectors[0], StagedDetector(*second)
-    return DegradationSettings(detectors, model, seed=seed)
+    settings = DegradationSettings(detectors, model, seed=seed)
+    return whole_sweep(takes, settings) if arguments.full else settings
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -190,6 +194,15 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
     if arguments.dataset is not None and arguments.smoke:
         raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
+
+
+def _in_full(arguments: argparse.Namespace) -> None:
+    """Name all files in full: the workers of a cluster were started in folders of their own."""
+    for name, value in vars(arguments).items():
+        if isinstance(value, Path):
+            setattr(arguments, name, value.absolute())
+        elif isinstance(value, list) and all(isinstance(one, Path) for one in value):
+            setattr(arguments, name, [one.absolute() for one in value])
 
 
 def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:

@@ -1,6 +1,7 @@
 """The degradation sweep on the recordings of an evaluation that were filmed."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +21,12 @@ from worldstate.studies.trials.pass_cache import FingerprintMemo, PassCache, fin
 from worldstate.studies.trials.takes import TakeList
 
 Begin = Callable[[str, int], None]
+
+
+def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSettings:
+    """Return the settings of a sweep over all filmed recordings, in place of an even choice of them."""
+    calm = [take.hazard_free for take in takes.static if take.filmed]
+    return replace(settings, approaches=calm.count(False), hazard_free=calm.count(True))
 
 
 def lacking_films(takes: TakeList, settings: DegradationSettings) -> str | None:
