@@ -146,11 +146,27 @@ def test_half_of_the_hazard_free_recordings_have_a_vehicle_and_none_of_the_hazar
         draw_settings("SM1", "right", rng)
 
 
+QUIET = replace(
+    preset(), far_rate=0.0, ambient_octaves_db=(-20.0,) * 8, wind_100hz_db=-20.0, self_noise_db=0.0
+)
+
+
+@pytest.mark.parametrize(("name", "has_late_sound"), [("open-road", False), ("wide-crossing", True)])
+def test_late_sound_needs_something_that_sends_it(name, has_late_sound):
+    scene = SimulationSettings(place(name).site, "left", 0.5, entry_s=0.4, sample_rate_hz=8e3, preset=QUIET)
+    loud, none = (
+        simulate_recording(
+            replace(scene, preset=replace(QUIET, late_open_db=level)), np.random.default_rng(1), PAIR
+        ).audio
+        for level in (0.0, -90.0)
+    )
+    assert (loud.std() > 1.5 * none.std()) == has_late_sound
+    assert np.array_equal(loud, none) != has_late_sound
+
+
 def test_a_vehicle_behind_is_heard_and_never_in_view():
-    still = {"ambient_octaves_db": (-20.0,) * 8, "wind_100hz_db": -20.0, "self_noise_db": 0.0}
-    quiet = replace(preset(), far_rate=0.0, **still)
     scene = SimulationSettings(
-        place("open-road").site, "none", 2.0, sample_rate_hz=8e3, preset=quiet,
+        place("open-road").site, "none", 2.0, sample_rate_hz=8e3, preset=QUIET,
         others=(VehicleSettings("left", 1.0, route_m=((-12.0, 60.0), (-12.0, -60.0))),),
     )  # fmt: skip
     recording = simulate_recording(scene, np.random.default_rng(1), PAIR)
