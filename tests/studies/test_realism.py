@@ -98,6 +98,14 @@ def test_the_areas_do_not_depend_on_the_order_of_the_sets():
     assert min(areas.values()) >= 0.5
 
 
+def test_windows_without_a_class_are_compared_by_the_others():
+    table = windows(np.random.default_rng(10))
+    found = measure_realism(
+        table, {"made": table.select(table.labels != "front")}, np.random.default_rng(0), classifiers=False
+    )
+    assert {one.windows for one in found.rows if one.figure.startswith("AUROC")} == {"hidden", "none"}
+
+
 def test_the_side_is_learned_from_other_junctions_and_is_chance_where_labels_are_shuffled():
     rng = np.random.default_rng(6)
     table = windows(rng, n=60)

@@ -59,10 +59,11 @@ def measure_areas(one: FeatureTable, other: FeatureTable) -> dict[FigureKey, flo
     """
     areas: dict[FigureKey, float] = {}
     for windows in CLASS_GROUPS:
-        first, second = (describe_windows(t.features[of_class(t, windows)]) for t in (one, other))
-        origin = np.repeat([False, True], [len(first["level"]), len(second["level"])])
-        for name in MEASURES:
-            area = auroc(np.concatenate([first[name], second[name]]), origin)
-            if area is not None:
+        chosen = [table.features[of_class(table, windows)] for table in (one, other)]
+        if min(map(len, chosen)):
+            first, second = map(describe_windows, chosen)
+            origin = np.repeat([False, True], list(map(len, chosen)))
+            for name in MEASURES:
+                area = auroc(np.concatenate([first[name], second[name]]), origin) or 0.0
                 areas[name, windows] = max(area, 1.0 - area)
     return areas
