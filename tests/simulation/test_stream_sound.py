@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,8 +39,10 @@ from worldstate.adapters.simulation.stream.writing import write_stream
 from worldstate.cli.main import main
 from worldstate.cli.users import simulate
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array
 from worldstate.operations.recordings.true_track import read_true_tracks
+from worldstate.studies.trials.takes import find_takes
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
 # Nothing that swells or fades by itself: what is left is stationary.
@@ -167,6 +170,16 @@ def test_a_stream_on_disk_is_read_like_a_recording(
         np.testing.assert_allclose([float(row["time_s"]) for row in own], track.time_s)
         np.testing.assert_array_equal([row["in_view"] == "1" for row in own], track.in_view)
         assert all((row["time_to_visible_s"] == "") == (event["t0_s"] is None) for row in own)
+    # As hazard-free time of an evaluation it is refused while anything comes out of a hidden arm.
+    listed = tmp_path / "SB1" / "none" / "2_02_0000"
+    shutil.copytree(folder, listed)
+    (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n2_02_0000,SB1,none,70\n")
+    with pytest.raises(InputFileError, match="1 vehicles that come out"):
+        find_takes(tmp_path, hazard_free=[folder])
+    quiet = {"vehicles": [event for event in events if not event["hazard"]], "sounds": []}
+    (folder / "events.json").write_text(json.dumps(quiet))
+    taken = find_takes(tmp_path, hazard_free=[folder]).static[-1]
+    assert (taken.path, taken.name, taken.hazard_free) == (folder, "SB1-busy-33", True)
 
 
 def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(

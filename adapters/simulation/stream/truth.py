@@ -2,8 +2,10 @@
 
 import csv
 import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
 from worldstate.adapters.simulation.dataset.truth import SCHEMA, SCHEMA_VERSION
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 
 from .arrivals import SoundEvent, VehicleEvent
@@ -24,6 +27,7 @@ COLUMNS = (
     "time_s", "vehicle", "x_m", "y_m", "speed_mps", "in_view", "time_to_visible_s", "level_db",
 )  # fmt: skip
 FOLLOWS = "follows"
+EVENTS_NAME, ROWS_NAME = "events.json", "vehicles.csv"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +105,18 @@ def describe_events(
         for number, one in enumerate(sounds, start=len(vehicles))
     ]
     return {"vehicles": told, "sounds": others}
+
+
+def stream_hazards(folder: Path) -> int:
+    """Count the vehicles that come out of a hidden arm in a stream on disk; 0 where it is not simulated."""
+    path = folder / EVENTS_NAME
+    if not path.is_file():
+        return 0
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        return sum(bool(one["hazard"]) for one in told["vehicles"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputFileError(path, f"expected the events of a simulated stream: {error!r}") from error
 
 
 def describe_stream(settings: StreamSettings, vehicles: Sequence[VehicleTruth]) -> dict[str, Any]:

@@ -33,9 +33,16 @@ from .rendering import Block, StreamScene, render_blocks
 from .settings import StreamSettings
 from .sight import camera_frames
 from .spectrogram import Spectrogram
-from .truth import VehicleTruth, describe_events, describe_stream, rows_csv, vehicle_truth
+from .truth import (
+    EVENTS_NAME,
+    ROWS_NAME,
+    VehicleTruth,
+    describe_events,
+    describe_stream,
+    rows_csv,
+    vehicle_truth,
+)
 
-EVENTS_NAME, ROWS_NAME = "events.json", "vehicles.csv"
 ARRIVALS, CHANNELS, LEVEL, CAMERA, SOUNDS = 0, 1, 2, 5, 6  # purposes of generators; 3 and 4 are the pieces'
 
 
