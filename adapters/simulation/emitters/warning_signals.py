@@ -10,13 +10,15 @@ from .signals import bursts, gate, harmonics
 # lasts is assumed. Its compressed-air horns carry their energy above 1 kHz: DIN 14610's technical rules ask
 # for a harmonic of 104 dB there.
 TWO_TONES_HZ, TONE_S, GLIDE_S = (410.0, 547.0), 0.75, 0.03
-HORN_PARTIALS = (0.5, 0.7, 1.0, 1.0, 0.9, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)
+# Signs are those of the lowest peak, 4 dB over the rms for 10 without: partials in step are a train of clicks,
+# which would clip at the microphones long before the tone does.
+HORN_PARTIALS = (0.5, 0.7, -1.0, 1.0, 0.9, 0.7, 0.5, -0.35, -0.25, -0.18, 0.12, 0.08)
 # An electronic siren's wail: 10 to 30 cycles a minute (13 CCR 1028); its span is assumed.
 WAIL_HZ, WAILS_HZ = (600.0, 1400.0), (0.2, 0.35)
 WAIL_PARTIALS = (1.0, 0.1, 0.35, 0.05, 0.2, 0.03, 0.1)  # nearly a square wave
 # Two discs a third apart (assumed); UN Regulation No. 28 asks for 1.8 to 3.55 kHz to be the loudest part.
 DISCS_HZ, DISC_SPREAD = (420.0, 505.0), 0.05
-DISC_PARTIALS = (0.3, 0.3, 0.4, 0.6, 0.9, 1.0, 0.9, 0.7, 0.4, 0.25, 0.15, 0.1)
+DISC_PARTIALS = (0.3, 0.3, 0.4, -0.6, -0.9, -1.0, 0.9, -0.7, -0.4, 0.25, -0.15, 0.1)
 BLAST_S, PAUSE_S = (0.3, 1.2), (0.4, 2.0)
 # One tone between 1 and 1.2 kHz, half of a second on and half off (assumed within SAE J994).
 BEEP_HZ, BEEPS_HZ = (1000.0, 1200.0), (0.95, 1.05)
