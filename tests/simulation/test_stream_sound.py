@@ -100,6 +100,19 @@ def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() 
     assert levels[50] == pytest.approx(10 * np.log10((around**2).mean() / 4e-10), abs=0.02)
 
 
+def test_a_signal_is_heard_over_its_vehicle_and_leaves_it_as_it_is() -> None:
+    scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=20.0)
+    plain, warning = (
+        event_sound(one, site("SB1"), scene.preset, scene.microphones, np.random.default_rng(2)).pressure_pa
+        for one in (event, replace(event, signal="siren"))
+    )
+    frequency, power = welch((warning - plain)[0], 3000.0, nperseg=1024)
+    # In the hidden arm it comes towards us: both tones are up to 3 % higher.
+    tones = [(frequency > tone) & (frequency < 1.04 * tone) for tone in (400.0, 535.0)]
+    assert sum(power[tone].sum() for tone in tones) > 0.5 * power[frequency < 700.0].sum()
+    assert (warning - plain).std() > 3 * plain.std()
+
+
 def test_no_seam_can_be_measured_where_pieces_of_background_meet() -> None:
     scene = scene_of(2.0, rate_hz=2000.0)
     sound = sound_of(scene, ())

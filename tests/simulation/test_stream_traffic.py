@@ -196,3 +196,25 @@ def test_streams_refuse_what_they_cannot_be() -> None:
         Traffic("test", {"up": 3.0})
     with pytest.raises(InvalidArgumentError, match="minutes"):
         replace(StreamSettings(site("SA1"), 1.0), minutes=1000.0)
+
+
+def test_signals_are_the_vehicles_own_and_bells_those_of_riders() -> None:
+    shares = {"siren": 0.3, "bicycle-bell": 0.5}
+    settings = StreamSettings(site("SB1"), 120.0, traffic=replace(traffic_named("busy"), signals=shares))
+    events = draw_events(
+        settings.site, settings.traffic, settings.preset, settings.duration_s, np.random.default_rng(4)
+    )
+    leaders = [event for event in events if event.flow not in ("follows", "far")]
+    riders = {
+        rides: [one for one in leaders if (one.manoeuvre.motion.kind.name in ("bicycle", "scooter")) == rides]
+        for rides in (True, False)
+    }
+    for rides, signal in ((True, "bicycle-bell"), (False, "siren")):
+        warned = Counter(one.signal for one in riders[rides])
+        assert set(warned) <= {"", signal}
+        expected = shares[signal] * len(riders[rides])
+        assert abs(warned[signal] - expected) < 4 * np.sqrt(expected)
+    told = describe_events([vehicle_truth(0, leaders[0], settings)], [], {})["vehicles"][0]
+    assert told["signal"] == (leaders[0].signal or None)
+    with pytest.raises(InvalidArgumentError, match="signals"):
+        Traffic("test", {}, signals={"voice": 0.1})

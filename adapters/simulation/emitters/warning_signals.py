@@ -10,8 +10,8 @@ from .signals import bursts, gate, harmonics
 # lasts is assumed. Its compressed-air horns carry their energy above 1 kHz: DIN 14610's technical rules ask
 # for a harmonic of 104 dB there.
 TWO_TONES_HZ, TONE_S, GLIDE_S = (410.0, 547.0), 0.75, 0.03
-# Signs are those of the lowest peak, 4 dB over the rms for 10 without: partials in step are a train of clicks,
-# which would clip at the microphones long before the tone does.
+# The signs give the lowest peak, 4 dB over the rms where partials in step have 10: those are trains of clicks
+# and clip at the microphones long before a tone does.
 HORN_PARTIALS = (0.5, 0.7, -1.0, 1.0, 0.9, 0.7, 0.5, -0.35, -0.25, -0.18, 0.12, 0.08)
 # An electronic siren's wail: 10 to 30 cycles a minute (13 CCR 1028); its span is assumed.
 WAIL_HZ, WAILS_HZ = (600.0, 1400.0), (0.2, 0.35)

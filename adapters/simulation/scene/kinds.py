@@ -39,6 +39,7 @@ class VehicleKind:
     propulsion_b_db: Octaves
     propulsion_until_kmh: float = np.inf  # Above, it falls silent within 5 km/h: the warning of electric cars
     engine_m: float = 0.3  # Height of the engine as a source; tyres are at `TYRE_M`
+    ridden_mps: tuple[float, float] | None = None  # Its speeds, where they are not those of the street
     harmonic_share: float = 0.5  # Share of the engine's power in multiples of its firing frequency
 
 
@@ -100,6 +101,7 @@ BICYCLE = replace(
     width_m=0.6,
     height_m=1.8,
     axles_m=(0.35, 1.45),
+    ridden_mps=(3.5, 6.0),
     rolling_a_db=(63.1, 69.2, 67.7, 73.1, 80.1, 76.7, 70.8, 64.2),
     propulsion_a_db=NO_OCTAVES,
     propulsion_b_db=FLAT,
@@ -113,6 +115,7 @@ SCOOTER = replace(
     length_m=1.2,
     height_m=1.8,
     axles_m=(0.1, 0.95),
+    ridden_mps=(3.5, 5.5),  # they end at 20 km/h
     rolling_a_db=(66.1, 73.2, 74.7, 80.1, 84.1, 80.7, 74.8, 66.2),
     propulsion_a_db=(SILENT_DB, SILENT_DB, 56.0, 60.0, 60.0, 56.0, 52.0, SILENT_DB),
     propulsion_b_db=(0.0, 0.0, 20.0, 20.0, 20.0, 20.0, 20.0, 0.0),

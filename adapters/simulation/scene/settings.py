@@ -9,7 +9,7 @@ from worldstate.ground.errors import InvalidArgumentError
 
 from .ego_motion import EgoMotion
 from .junction import MOVING_SITES, Site, site
-from .kinds import vehicle_kind
+from .kinds import VehicleKind, vehicle_kind
 from .places import Way, place_of
 from .presets import Preset, preset
 from .sound_kinds import SIGNALS
@@ -242,7 +242,7 @@ def draw_settings(
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
-        speed_mps=rng.uniform(*(SPEEDS_MPS if plan.opposite_wall_m is None else WALLED_SPEEDS_MPS)),
+        speed_mps=rng.uniform(*speeds_mps(plan, vehicle_kind(kind))),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
         parked_car=bool(rng.random() < 0.3) and known is None,
         kind=kind,
@@ -260,6 +260,12 @@ def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
         "left", settings.entry_s, settings.speed_mps, 0.0, settings.kind, route_m=way.route_m
     )
     return replace(settings, others=(plain,))
+
+
+def speeds_mps(site: Site, kind: VehicleKind) -> tuple[float, float]:
+    """Range of the speeds of a kind of vehicle at a site, before braking."""
+    street = SPEEDS_MPS if site.opposite_wall_m is None else WALLED_SPEEDS_MPS
+    return kind.ridden_mps or street
 
 
 def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:

@@ -12,7 +12,7 @@ from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 
-from .manoeuvres import LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
+from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
 from .settings import StreamSettings
 from .traffic import Traffic
 
@@ -29,6 +29,7 @@ class VehicleEvent:
     flow: str  # The flow that it arrived in, or "follows"
     manoeuvre: Manoeuvre
     start_s: float  # Time of the stream at which the clock of its motion is 0
+    signal: str = ""  # What it warns with
 
     @property
     def end_s(self) -> float:
@@ -77,9 +78,12 @@ def _arrival(
         # Nobody hears a bicycle two streets away.
         heard = vehicle_kind("light") if flow == "far" and kind.name == "bicycle" else kind
         driver = draw_driver(site, heard, preset, rng, arm)
+        signal = _signal(traffic, heard, rng)
+        if signal:
+            driver = replace(driver, reach_m=EARSHOT_M[1])  # louder than its tyres
         leader = MANOEUVRES[flow](driver, rng)
         late_s = TOGETHER_S * rng.standard_normal() if flow == "both" and arm == RIGHT else 0.0
-        yield _event(flow, arrival_s + late_s, leader)
+        yield replace(_event(flow, arrival_s + late_s, leader), signal=signal)
         if arm is None:
             continue
         last = leader
@@ -106,6 +110,14 @@ def draw_sounds(settings: StreamSettings, microphones: int, rng: np.random.Gener
 
 def _event(flow: str, arrival_s: float, manoeuvre: Manoeuvre) -> VehicleEvent:
     return VehicleEvent(flow, manoeuvre, arrival_s + manoeuvre.gap_s - manoeuvre.arrives_s)
+
+
+def _signal(traffic: Traffic, kind: VehicleKind, rng: np.random.Generator) -> str:
+    """Draw what a vehicle warns with; only what is ridden has a bicycle's bell."""
+    for signal, share in traffic.signals.items():
+        if (signal == "bicycle-bell") == (kind.ridden_mps is not None) and rng.random() < share:
+            return signal
+    return ""
 
 
 def _kind(traffic: Traffic, rng: np.random.Generator) -> VehicleKind:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.adapters.simulation.emitters.placed_sound import add_sound
+from worldstate.adapters.simulation.emitters.placed_sound import add_signal, add_sound
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.adapters.simulation.scene.presets import Preset
@@ -59,6 +59,8 @@ def event_sound(
         time, manoeuvre = np.arange(-before, blocks + 1) * knot_s, event.manoeuvre
         path = manoeuvre.motion.trajectory(time, manoeuvre.heard)
         add_vehicle(static, site, preset, path, receiver, rng)
+        if event.signal:
+            add_signal(static, event.signal, path, site, preset, receiver, rng)
     static.render()
     sound *= _envelope(event, site, receiver)
     return EventSound(round(event.start_s * rate), sound)

@@ -14,7 +14,7 @@ from worldstate.adapters.simulation.scene.settings import (
     BRAKING_MPS2,
     BRAKING_SHARE,
     SPEEDS_MPS,
-    WALLED_SPEEDS_MPS,
+    speeds_mps,
 )
 from worldstate.adapters.simulation.scene.vehicle import (
     POWER_TO_1M_DB,
@@ -26,7 +26,6 @@ from worldstate.ground.typing import FloatArray
 
 from .motion import Motion, SpeedLimit, confined, drive_along
 
-BICYCLE_MPS = (3.5, 6.0)
 TURN_MPS, TURN_RADIUS_M, ARC_STEPS = 4.0, 3.5, 16
 OWN_LANE_M = 1.8  # beside the ego, whose half width is .9 m, with what a side wall leaves
 KERB_M = 0.95  # half a vehicle and a hand's breadth
@@ -85,8 +84,7 @@ def draw_driver(
     site: Site, kind: VehicleKind, preset: Preset, rng: np.random.Generator, arm: str | None = None
 ) -> Driver:
     """Draw an arm, a speed and whether the driver brakes before a blind junction."""
-    speeds = SPEEDS_MPS if site.opposite_wall_m is None else WALLED_SPEEDS_MPS
-    speed = float(rng.uniform(*(BICYCLE_MPS if kind.name == "bicycle" else speeds)))
+    speed = float(rng.uniform(*speeds_mps(site, kind)))
     braking = float(rng.uniform(*BRAKING_MPS2)) if rng.random() < BRAKING_SHARE else 0.0
     chosen = LEFT if rng.random() < 0.5 else RIGHT
     return Driver(site, kind, arm or chosen, speed, braking, earshot_m(site, kind, speed, preset))

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
-from worldstate.adapters.simulation.scene.sound_kinds import sound_kind
+from worldstate.adapters.simulation.scene.sound_kinds import SIGNALS, sound_kind
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
@@ -12,8 +12,12 @@ from worldstate.ground.errors import InvalidArgumentError
 HAZARDS = ("left", "right", "both", "waits")
 FLOWS = (*HAZARDS, "turns_away", "parks", "far", "from_behind", "from_ahead")
 MOST_PER_HOUR = 3600.0
-# Cars, delivery vans and lorries, electric cars, bicycles of a town's side streets; assumed, not counted.
-TOWN_KINDS = {"light": 0.72, "medium": 0.07, "heavy": 0.03, "electric": 0.08, "bicycle": 0.10}
+# Cars, delivery vans and lorries, electric cars, bicycles and kick scooters of a side street; assumed, not
+# counted.
+TOWN_KINDS = {
+    **{"light": 0.70, "medium": 0.07, "heavy": 0.03, "electric": 0.08},
+    **{"bicycle": 0.10, "scooter": 0.02},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +29,7 @@ class Traffic:
     follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has another one behind it
     kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normed
     sounds: Mapping[str, float] = field(default_factory=dict)  # What else sounds, by kind, an hour
+    signals: Mapping[str, float] = field(default_factory=dict)  # Shares of the vehicles that warn, by signal
 
     def __post_init__(self) -> None:
         for flow, rate in self.per_hour.items():
@@ -34,6 +39,10 @@ class Traffic:
         for sound, rate in self.sounds.items():
             sound_kind(sound)
             in_range(f"sounds[{sound!r}]", rate, 0.0, MOST_PER_HOUR)
+        for signal, share in self.signals.items():
+            if signal not in SIGNALS:
+                raise InvalidArgumentError(f"signals: expected {', '.join(SIGNALS)}, got {signal!r}")
+            in_range(f"signals[{signal!r}]", share, 0.0, 1.0)
         # A share of one would make a queue without an end.
         in_range("follower_share", self.follower_share, 0.0, 0.9)
         for kind, share in self.kinds.items():

@@ -86,6 +86,7 @@ def describe_events(
             "vehicle": one.number,
             "flow": one.event.flow,
             "kind": one.event.manoeuvre.motion.kind.name,
+            "signal": one.event.signal or None,
             "arm": one.event.manoeuvre.arm,
             "hazard": one.hazard,
             "t0_s": one.t0_s,

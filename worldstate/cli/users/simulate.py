@@ -21,7 +21,7 @@ Half of their hazard-free recordings have a vehicle in plain view, or one that i
 sound, array.xml, camera results, truth.json, events.json (an entry a vehicle), vehicles.csv (a row a vehicle
 and tenth of a second: position, speed, in view, time to visible, level at the array) and stream.png.
 --traffic no-hazard is busy, but nothing comes out of a hidden arm: whatever warns there is wrong.
---sounds come twelve times an hour each.
+--sounds come twelve times an hour each; a tenth of the vehicles has each signal of them.
 """
 
 import argparse
@@ -52,7 +52,8 @@ PRESETS = ("street-5", "street-5-calm")
 STREAM_SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")
 TRAFFICS = ("calm", "busy", "no-hazard", "empty")
 FIGURE_NAME = "stream.png"
-PER_HOUR = 12.0  # of every kind of --sounds in a stream
+PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
+SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
 
 EXAMPLE = """\
 examples:
@@ -152,6 +153,7 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.adapters.simulation.scene.junction import site
     from worldstate.adapters.simulation.scene.presets import preset
     from worldstate.adapters.simulation.scene.settings import SAMPLE_RATE_HZ, rate_for
+    from worldstate.adapters.simulation.scene.sound_kinds import SIGNALS
     from worldstate.adapters.simulation.stream.settings import StreamSettings
     from worldstate.adapters.simulation.stream.traffic import traffic_named
     from worldstate.ground.checks import in_range
@@ -161,7 +163,11 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
         site=site(arguments.site),
         minutes=arguments.minutes,
         seed=arguments.seed,
-        traffic=replace(traffic_named(arguments.traffic), sounds=dict.fromkeys(arguments.sounds, PER_HOUR)),
+        traffic=replace(
+            traffic_named(arguments.traffic),
+            sounds=dict.fromkeys((kind for kind in arguments.sounds if kind not in SIGNALS), PER_HOUR),
+            signals=dict.fromkeys((kind for kind in arguments.sounds if kind in SIGNALS), SIGNAL_SHARE),
+        ),
         preset=preset(arguments.preset),
         sample_rate_hz=SAMPLE_RATE_HZ
         if band is None
