@@ -34,7 +34,7 @@ def _verdicts(found: Realism) -> tuple[list[dict[str, bool | None]], list[dict[s
 
 def _head(names: list[str]) -> str:
     spans = f"{'real against real':>19}{'of a type':>13}{'asked':>13}"
-    return f"{'figure':<50}{'windows':<14}{'real':>8}{spans}" + "".join(
+    return f"{'figure':<53}{'windows':<14}{'real':>8}{spans}" + "".join(
         f"{name[-10:]:>11}  " for name in names
     )
 
@@ -42,7 +42,7 @@ def _head(names: list[str]) -> str:
 def _line(row: RealismRow, names: list[str]) -> str:
     columns = "".join(f"{_number(row.simulated.get(name)):>11}{_marks(row, name):<2}" for name in names)
     spans = f"{_span(row.halves):>19}{_span(row.junctions):>13}{_span(row.asked):>13}"
-    return f"{row.figure:<50}{row.windows:<14}{_number(row.real):>8}{spans}{columns}"
+    return f"{row.figure:<53}{row.windows:<14}{_number(row.real):>8}{spans}{columns}"
 
 
 def _marks(row: RealismRow, name: str) -> str:
