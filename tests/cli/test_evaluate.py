@@ -61,7 +61,7 @@ def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, cap
     broken[0].write_bytes(broken[0].read_bytes()[:-1000])
     write_array_xml(tmp_path / "array.xml", ovad_array())
     more = ["--hazard-free", *map(str, broken), "--against", str(out)]
-    assert main(["evaluate", "--smoke", "--out", str(out), *more]) == 0
+    assert main(["evaluate", "--smoke", "--jobs", "2", "--out", str(out), *more]) == 0
     again = json.loads((out / "evaluation.json").read_text())
     assert {path: path.stat().st_mtime_ns for path in (out / "cache").rglob("*.npz")} == kept
     assert again["protocols"] == report["protocols"]
