@@ -15,6 +15,7 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
     park,
 )
 from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.ground.typing import FloatArray
 
 from .arrivals import SoundEvent, VehicleEvent
 from .settings import StreamSettings
@@ -49,32 +50,43 @@ def camera_frames(
     if to_park.random() < PARKED_SHARE:
         frames = park(settings.site, camera, count, to_park)
     for event, draws in zip(events, to_vehicles.spawn(len(events)), strict=True):
-        numbers = np.arange(
-            max(int(np.ceil(event.start_s * FRAME_RATE_HZ)), 0),
-            min(int(np.ceil(event.end_s * FRAME_RATE_HZ)), count),
-        )
-        path = event.manoeuvre.motion.trajectory(numbers / FRAME_RATE_HZ - event.start_s)
-        # What is beside or behind the camera has no picture in it.
-        ahead = path.behind(0.0)[0] > NEAREST_BOX_M
-        boxes = detect(path.at(path.time_s[ahead]), settings.site, camera, draws)
-        for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
-            frames[number] += seen
+        _add_boxes(frames, event, settings.site, draws)
+    _add_clutter(frames, to_clutter)
+    return lost(frames, _soiled(sounds, count), to_rain)
+
+
+def _add_boxes(frames: list[Frame], event: VehicleEvent, site: Site, rng: np.random.Generator) -> None:
+    first, last = (int(np.ceil(time_s * FRAME_RATE_HZ)) for time_s in (event.start_s, event.end_s))
+    numbers = np.arange(max(first, 0), min(last, len(frames)))
+    path = event.manoeuvre.motion.trajectory(numbers / FRAME_RATE_HZ - event.start_s)
+    # What is beside or behind the camera has no picture in it.
+    ahead = path.behind(0.0)[0] > NEAREST_BOX_M
+    boxes = detect(path.at(path.time_s[ahead]), site, PinholeCamera(), rng)
+    for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
+        frames[number] += seen
+
+
+def _soiled(sounds: Sequence[SoundEvent], count: int) -> FloatArray:
+    """Share of the boxes that drops on the lens take, shape (count,)."""
     missed, time = np.zeros(count), np.arange(count) / FRAME_RATE_HZ
     for one in sounds:
+        # A lens dries when the rain is over; how long that takes is not modelled.
         raining = (time >= one.start_s + one.sound.start_s) & (time < one.end_s)
         missed = np.maximum(missed, one.sound.lens_missed * raining)
-    return lost(_with_clutter(frames, camera, to_clutter), missed, to_rain)
+    return missed
 
 
-def _with_clutter(frames: list[Frame], camera: PinholeCamera, rng: np.random.Generator) -> list[Frame]:
+def _add_clutter(frames: list[Frame], rng: np.random.Generator) -> None:
+    camera = PinholeCamera()
     for _ in range(rng.poisson(CLUTTER_PER_HOUR * len(frames) / FRAME_RATE_HZ / 3600.0)):
         first = int(rng.integers(len(frames)))
         width = rng.uniform(*CLUTTER_WIDTH_PX)
         height = width * rng.uniform(*CLUTTER_SHAPE)
         left = rng.uniform(0.0, camera.width_px - width)
+        # About the horizon, where a detector that knows streets looks for vehicles.
         top = rng.uniform(0.3, 0.7) * (camera.height_px - height)
         left, top, right, bottom = (round(float(v), 1) for v in (left, top, left + width, top + height))
-        score = round(float(rng.uniform(*CLUTTER_SCORE)), 4)
-        for number in range(first, min(first + int(rng.integers(*CLUTTER_IMAGES) + 1), len(frames))):
-            frames[number] += (SimulatedDetection((left, top, right, bottom), score),)
-    return frames
+        box = SimulatedDetection((left, top, right, bottom), round(float(rng.uniform(*CLUTTER_SCORE)), 4))
+        images = int(rng.integers(*CLUTTER_IMAGES, endpoint=True))
+        for number in range(first, min(first + images, len(frames))):
+            frames[number] += (box,)

@@ -27,6 +27,7 @@ class Spectrogram:
         length = frames * FFT_SAMPLES
         whole = np.concatenate([self._rest, samples_pa])
         cut = len(whole) // length * length
+        # Blocks without overlap lose a third of the samples to the window, which a picture does not need.
         window = np.hanning(FFT_SAMPLES).astype(np.float32)
         blocks = whole[:cut].reshape(-1, frames, FFT_SAMPLES) * window
         for block in blocks:

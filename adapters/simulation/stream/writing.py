@@ -124,6 +124,7 @@ def write_stream(
     vehicles = tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events))
     sounds = draw_sounds(settings, listening.n_microphones, settings.generator(SOUNDS))
     heard = Spectrogram(settings.sample_rate_hz)
+    # Beside the target, on the same disk, so that the whole stream takes its name in one step.
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
         temporary = Path(hidden) / target.name
         temporary.mkdir()
@@ -145,6 +146,7 @@ def _write_sound(
     """Write the blocks as they come; return the levels of all events."""
     microphones, rate = scene.microphones, scene.settings.sample_rate_hz
     channels = len(microphones.positions_m)
+    # Gains are the converters': they come after everything that sounds, and are in no level of the truth.
     gains = (microphones.gains / FULL_SCALE_PA).astype(np.float32)[:, None]
     middle = int(
         np.linalg.norm(microphones.positions_m - microphones.positions_m.mean(axis=0), axis=1).argmin()
