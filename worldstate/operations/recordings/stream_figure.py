@@ -37,7 +37,7 @@ HIDDEN_STYLE, SEEN_STYLE = ":", "-"
 def write_stream_figure(stream: WrittenStream, path: Path) -> None:
     """Draw ways, spectrogram and events of a stream; the kind of file follows from the ending of its name."""
     with figure_file(path, 11.0, 9.0) as figure:
-        above, middle, below = figure.subplots(3, 1, height_ratios=(0.9, 1.0, 0.8))
+        above, middle, below = figure.subplots(3, 1, height_ratios=(0.8, 0.9, 1.0))
         _draw_map(above, stream)
         _draw_spectrogram(middle, stream)
         _draw_events(below, stream)
@@ -93,18 +93,16 @@ def _draw_spectrogram(axes: "Axes", stream: WrittenStream) -> None:
 
 
 def _draw_events(axes: "Axes", stream: WrittenStream) -> None:
-    flows = list(FLOW_COLOURS)
+    rows = [*FLOW_COLOURS, *sorted({one.sound.kind for one in stream.sounds})]
     for one in stream.vehicles:
-        _draw_event(axes, one, flows.index(one.event.flow))
+        _draw_event(axes, one, rows.index(one.event.flow))
     for sound in stream.sounds:
-        axes.broken_barh(
-            [(sound.start_s, sound.end_s - sound.start_s)], (len(flows) - 0.35, 0.7), color="0.8"
-        )
-        axes.text(sound.start_s, len(flows), sound.sound.kind, fontsize=6, va="center", clip_on=True)
-    flows.append("other sounds")
-    axes.set(yticks=range(len(flows)), yticklabels=[flow.replace("_", " ") for flow in flows])
+        span = (sound.start_s, sound.end_s - sound.start_s)
+        axes.broken_barh([span], (rows.index(sound.sound.kind) - 0.35, 0.7), color="0.7", lw=0)
+    axes.set(yticks=range(len(rows)), yticklabels=[row.replace("_", " ") for row in rows])
+    axes.tick_params(axis="y", labelsize=7)
     axes.set(xlabel="time (s); pale: in earshot, full: in view, tick: first line of sight")
-    axes.set_ylim(len(flows) - 0.4, -0.6)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
 
 
 def _draw_event(axes: "Axes", one: VehicleTruth, row: int) -> None:
