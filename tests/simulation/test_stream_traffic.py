@@ -27,7 +27,7 @@ from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.adapters.simulation.stream.sight import (
     CLUTTER_IMAGES,
     CLUTTER_PER_HOUR,
-    camera_frames,
+    detected_frames,
     visible_s,
 )
 from worldstate.adapters.simulation.stream.traffic import FLOWS, HAZARDS, Traffic, traffic_named
@@ -153,8 +153,8 @@ def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
 def test_boxes_follow_what_is_in_view_with_misses_and_clutter() -> None:
     settings = StreamSettings(site("SB1"), 10.0, traffic=Traffic("test", {"left": 240.0}, kinds={"light": 1}))
     events = draw_events(settings.site, settings.traffic, preset(), 600.0, np.random.default_rng(2))
-    frames = camera_frames(settings, events, [], np.random.default_rng(1))
-    alone = camera_frames(settings, [], [], np.random.default_rng(1))
+    frames = detected_frames(settings, events, [], np.random.default_rng(1))
+    alone = detected_frames(settings, [], [], np.random.default_rng(1))
     assert len(frames) == len(alone) == 6000
     added = np.array([len(a) - len(b) for a, b in zip(frames, alone, strict=True)])
     vehicles = [vehicle_truth(i, event, settings) for i, event in enumerate(events)]
@@ -181,7 +181,7 @@ def test_other_sounds_come_at_their_rate_and_rain_takes_boxes() -> None:
     assert all(0.0 <= one.start_s < 3600.0 for one in sounds)
     short = replace(settings, minutes=2.0)
     soaked = SoundEvent(SoundSettings("rain", 2.0, 58.0, lens_missed=0.999), 0.0)
-    dry, wet = (camera_frames(short, [], rain, np.random.default_rng(9)) for rain in ([], [soaked]))
+    dry, wet = (detected_frames(short, [], rain, np.random.default_rng(9)) for rain in ([], [soaked]))
     assert sum(map(len, dry[20:600])) > 500  # this seed has a parked car
     assert sum(map(len, wet[20:600])) < 20
     assert wet[620:] == dry[620:]

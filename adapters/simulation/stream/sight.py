@@ -37,7 +37,7 @@ def visible_s(event: VehicleEvent, site: Site) -> float | None:
     return round(event.start_s + float(clock[seen.argmax()]), 6) if seen.any() else None
 
 
-def camera_frames(
+def detected_frames(
     settings: StreamSettings,
     events: Sequence[VehicleEvent],
     sounds: Sequence[SoundEvent],

@@ -31,7 +31,7 @@ from .arrivals import SoundEvent, draw_events, draw_sounds
 from .microphones import draw_microphones
 from .rendering import Block, StreamScene, render_blocks
 from .settings import StreamSettings
-from .sight import camera_frames
+from .sight import detected_frames
 from .spectrogram import Spectrogram
 from .truth import (
     EVENTS_NAME,
@@ -177,7 +177,7 @@ def _write_beside(
     levels: dict[int, FloatArray],
 ) -> None:
     events = [one.event for one in vehicles]
-    frames = camera_frames(settings, events, sounds, settings.generator(CAMERA))
+    frames = detected_frames(settings, events, sounds, settings.generator(CAMERA))
     _write_json(folder / DETECTION_NAMES[0], to_json(frames))
     _write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
     _write_json(folder / EVENTS_NAME, describe_events(vehicles, sounds, levels))
