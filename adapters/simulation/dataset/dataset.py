@@ -31,7 +31,7 @@ from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.places import PLACES, place
 from worldstate.adapters.simulation.scene.presets import preset
-from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings
+from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings, rate_for
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
@@ -222,6 +222,8 @@ def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, p
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
     settings = replace(drawn, preset=preset(wanted.preset))
+    if wanted.bandwidth_hz is not None:
+        settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
     if wanted.sounds:
         settings = with_sounds(settings, wanted.sounds, array.n_microphones, rng.spawn(1)[0])
     recording = simulate_recording(settings, rng, array)

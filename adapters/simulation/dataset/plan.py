@@ -17,6 +17,8 @@ from worldstate.ground.errors import InvalidArgumentError
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
 JUNCTION, ALL = "junction", "all"
+# Below, nothing is left of the band that bearings and features are taken from.
+BANDWIDTHS_HZ = (700.0, 32_000.0)
 APPROACH_SIDES = ("left", "right")
 
 
@@ -54,6 +56,8 @@ class DatasetSettings:
         a standing ego at a junction.
     video_width_px : int
         Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
+    bandwidth_hz : float, optional
+        Render up to here only, 700 to 32,000 Hz, at the rate `rate_for`; the full rate if not given.
     sounds : tuple of str
         What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
     preset : str
@@ -80,6 +84,7 @@ class DatasetSettings:
     video_width_px: int = PinholeCamera().width_px
     preset: str = DEFAULT_PRESET
     sounds: tuple[str, ...] = ()
+    bandwidth_hz: float | None = None
 
     def __post_init__(self) -> None:
         in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
@@ -89,6 +94,8 @@ class DatasetSettings:
         in_range("duration_s", self.duration_s, 0.5, 60.0)
         in_range("video_width_px", self.video_width_px, 64, PinholeCamera().width_px)
         vehicle_kind(self.kind)
+        if self.bandwidth_hz is not None:
+            in_range("bandwidth_hz", self.bandwidth_hz, *BANDWIDTHS_HZ)
         in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
         for name in self.sounds:
             sound_kind(name)

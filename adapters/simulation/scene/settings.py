@@ -26,15 +26,17 @@ EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
 
 
 def rate_for(bandwidth_hz: float) -> float:
-    """Return the sample rate that sound of a bandwidth is rendered at, about three times it.
+    """Return the sample rate that sound of a bandwidth is rendered at, three to six times it.
 
     Examples
     --------
-    >>> rate_for(2000.0), rate_for(16_000.0)
-    (5999.75, 47998.0)
+    >>> rate_for(2000.0), rate_for(2500.0), rate_for(16_000.0)
+    (6000.0, 12000.0, 47998.0)
     """
-    # A whole part of the full rate, so that the bins of an STFT fall where those of the full rate do.
-    return SAMPLE_RATE_HZ / max(round(SAMPLE_RATE_HZ / (3.0 * bandwidth_hz)), 1)
+    # Halvings of the full rate, so that frames of 512 samples become 256, 128 or 64 and bins stay. Files
+    # hold whole rates: 5,999.75 Hz read as 6,000 would be a tenth of a second late after an hour.
+    halvings = max(int(np.floor(np.log2(SAMPLE_RATE_HZ / (3.0 * bandwidth_hz)) + 1e-3)), 0)
+    return float(round(SAMPLE_RATE_HZ / 2**halvings))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +127,7 @@ class SimulationSettings:
     parked_car : bool
         Whether a car stands in view.
     sample_rate_hz : float
-        8 to 96 kHz.
+        2 to 96 kHz; sound is rendered up to a third of it.
     preset : Preset
         Levels of everything else.
     kind, manoeuvre, route_m, signal
@@ -171,7 +173,7 @@ class SimulationSettings:
         in_range("entry_s", self.entry_s, 0.0, self.duration_s if self.approach != "none" else 60.0)
         in_range("speed_mps", self.speed_mps, 1.0, 30.0)
         in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
-        in_range("sample_rate_hz", self.sample_rate_hz, 8_000.0, 96_000.0)
+        in_range("sample_rate_hz", self.sample_rate_hz, 2_000.0, 96_000.0)
         in_range("others: number of vehicles", len(self.others), 0, MAX_OTHERS)
         in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
         self.traffic  # noqa: B018  (building the first vehicle checks what is left)

@@ -24,7 +24,7 @@ from .sight import visible_s
 from .traffic import HAZARDS
 
 COLUMNS = (
-    "time_s", "vehicle", "x_m", "y_m", "speed_mps", "in_view", "time_to_visible_s", "level_db",
+    "time_s", "vehicle", "x_m", "y_m", "speed_mps", "in_view", "time_to_visible_s", "loudness_db",
 )  # fmt: skip
 FOLLOWS = "follows"
 EVENTS_NAME, ROWS_NAME = "events.json", "vehicles.csv"
@@ -101,7 +101,7 @@ def describe_events(
             "place_m": list(one.sound.place_m) if one.sound.has_place else None,
             "first_s": round(one.start_s + one.sound.start_s, 3),
             "last_s": round(one.start_s + one.sound.end_s, 3),
-            "level_db": round(float(levels_db[number].max()), 1) if levels_db[number].size else None,
+            "loudness_db": round(float(levels_db[number].max()), 1) if levels_db[number].size else None,
         }
         for number, one in enumerate(sounds, start=len(vehicles))
     ]

@@ -20,6 +20,7 @@ from worldstate.adapters.listen import ListenSettings, Source, Step, listen_step
 from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
@@ -290,7 +291,8 @@ def _music(
     audio: AudioSource, array: MicrophoneArray, frames: Iterable[AcousticFrame], wanted: BoolArray
 ) -> FloatArray:
     """MUSIC bearings of the very samples that the SRP bearings were read from, NaN where not wanted."""
-    chosen, rate = FrontEndSettings(), audio.sample_rate_hz
+    rate = audio.sample_rate_hz
+    chosen = FrontEndSettings(nfft=feature_nfft(rate))
     bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)
     azimuths = chosen.azimuths_rad()
     steering = array.steering(bin_frequencies_hz(bins, rate, chosen.nfft), azimuths).astype(np.complex64)
