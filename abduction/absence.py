@@ -69,15 +69,21 @@ class MissRateTable:
 
     def __call__(self, azimuth_rad: float, degradation: float = 0.0, label: str | None = None) -> float:
         """Return beta at one azimuth (radians, any sign) and degradation in [0, 1]."""
-        magnitude_deg = abs(float(np.degrees(azimuth_rad)))
+        return float(self.over(np.array([azimuth_rad]), degradation, label)[0])
+
+    def over(
+        self, azimuths_rad: FloatArray, degradation: float = 0.0, label: str | None = None
+    ) -> FloatArray:
+        """Return beta at several azimuths, shape (n,), and one degradation."""
         # Asked many times a hop: a comparison, which NaN fails too.
         if not 0.0 <= degradation <= 1.0:
             raise InvalidArgumentError(f"degradation: expected a number in [0, 1], got {degradation}")
-        if magnitude_deg > self.azimuth_deg[-1] or degradation > self.degradation[-1]:
-            return 1.0
+        magnitude_deg = np.abs(np.degrees(azimuths_rad))
+        if degradation > self.degradation[-1]:
+            return np.ones_like(magnitude_deg)
         rows = self.beta if label is None else self.per_class.get(label, self.beta)
         along = [float(np.interp(degradation, self.degradation, row)) for row in rows]
-        return float(np.interp(magnitude_deg, self.azimuth_deg, along))
+        return np.interp(magnitude_deg, self.azimuth_deg, along, right=1.0)
 
 
 def default_miss_rates(half_view_deg: float = 45.0) -> MissRateTable:

@@ -9,6 +9,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
@@ -136,7 +137,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         grounding: Grounding | None = None,
         uncalibrated: bool = False,
     ) -> None:
-        front_end_settings = front_end_settings or FrontEndSettings()
+        front_end_settings = front_end_settings or FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
         domain: ModelDomain | None = getattr(model, "domain", None)
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)

@@ -29,6 +29,7 @@ from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
@@ -112,6 +113,7 @@ class ListenSettings:
         """Return the front-end's settings for an array and a sample rate."""
         ego_noise = self.ego_noise
         return FrontEndSettings(
+            nfft=feature_nfft(sample_rate_hz),
             azimuth_span_deg=self.grid_deg,
             srp_band_hz=self.band_hz or default_band_hz(array, sample_rate_hz),
             ego_noise=(EgoNoiseSettings() if ego_noise else None)

@@ -11,7 +11,7 @@ from worldstate.frontend.approach.tone_stage import ToneStage
 from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of
-from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, segment_feature
+from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
 from worldstate.frontend.direction.peaks import highest_peaks
 from worldstate.frontend.direction.srp import normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
@@ -62,7 +62,7 @@ class FrontEnd:
     sample_rate_hz : float
         Samples per second; more than twice the highest frequency of the bands.
     settings : FrontEndSettings, optional
-        Bands, windows, grids and stages; the values of the paper by default.
+        Bands, windows, grids and stages; the values of the paper by default, with frames of `feature_nfft`.
     start_ns : int
         Time of the first sample, nanoseconds.
 
@@ -96,11 +96,12 @@ class FrontEnd:
     ) -> None:
         self.array = array
         self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
-        self.settings = settings = settings or FrontEndSettings()
+        self.settings = settings = settings or FrontEndSettings(nfft=feature_nfft(self.sample_rate_hz))
         if settings.nfft > self.sample_rate_hz / settings.hop_rate_hz:
             hop = self.sample_rate_hz / settings.hop_rate_hz
             raise InvalidArgumentError(
-                f"nfft: expected at most one hop of {hop:.0f} samples, got {settings.nfft}"
+                f"nfft: expected at most one hop of {hop:.0f} samples, got {settings.nfft}: "
+                "sound of a higher rate (6 kHz will do), or shorter frames"
             )
         self._start_ns = start_ns
         self._n_taken = 0

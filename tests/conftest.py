@@ -19,6 +19,24 @@ settings.register_profile("shared_machine", deadline=None)
 settings.load_profile("shared_machine")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Let the tests that share a fixture run in one process, or each of several makes it again."""
+    for item in items:
+        group = _shared(item)
+        if group is not None and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _shared(item):
+    scopes = {name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()}
+    for name in ("approach", "smoke"):
+        # A parametrised argument may have that name too.
+        if scopes.get(name) == "session":
+            return name
+    return item.module.__name__ if {"module", "package"} & set(scopes.values()) else None
+
+
 @dataclass(frozen=True)
 class Approach:
     """One simulated occluded approach on disk."""
@@ -44,7 +62,8 @@ def approach(tmp_path_factory) -> Approach:
 
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory):
-    """The folder of a smoke evaluation, and its report; a minute: its tests are of one group."""
+    """The folder of a smoke evaluation, and its report."""
     out = tmp_path_factory.mktemp("evaluation")
-    assert main(["evaluate", "--smoke", "--out", str(out)]) == 0
+    # Five pools would import the library in two processes each: the second run in test_evaluate has pools.
+    assert main(["evaluate", "--smoke", "--jobs", "1", "--out", str(out)]) == 0
     return out, json.loads((out / "evaluation.json").read_text())

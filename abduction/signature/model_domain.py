@@ -22,7 +22,7 @@ class ModelDomain:
     positions_m : ndarray, shape (M, 3)
         Its microphones in the order of the channels, `base_link` axes, metres.
     sample_rate_hz : (float, float)
-        Lowest and highest rate.
+        Lowest and highest rate with frames of 512; lower ones with frames shorter by as much count as these.
     band_hz : (float, float)
         Band of the feature.
     feature : str

@@ -8,6 +8,7 @@ from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from sklearn import config_context
 from sklearn.svm import SVC
 
 from worldstate.abduction.cueing.platt import fit_sigmoid
@@ -106,8 +107,10 @@ class PublishedClassifier:
         mean, scale = standardisation(features)
         standard = (features - mean) / scale
         codes = np.searchsorted(CLASSES, labels)
-        machine = SVC(kernel="linear", C=self.penalty, decision_function_shape="ovo").fit(standard, codes)
-        slopes, offsets = self._fit_sigmoids(standard, codes)
+        # Thirty machines of a few dozen windows: checking what is checked above takes as long as they do.
+        with config_context(assume_finite=True, skip_parameter_validation=True):
+            machine = SVC(kernel="linear", C=self.penalty, decision_function_shape="ovo").fit(standard, codes)
+            slopes, offsets = self._fit_sigmoids(standard, codes)
         self.model_ = SignatureModel(
             mean=mean,
             scale=scale,
@@ -148,7 +151,8 @@ class PublishedClassifier:
                 decisions[test] = 1.0 if is_first[train].all() else -1.0
                 continue
             machine = SVC(kernel="linear", C=self.penalty).fit(standard[train], is_first[train])
-            decisions[test] = machine.decision_function(standard[test]) if test.any() else 0.0
+            # The plane itself: scikit-learn checks its input again for as long as it has fitted.
+            decisions[test] = standard[test] @ machine.coef_[0] + machine.intercept_[0]
         return decisions
 
 

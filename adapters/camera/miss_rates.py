@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.special import betaincinv
 
 from worldstate.abduction.absence import MissRateTable
 from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
@@ -63,11 +64,9 @@ class FamilyCounts:
 
     def interval(self, repeats: float = 1.0) -> tuple[FloatArray, FloatArray]:
         """Return the 95 % limits of the Beta posterior of each cell, two arrays of shape (bins, levels)."""
-        from scipy.stats import beta
-
         looks, misses = np.array(self.looks) / repeats, np.array(self.misses) / repeats
         a, b = misses + PRIOR, looks - misses + PRIOR
-        return beta.ppf(0.025, a, b), beta.ppf(0.975, a, b)
+        return betaincinv(a, b, 0.025), betaincinv(a, b, 0.975)
 
     @property
     def clutter_rates(self) -> FloatArray:

@@ -34,7 +34,8 @@ def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, rule: ParkedRule
     since_ns = int(log.stamps_ns[frame]) - nanoseconds(rule.span_s)
     first = int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS))
     past = log.frames[first:frame]
-    if not past or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
+    # Most images of a hidden approach are empty, and this is asked several times a hop.
+    if not past or not len(boxes_px) or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
         return np.zeros(len(boxes_px), dtype=bool)
     apart_px = (np.abs(boxes_px[:, None] - earlier.boxes_px[None]).max(axis=2) for earlier in past)
     present = [(apart <= rule.tolerance_px).any(axis=1) for apart in apart_px]

@@ -248,8 +248,8 @@ class VisionQuery:
         in_view = sector.overlap(self._view)
         if in_view is None:
             return None
-        angles = self.camera.off_axis(in_view.midpoints(SAMPLES)).tolist()
-        seen = float(np.mean([self.miss_rate(angle, d, label) for label in labels for angle in angles]))
+        angles = self.camera.off_axis(in_view.midpoints(SAMPLES))
+        seen = float(np.mean([self.miss_rate.over(angles, d, label) for label in labels]))
         share = in_view.half_width_rad / sector.half_width_rad
         return share * seen + (1.0 - share)
 

@@ -77,9 +77,8 @@ def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
     """Return the array that a sound file is taken to be of, if it has as many channels."""
     with open_audio(path, strict=False) as audio:
         if audio.channels != array.n_microphones:
-            problem = (
-                f"expected --array for its {audio.channels} channels; {array.name} has {array.n_microphones}"
-            )
+            wanted = f"expected --array, or {ARRAY_NAME} beside it, for its {audio.channels} channels"
+            problem = f"{wanted}; {array.name} has {array.n_microphones}"
             raise InputFileError(path, problem)
     _LOG.warning("%s: no array is named; taken as %s, %d microphones", path, array.name, array.n_microphones)
     return array

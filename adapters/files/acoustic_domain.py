@@ -8,24 +8,31 @@ import numpy as np
 from worldstate.abduction.signature.model_domain import EgoMotion, ModelDomain
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_VERSION
+from worldstate.frontend.direction.feature import (
+    FEATURE_BAND_HZ,
+    FEATURE_NFFT,
+    FEATURE_RATE_HZ,
+    FEATURE_VERSION,
+    RATE_TOLERANCE,
+    feature_nfft,
+)
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import IndexArray
 
 from .array_match import array_difference, microphone_order
 
-OVAD_RATE_HZ = 47_998.0
-# Frames have a fixed number of samples: two per cent move the top of the band by a third of a bin.
-RATE_TOLERANCE = 0.02
-WAY_OUT = "Train a model for it (extract-features, train), or go on with --uncalibrated (uncalibrated=True)"
+# Only `run` goes on with a model of another array; the other commands have no such option to name.
+TRAIN = "Train a model for it (extract-features, train)"
+WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
 
 _LOG = logging.getLogger(__name__)
 
 
 def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
     """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
-    low, high = (1.0 - RATE_TOLERANCE) * min(rates_hz), (1.0 + RATE_TOLERANCE) * max(rates_hz)
+    alike = [_rate_of_long_frames(rate, feature_nfft(rate)) for rate in rates_hz]
+    low, high = (1.0 - RATE_TOLERANCE) * min(alike), (1.0 + RATE_TOLERANCE) * max(alike)
     motion = ego_motion_of(environments)
     return ModelDomain(array.name, array.positions_m, (low, high), FEATURE_BAND_HZ, FEATURE_VERSION, motion)
 
@@ -38,10 +45,10 @@ def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
 
 def ovad_domain(environments: Sequence[str]) -> ModelDomain:
     """Return the domain of the windows released with OVAD."""
-    return domain_of(ovad_array(), [OVAD_RATE_HZ], environments)
+    return domain_of(ovad_array(), [FEATURE_RATE_HZ], environments)
 
 
-def check_array(domain: ModelDomain, array: MicrophoneArray) -> IndexArray:
+def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
     """Return the channels of an array in the order that a model was made with.
 
     Raises
@@ -54,7 +61,7 @@ def check_array(domain: ModelDomain, array: MicrophoneArray) -> IndexArray:
         difference = array_difference(domain.positions_m, array)
         made_for = f"{domain.array}, {len(domain.positions_m)} microphones"
         raise OutOfDomainError(
-            f"{array.name}: not the array of the model ({made_for}): {difference}. {WAY_OUT}"
+            f"{array.name}: not the array of the model ({made_for}): {difference}. {way_out}"
         )
     return order
 
@@ -75,7 +82,7 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
     if domain is None:
         _LOG.warning("the model names no array that it was made for: no budget is stated")
         return False
-    check_array(domain, array)
+    check_array(domain, array, WAY_OUT)
     if moving_ego and domain.ego_motion == "standing":
         _LOG.warning("the model was made for a standing ego, this one moves: no budget is stated")
         return False
@@ -83,7 +90,11 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
 
 
 def feature_order(
-    domain: ModelDomain, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings
+    domain: ModelDomain,
+    array: MicrophoneArray,
+    sample_rate_hz: float,
+    settings: FrontEndSettings,
+    way_out: str = WAY_OUT,
 ) -> tuple[int, ...] | None:
     """Return the channels in the model's order where it is another one, or refuse what it was not made for.
 
@@ -93,22 +104,33 @@ def feature_order(
         If array, sample rate, band or feature is not what the model was made with.
     """
     low, high = domain.sample_rate_hz
-    if not low <= sample_rate_hz <= high:
-        expected = f"a model made for {low:.0f} to {high:.0f} Hz expects such sound"
-        raise OutOfDomainError(f"sample rate: {expected}, got {sample_rate_hz:g} Hz. {WAY_OUT}")
+    if not low <= _rate_of_long_frames(sample_rate_hz, settings.nfft) <= high:
+        expected = (
+            f"a model made for {low:.0f} to {high:.0f} Hz and frames of {FEATURE_NFFT} expects such sound"
+        )
+        got = f"{sample_rate_hz:g} Hz and frames of {settings.nfft}"
+        raise OutOfDomainError(
+            f"sample rate: {expected}, or a half, a quarter or an eighth of both, got {got}. {way_out}"
+        )
     made_with = _feature(domain.feature, domain.band_hz)
-    got = _feature(FEATURE_VERSION, settings.feature_band_hz, settings.nfft)
+    got = _feature(FEATURE_VERSION, settings.feature_band_hz)
     if got != made_with:
-        raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {WAY_OUT}")
-    order = check_array(domain, array)
+        raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {way_out}")
+    order = check_array(domain, array, way_out)
     if (np.diff(order) == 1).all():
         return None
     _LOG.warning("%s: the model's microphones in another order; channels are put in the model's", array.name)
     return tuple(order.tolist())
 
 
-def _feature(version: str, band_hz: tuple[float, float], nfft: int = FEATURE_NFFT) -> str:
-    return f"{version}, {band_hz[0]:g} to {band_hz[1]:g} Hz, frames of {nfft}"
+def _feature(version: str, band_hz: tuple[float, float]) -> str:
+    return f"{version}, {band_hz[0]:g} to {band_hz[1]:g} Hz"
+
+
+def _rate_of_long_frames(sample_rate_hz: float, nfft: int) -> float:
+    """Rate at which 512 samples last as long as a frame: ``512 f_s / N``."""
+    # What the feature depends on: a model hears sound of 6 kHz in frames of 64 as it hears that of 48 kHz.
+    return sample_rate_hz * FEATURE_NFFT / nfft
 
 
 def check_tables(model: ModelDomain, table: ModelDomain) -> None:

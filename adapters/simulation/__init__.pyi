@@ -9,8 +9,8 @@ from .scene.junction import SITES as SITES
 from .scene.junction import Site as Site
 from .scene.junction import site as site
 from .scene.kinds import KINDS as KINDS
-from .scene.occlusions import OCCLUSIONS as OCCLUSIONS
-from .scene.occlusions import occluded_scene as occluded_scene
+from .scene.places import PLACES as PLACES
+from .scene.places import place as place
 from .scene.presets import DEFAULT_PRESET as DEFAULT_PRESET
 from .scene.presets import PRESETS as PRESETS
 from .scene.presets import Preset as Preset
@@ -18,3 +18,5 @@ from .scene.presets import preset as preset
 from .scene.settings import SimulationSettings as SimulationSettings
 from .scene.settings import VehicleSettings as VehicleSettings
 from .scene.settings import draw_settings as draw_settings
+from .scene.sound_kinds import SOUNDS as SOUNDS
+from .scene.sound_settings import SoundSettings as SoundSettings

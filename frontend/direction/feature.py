@@ -38,7 +38,28 @@ FEATURE_BAND_HZ = (50.0, 1500.0)
 FEATURE_VERSION = "SRP-PHAT pairs 1"
 """Version of the feature, kept in every model; another number whenever the values for a sound change."""
 FEATURE_NFFT = 512
+FEATURE_RATE_HZ = 47_998.0  # of the released sound
 FEATURE_SEGMENTS = 2
+# Two per cent of the rate move the top of the band by a third of a bin.
+RATE_TOLERANCE = 0.02
+# At 3 kHz the band would end at half the rate, where converters pass nothing any more.
+MOST_HALVINGS = 3
+
+
+def feature_nfft(sample_rate_hz: float) -> int:
+    r"""Return the frame length whose bins fall where the published ones do, else 512.
+
+    .. math:: N = 512 / 2^k, \qquad |2^k f_s / 47\,998 - 1| \le .02, \quad k = 0, \ldots, 3
+
+    Examples
+    --------
+    >>> feature_nfft(47_998), feature_nfft(12_000), feature_nfft(6000), feature_nfft(16_000)
+    (512, 128, 64, 512)
+    """
+    # Only halvings: a third of the rate would need frames of 170.7 samples, and models of such sound exist.
+    halvings = round(np.log2(FEATURE_RATE_HZ / sample_rate_hz))
+    fits = abs(2.0**halvings * sample_rate_hz / FEATURE_RATE_HZ - 1.0) <= RATE_TOLERANCE
+    return FEATURE_NFFT >> halvings if fits and 0 <= halvings <= MOST_HALVINGS else FEATURE_NFFT
 
 
 def feature_steering(
@@ -114,7 +135,7 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     Parameters
     ----------
     window : array_like, shape (n, M)
-        About one second of sound, any unit; n >= 512.
+        About one second of sound, any unit; at least a frame of `feature_nfft` samples.
     array : MicrophoneArray
         One microphone a channel, in the order of the channels.
     sample_rate_hz : float
@@ -145,14 +166,15 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     """
     samples = finite_array("window", window, (None, array.n_microphones))
     rate = in_range("sample_rate_hz", sample_rate_hz, 0.0, np.inf, open_low=True, open_high=True)
-    if len(samples) < FEATURE_NFFT:
-        raise InvalidArgumentError(f"window: expected at least {FEATURE_NFFT} samples, got {len(samples)}")
-    bins = band_bins(FEATURE_BAND_HZ, rate, FEATURE_NFFT)
-    spectra = scipy.signal.stft(samples, nperseg=FEATURE_NFFT, axis=0)[2][bins.start : bins.stop]
+    nfft = feature_nfft(rate)
+    if len(samples) < nfft:
+        raise InvalidArgumentError(f"window: expected at least {nfft} samples, got {len(samples)}")
+    bins = band_bins(FEATURE_BAND_HZ, rate, nfft)
+    spectra = scipy.signal.stft(samples, nperseg=nfft, axis=0)[2][bins.start : bins.stop]
     whitened = whiten(np.ascontiguousarray(spectra.transpose(2, 0, 1), np.complex64))
     length = len(whitened) // FEATURE_SEGMENTS
     with one_blas_thread():
-        steering = feature_steering(array, bins, rate)
+        steering = feature_steering(array, bins, rate, nfft)
         sums = [pair_sum(whitened[i * length :][:length], steering) for i in range(FEATURE_SEGMENTS)]
     return np.concatenate([segment_feature([s], length, len(bins), array.n_microphones) for s in sums])
 

@@ -14,7 +14,8 @@ def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) ->
         )
     if high > nfft // 2:
         raise InvalidArgumentError(
-            f"band_hz: expected less than half the sample rate of {sample_rate_hz} Hz, got {band_hz} Hz"
+            f"band_hz: expected less than half the sample rate of {sample_rate_hz} Hz, got {band_hz} Hz: "
+            "choose a lower band, or sound of a higher rate (simulate: --bandwidth)"
         )
     return range(low, high)
 

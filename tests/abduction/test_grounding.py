@@ -20,9 +20,6 @@ from worldstate.frontend.approach.tone_stage import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.values import NotUsable
 
-# One worker simulates the approach, once.
-pytestmark = pytest.mark.xdist_group("approach")
-
 SCORES = SignatureEvidence(("left", "right"), (0.7, -0.4), 0.1, -0.2)
 SILENT = NotUsable("nothing heard")
 

@@ -25,9 +25,6 @@ from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.measurement.measurement import Bearing
 from worldstate.state.context import Context
 
-# One worker simulates the approach, once.
-pytestmark = pytest.mark.xdist_group("approach")
-
 RATE = 47_998
 HERE = ovad_array().positions_m
 RNG = np.random.default_rng(10)

@@ -23,9 +23,6 @@ from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 
-# One worker simulates the approach, once.
-pytestmark = pytest.mark.xdist_group("approach")
-
 CLASSES = ("front", "left", "none", "right")
 AZIMUTH = np.tile(np.linspace(-1, 1, 30), 2)
 SHAPES = {"front": 1 + AZIMUTH**2, "none": 0 * AZIMUTH, "left": 0.7 - AZIMUTH, "right": 0.7 + AZIMUTH}

@@ -11,7 +11,6 @@ from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
 
 
-@pytest.mark.xdist_group("approach")
 @pytest.mark.parametrize("follows", [False, True])
 def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path):
     sound, rate = soundfile.read(approach.audio_path, dtype="float32")
@@ -41,7 +40,6 @@ def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path
     assert set(whole[0]["bearing"]) == {"azimuth_rad", "std_rad", "prominence"}
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_engine_is_followed_with_ego_noise_only(approach, tmp_path, capsys):
     speed = tmp_path / "rpm.csv"
     speed.write_text("time_s,rpm\n0,1500\n60,1500\n")

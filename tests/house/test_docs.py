@@ -68,7 +68,6 @@ def test_files_that_a_page_names_exist(page):
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_programs_of_the_first_page_run(approach, tmp_path, monkeypatch, capsys):
     text = (ROOT / "docs" / "first_program.md").read_text(encoding="utf-8")
     (tmp_path / "out" / "demo").mkdir(parents=True)

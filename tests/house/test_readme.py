@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from worldstate.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -15,7 +13,6 @@ def first_program() -> str:
     return re.search(r"```python\n(.*?)```", README, flags=re.DOTALL).group(1)
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_first_program_warns_of_the_recording_that_the_demo_leaves(
     approach, tmp_path, monkeypatch, capsys
 ):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.occluders import OccludingBody
 from worldstate.adapters.simulation.scene.route import along
@@ -147,6 +148,25 @@ def test_behind_a_wall_nothing_comes_straight_and_beyond_its_end_it_does():
     assert abs(shares[0]) < 0.03
     assert abs(shares[1]) < 0.03
     assert shares[2] == pytest.approx(1.0, abs=0.03)
+
+
+def test_an_ego_that_drives_hears_a_source_in_its_street_first_ahead_and_then_behind():
+    """Every image is passed, too: a tone after its own changing way, Doppler and all."""
+    ego, f = EgoMotion(8.0, 10.0), 500.0
+    receiver = Receiver(ONE, np.zeros(1), np.arange(whole(1.0) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / FS, ego)
+    start = -whole(HEAD_S) / FS
+    time = start + np.arange(whole(HEAD_S) + receiver.samples) / FS
+    emission = Emission.of(np.cos(2 * np.pi * f * time).astype(np.float32), start, FS)
+    x, y = float(ego.x_m(np.array([0.5]))[0]), -1.6
+    out = np.zeros((1, receiver.samples), np.float32)
+    source = MovingSource(emission, x, np.full(len(emission.knots_s), y), HEIGHT_M)
+    add_sources(StaticSources(out, FS), [source], Surroundings(STREET, receiver, 24.0))
+    heard_s = time[-receiver.samples :]
+    expected = np.zeros(receiver.samples)
+    for image, order in corridor(y, 3.1, 2.9, 3):
+        way = np.hypot(x - ego.x_m(heard_s), image)
+        expected += 0.8**order * np.cos(2 * np.pi * f * (heard_s - way / SPEED_OF_SOUND_MPS)) / way
+    assert error_db(out[0], expected) < -30.0
 
 
 def bearing_deg(sound: np.ndarray, array: MicrophoneArray) -> float:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.special
+from worldstate.adapters.simulation.scene.occlusions import occluded_scene
 
 from worldstate.adapters.simulation import preset, site
 from worldstate.adapters.simulation.scene.ambience import site_ambience
 from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.scene.occlusions import occluded_scene
 from worldstate.adapters.simulation.scene.vehicle import Trajectory, load_db
 from worldstate.adapters.simulation.sound.background import add_background, opening_images
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from worldstate.adapters.simulation import (
     KINDS,
     MOVING_SITES,
-    OCCLUSIONS,
+    PLACES,
     SimulationSettings,
     VehicleSettings,
     draw_settings,
+    place,
     preset,
     simulate_recording,
     site,
@@ -102,17 +103,17 @@ def test_a_place_that_stands_still_is_heard_from_where_it_is():
         assert error_db < -50.0
 
 
+HIDDEN_IN_THE_OPEN = ("SL1", "SP1", "SM1")  # behind a van, a pier, a wall
 SCENES = {
     "turn": lambda: replace(draw_settings("SA1", "left", np.random.default_rng(3)), manoeuvre="turn"),
     "moving": lambda: draw_settings("DA1", "right", np.random.default_rng(4)),
     "moving turn": lambda: replace(draw_settings("DB2", "left", np.random.default_rng(5)), manoeuvre="turn"),
-    **{name: (lambda n=name: scene_settings(n)) for name in OCCLUSIONS},
+    **{name: (lambda n=name: scene_settings(n)) for name in HIDDEN_IN_THE_OPEN},
 }
 
 
 def scene_settings(name: str) -> SimulationSettings:
-    names = {"lead-vehicle": "SL1", "bridge-pier": "SP1", "merge": "SM1"}
-    return draw_settings(names[name], "left", np.random.default_rng(6))
+    return draw_settings(name, "left", np.random.default_rng(6))
 
 
 def heard(scene: SimulationSettings, sound) -> np.ndarray:
@@ -193,12 +194,14 @@ def band_db(x: np.ndarray) -> float:
     return float(10 * np.log10(power[(frequency > 500) & (frequency < 2000)].sum()))
 
 
-@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@settings(max_examples=12, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.data())
 def test_no_scene_gives_silence_nan_or_a_click(data):
     """Any site, kind, way and ego: finite, never still, and no sample leaps out of its neighbourhood."""
     number = st.floats(0.0, 1.0)
-    name = data.draw(st.sampled_from([*MOVING_SITES, "SA2", "SB3", "SL1", "SP1", "SM1"]))
+    name = data.draw(
+        st.sampled_from([*MOVING_SITES, "SA2", "SB3", *(place(other).site.name for other in PLACES)])
+    )
     duration = data.draw(st.floats(0.5, 1.2))
     drawn = draw_settings(name, "left", np.random.default_rng(data.draw(st.integers(0, 99))), duration)
     other = VehicleSettings(

@@ -13,8 +13,8 @@ from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.ego_motion import BRAKING_MPS2, EgoMotion
 from worldstate.adapters.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
 from worldstate.adapters.simulation.scene.occluders import OccludingBody, box, detours, hidden_by
-from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
+from worldstate.adapters.simulation.scene.places import place
 from worldstate.adapters.simulation.scene.vehicle import (
     GEARS_HZ_PER_MPS,
     IDLE_HZ,
@@ -79,7 +79,7 @@ def test_the_road_adds_what_two_waves_average_to(source_m, flat_m):
         assert 20.0 * np.log10(gain) == pytest.approx(expected_db, abs=0.8)
 
 
-@given(st.sampled_from(sorted(KINDS)), st.floats(3.0, 20.0), st.floats(1.1, 2.0))
+@given(st.sampled_from(sorted(set(KINDS) - {"electric"})), st.floats(3.0, 20.0), st.floats(1.1, 2.0))
 def test_every_kind_follows_the_published_speed_laws(name, speed, factor):
     """CNOSSOS: rolling A + B log10(v / 70), propulsion A + B (v - 70) / 70."""
     kind, speeds = vehicle_kind(name), np.array([speed, factor * speed, 70.0 / 3.6])
@@ -89,6 +89,15 @@ def test_every_kind_follows_the_published_speed_laws(name, speed, factor):
     np.testing.assert_allclose(np.diff(rolling)[:, 0], np.array(kind.rolling_b_db) * np.log10(factor))
     risen = np.array(kind.propulsion_b_db) * 3.6 * (factor - 1.0) * speed / 70.0
     np.testing.assert_allclose(np.diff(propulsion)[:, 0], risen, atol=1e-9)
+
+
+def test_an_electric_car_warns_below_20_km_h_as_the_regulation_asks():
+    """UN Regulation No. 138, 6.2.8: 50 dB(A) at 2 m at 10 km/h, 56 at 20; here nothing above 25."""
+    a_weights_db = np.array([-26.2, -16.1, -8.6, -3.2, 0.0, 1.2, 1.0, -1.1])
+    power_db = propulsion_level_db(np.array([10.0, 20.0, 26.0]) / 3.6, vehicle_kind("electric"))
+    at_2m = 10 * np.log10((10 ** ((power_db + a_weights_db[:, None]) / 10)).sum(axis=0)) - 8.0 - 6.0
+    np.testing.assert_allclose(at_2m[:2], [50.0, 56.0], atol=1.0)
+    assert at_2m[2] < 0.0
 
 
 def octave_levels_db(signal: np.ndarray) -> np.ndarray:
@@ -123,9 +132,9 @@ def test_quiet_kinds_are_quiet_and_loud_ones_loud():
         parts = emit(constant(7.0, name), 48_000, FS, 0.0, np.random.default_rng(2))
         return float(20.0 * np.log10(np.std(np.sum([part.signal for part in parts], axis=0))))
 
-    order = [level(name) for name in ("bicycle", "electric", "light", "medium", "heavy")]
+    order = [level(name) for name in ("bicycle", "scooter", "electric", "light", "medium", "heavy")]
     assert np.all(np.diff(order) > 1.0)
-    assert order[2] - order[0] > 15.0
+    assert order[3] - order[0] > 15.0
 
 
 @settings(deadline=None)
@@ -228,21 +237,18 @@ def test_a_long_barrier_hides_who_drives_beside_us():
     assert np.all((detour > 0.0) == expected)
 
 
-@pytest.mark.parametrize("name", sorted(OCCLUSIONS))
-def test_occluded_vehicles_come_into_sight_when_told_and_their_detour_has_no_jumps(name):
-    scene = occluded_scene(name)
-    told = SimulationSettings(scene.site, scene.approach, entry_s=6.0, speed_mps=9.0, route_m=scene.route_m)
+@pytest.mark.parametrize("name", ["lead-vehicle", "bridge-pier", "merge", "one-corner", "parked-van"])
+def test_the_detour_of_a_hidden_vehicle_has_no_jumps_while_it_comes_into_sight(name):
+    there = place(name)
+    (way,) = (way for way in there.ways if way.approach == "left")
+    told = SimulationSettings(there.site, "left", entry_s=6.0, speed_mps=9.0, route_m=way.route_m)
     time = np.linspace(-2.0, 10.0, 12_001)
     (path,) = trajectories(told, time)
-    x, y = path.behind(0.0)
-    assert np.hypot(np.interp(6.0, time, x), np.interp(6.0, time, y)) > 4.0
-    hidden = hidden_by(scene.site.occluders, x, y, (0.0, 0.0))
-    assert hidden[(time > 2.0) & (time < 5.5)].all()
-    assert not hidden[time > 6.3].any()
-    for occluder in scene.site.occluders:
-        detour = detours(occluder, x, y, (0.0, 0.0))[0]
+    for occluder in there.site.occluders:
+        detour = detours(occluder, *path.behind(0.0), (0.0, 0.0))[0]
         near = np.abs(detour) < 0.2  # beyond, nothing is screened any more
-        assert np.abs(np.diff(detour))[near[1:] & near[:-1]].max() < 0.012  # 9 m/s, 1 ms
+        if near.any():
+            assert np.abs(np.diff(detour))[near[1:] & near[:-1]].max() < 0.012  # 9 m/s, 1 ms
 
 
 @pytest.mark.parametrize(
@@ -254,7 +260,7 @@ def test_outlines_that_are_none_are_refused(corners):
 
 
 def test_unknown_names_are_named():
-    for ask in (vehicle_kind, occluded_scene, site):
+    for ask in (vehicle_kind, place, site):
         with pytest.raises(InvalidArgumentError, match="nowhere"):
             ask("nowhere")
 

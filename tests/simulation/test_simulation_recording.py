@@ -15,7 +15,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.simulation import (
     KINDS,
-    OCCLUSIONS,
+    PLACES,
     SITES,
     DatasetSettings,
     SimulationSettings,
@@ -164,7 +164,7 @@ def test_no_setting_gives_silence_or_nan(scene, seed):
 @given(st.sampled_from(SITES), st.sampled_from(["left", "right"]), st.integers(0, 1000))
 def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed):
     rng = np.random.default_rng(seed)
-    scene = replace(draw_settings(name, approach, rng, 10.0), parked_car=False, sample_rate_hz=8_000.0)
+    scene = replace(draw_settings(name, approach, rng, 5.0), parked_car=False, sample_rate_hz=8_000.0)
     recording = simulate_recording(scene, rng, PAIR)
     t0 = recording.t0_frame
     frames = recording.truth["frames"]
@@ -295,7 +295,7 @@ def test_the_command_writes_and_reports(tmp_path, capsys):
 
 def test_the_command_offers_what_the_simulation_has():
     assert sorted(cli.KINDS) == sorted(KINDS)
-    assert sorted(cli.SCENES) == sorted(["junction", *OCCLUSIONS])
+    assert sorted(cli.SCENES) == sorted(["junction", *PLACES, "all"])
     assert list(cli.PRESETS) == list(PRESETS)
     assert cli.PRESETS[0] == DEFAULT_PRESET
 

@@ -107,7 +107,6 @@ def test_identities_and_boxes_are_those_of_another_implementation(seed):
     assert agree(street(np.random.default_rng(seed))) > 10
 
 
-@pytest.mark.xdist_group("approach")
 def test_it_agrees_on_the_boxes_of_a_recording(approach):
     frames = read_detections(approach.detections_path).frames
     assert agree((frame.boxes_px, frame.scores) for frame in frames) >= 1

@@ -45,7 +45,7 @@ from worldstate.studies.degradation.looks import (
     look,
     motion_detectors,
 )
-from worldstate.studies.degradation.rain import RAIN_DB, rained
+from worldstate.studies.degradation.rain import RAIN_DB, level_rms, rained
 from worldstate.studies.degradation.staged_filter import by_condition, cameras, filter_in_conditions
 from worldstate.studies.trials.engine import Engine
 from worldstate.studies.trials.pass_cache import PassCache
@@ -93,7 +93,6 @@ def rates(video):
     )
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
     detector, scale = MotionDetector(), np.array([WHOLE.width_px / WIDTH, WHOLE.height_px / HEIGHT] * 2)
     kept = detections_in(looks["mog2"], CLEAN)
@@ -106,7 +105,6 @@ def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
     assert kept.stamps_ns[:3].tolist() == [0, 100_000_000, 200_000_000]
 
 
-@pytest.mark.xdist_group("approach")
 def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
     watcher = Watcher(MotionDetector(), rates)
     for number, image in enumerate(islice(video.frames(), 90)):
@@ -119,7 +117,6 @@ def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
         Watcher(MotionDetector(), replace(rates, health=None))
 
 
-@pytest.mark.xdist_group("approach")
 def test_d_is_read_from_the_images_alone(looks, rates):
     levels = {
         state.name: np.median(degradation_in(looks[READINGS], state.name, rates).degradation)
@@ -139,7 +136,6 @@ def part(video, first, last):
     )
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_scale_of_d_is_that_of_the_same_images(video):
     conditions = (
         Condition(CLEAN),
@@ -155,7 +151,6 @@ def test_the_scale_of_d_is_that_of_the_same_images(video):
     assert mine.sharpness == pytest.approx(theirs.sharpness, rel=0.05)
 
 
-@pytest.mark.xdist_group("approach")
 def test_counts_are_those_of_measure_absence(approach, video):
     """On clean frames, where nothing is drawn at random."""
     whole, (first, last) = read_detections(approach.detections_path), (60, 100)
@@ -176,7 +171,6 @@ def test_counts_are_those_of_measure_absence(approach, video):
     assert np.array(counted.looks)[:, 0].sum() > 10
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, looks, rates):
     source, seed = open_source(approach.folder), (0, 1)
     behind = cameras(MOTION, {"mog2": rates}, looks)
@@ -217,7 +211,6 @@ def assert_the_sound_says_the_same(source, off):
     assert off.presence == pytest.approx(np.array(presence))
 
 
-@pytest.mark.xdist_group("approach")
 def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
     folder = tmp_path / "recording"
     shutil.copytree(approach.folder, folder)
@@ -243,12 +236,11 @@ def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(appr
     assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
 
 
-@pytest.mark.xdist_group("approach")
 def test_rain_on_the_roof_is_white_and_its_own_at_every_microphone(approach):
     source = open_source(approach.folder)
     with open_sound(source.sound) as audio:
         dry = np.concatenate(list(audio.blocks()))
-    with open_sound(rained(source, 3, np.random.default_rng(3)).sound, 56) as audio:
+    with open_sound(rained(source, 3, level_rms(source), np.random.default_rng(3)).sound, 56) as audio:
         drops = np.concatenate(list(audio.blocks(1 << 14))) - dry
     db = 20.0 * np.log10(drops.std(axis=0) / np.sqrt(np.mean(dry.astype(float).var(axis=0))))
     assert db == pytest.approx(RAIN_DB[3], abs=0.1)
@@ -320,7 +312,6 @@ def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
     assert set(used.values()) == {77.0}
 
 
-@pytest.mark.xdist_group("approach")
 def test_settings_that_cannot_be_are_refused(rates):
     with pytest.raises(InvalidArgumentError, match="names of their own"):
         DegradationSettings(detectors=(*MOTION, *MOTION))

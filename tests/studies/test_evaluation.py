@@ -16,19 +16,23 @@ from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import load_model, read_model, save_model
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
 from worldstate.operations.recordings.bearing_gating import bearing_curve
 from worldstate.operations.recordings.hop_stream import ABSENT
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.studies.evaluation.evaluation import lacking_data
 from worldstate.studies.evaluation.front_end_study import front_end_study
 from worldstate.studies.evaluation.protocol_run import ProtocolRun, run_protocol
 from worldstate.studies.evaluation.protocols import FIXED, PROTOCOLS, RETRAINED, STATIC
 from worldstate.studies.evaluation.scores import Score
 from worldstate.studies.methods.calibrated_cue import CalibratedCue
 from worldstate.studies.methods.published_rule import PublishedRule
+from worldstate.studies.methods.table_rows import methods_for, refused_methods
 from worldstate.studies.streets.simulated_windows import simulated_windows
 from worldstate.studies.trials.classification import Classifiers, classified, junction_of, posteriors
+from worldstate.studies.trials.engine import Failed
 from worldstate.studies.trials.hearing import Hearing
 from worldstate.studies.trials.listening import pass_time_s
 from worldstate.studies.trials.takes import Take, TakeList
@@ -37,6 +41,7 @@ from worldstate.studies.trials.trial import Decisions, Trial
 
 HOPS = 91
 T0_S, PASS_S = 7.0, 8.0
+OURS = ("shipped model", "+ site adaptation", "world-state advisory")
 PUBLISHED, SUSTAINED = PublishedRule("published"), PublishedRule("sustained", sustained=True)
 
 
@@ -262,6 +267,40 @@ def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
     assert len(list((cache / "plain").iterdir())) == 2
     assert np.array_equal(heard.hops.features, other.hops.features)
     assert not np.array_equal(heard.hops.shipped, other.hops.shipped)
+
+
+@pytest.mark.parametrize(
+    ("microphones", "rate_hz", "why"),
+    [(8, 48_000, "not the array of the model"), (56, 44_100, "got 44100 Hz")],
+)
+def test_a_model_is_not_scored_on_sound_that_it_was_not_made_for(microphones, rate_hz, why, tmp_path):
+    array = MicrophoneArray(ovad_array().positions_m[:microphones], "roof")
+    noise = 0.01 * np.random.default_rng(0).standard_normal((rate_hz * 5 // 4, microphones))
+    soundfile.write(tmp_path / "quiet.wav", noise, rate_hz, subtype="FLOAT")
+    write_array_xml(tmp_path / "array.xml", array)
+    trial = Hearing(tmp_path / "cache")(Take(tmp_path / "quiet.wav", "quiet", "quiet"))
+    assert dict(trial.chains) == {} and not {"shipped", "grounded"} & set(trial.hops.columns)
+    assert np.isfinite(trial.hops.features).all()
+    refused, rows = refused_methods([trial]), {method.name for method in methods_for([trial])}
+    assert {*OURS, "shipped scores .02", "grounded .02"} <= set(refused)
+    assert all(why in said and "--uncalibrated" not in said for said in refused.values())
+    assert {"Vision-only", "published", "proposed .02", "ensemble .02"} <= rows
+    assert not rows & set(refused)
+    # Of a standing ego nothing is said past its own noise, refused or not.
+    assert "+ ego-noise cancellation" not in rows | set(refused)
+
+
+def test_windows_of_another_array_are_refused(streets, tmp_path):
+    write_array_xml(tmp_path / "array.xml", MicrophoneArray(ovad_array().positions_m[::7], "ring"))
+    write_features(tmp_path / "windows.csv", table_of(streets))
+    with pytest.raises(OutOfDomainError, match=r"windows of another array.*extract-features"):
+        windows_from_table(tmp_path / "windows.csv", TakeList(tmp_path, (), (), (), False))
+
+
+def test_recordings_that_could_not_be_heard_are_named_where_too_few_are_left():
+    takes = tuple(Take(Path(kind), kind, "SA1", kind, 5.0) for kind in ("left", "none"))
+    with pytest.raises(InvalidArgumentError, match=r"found 1 .*; not heard: right: cut short"):
+        lacking_data(TakeList(Path("streets"), takes, (), (), False), [Failed("right", "cut short")])
 
 
 @pytest.mark.parametrize("last_s", [4.5, 3.2])

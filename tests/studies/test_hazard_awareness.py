@@ -20,7 +20,11 @@ from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.degradation.awareness import AwarenessSettings, hazard_awareness
 from worldstate.studies.degradation.beta_curves import beta_curves, counts_of, counts_table
 from worldstate.studies.degradation.conditions import CLEAN, FAMILIES, OFF, all_conditions
+from worldstate.studies.degradation.degradation_study import DegradationSettings
+from worldstate.studies.degradation.looks import motion_detectors
 from worldstate.studies.degradation.sweep_data import sweep_data
+from worldstate.studies.evaluation.camera_failure import whole_sweep
+from worldstate.studies.trials.takes import Take, TakeList
 
 PRIOR = (0.25,) * 4
 SETTINGS = AwarenessSettings(PRIOR)
@@ -231,3 +235,7 @@ def test_recordings_are_chosen_evenly_and_what_is_missing_is_named(tmp_path):
     )
     assert "hazard-free recordings are missing" in few.lacks
     assert chosen.lacks is None
+    takes = tuple(Take.of(one) for one in [*whole, dark])
+    full = whole_sweep(TakeList(tmp_path, takes, (), (), False), DegradationSettings(motion_detectors()))
+    every = sweep_data([*whole, dark], full.approaches, full.hazard_free)
+    assert set(every.recordings) == set(whole) and every.missing == ()

@@ -239,13 +239,14 @@ def evaluation(tmp_path_factory):
     lacking = {one.name: "needs more" for one in (DYNAMIC, RETRAINED)}
     study = front_end_study(trials, rng, 20)
     return Evaluation(
-        takes, tuple(trials), (), lacking, runs, scores, draws, study, {}, None, EvaluationSettings(draws=50)
+        takes, tuple(trials), (), lacking, runs, scores, draws, study, None, EvaluationSettings(draws=50)
     )
 
 
 def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(evaluation, tmp_path):
-    document = evaluation_document(evaluation)
+    document = evaluation_document(evaluation, configuration=(("--seed", "7"),))
     blocks = {block.name: block for block in document.all_blocks}
+    assert ("--seed", "7") in document.facts
     assert len(blocks) == len(document.all_blocks), "two blocks would share a file"
     assert len(blocks["paper"].rows) == len(PAPER_VALUES)
     row = next(row for row in blocks["table_i"].rows if row[0] == "proposed .02")
@@ -267,6 +268,41 @@ def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(eva
         f"report_files/{path.name}" for path in (tmp_path / "report_files").iterdir()
     }
     assert "not run: needs more" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(evaluation, tmp_path):
+    blocks = {block.name: block for block in evaluation_document(evaluation).all_blocks}
+    hours = 8 * 60 * 0.1 / 3600.0
+    told = f"16 recordings: 8 approaches and 8 hazard-free, {hours:.3f} h."
+    assert {"table_i", "alpha", "calibration", "strata", "ablations", "protocol_junctions_fixed"} <= {
+        name for name, block in blocks.items() if block.caption.startswith(told)
+    }
+    assert {row[2] for row in blocks["junctions"].rows} == {"8"}
+    assert {row[1] for row in blocks["differences"].rows} == {"16"}
+    table = blocks["table_i"]
+    row = next(row for row in table.rows if row[0] == "proposed .02")
+    sites = evaluation.scores["static"]["proposed .02"].by_site()
+    rate = dict(zip(table.columns, row, strict=True))["false alarms (1/h)"]
+    worst = max(sites, key=lambda site: sites[site]["false_alarms_per_hour"])
+    assert rate.note == f"worst {worst} {sites[worst]['false_alarms_per_hour']:.0f}"
+    assert rate.note in csv_text(table)
+    fewer = next(row for row in blocks["paper"].rows if row[2].endswith("false alarms saved"))[5]
+    assert fewer.low <= fewer.value <= fewer.high
+
+
+def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evaluation, tmp_path):
+    why = "<b>: not the array of the model"
+    refused = {"static": {"shipped model": why, "shipped scores .02": why}}
+    document = evaluation_document(replace(evaluation, refused=refused))
+    blocks = {block.name: block for block in document.all_blocks}
+    for name, method in (("table_i", "shipped model"), ("grounded", "shipped scores .02")):
+        (cells,) = (row[1:] for row in blocks[name].rows if row[0] == method)
+        assert cells[0].number == "not scored: the model was not made for this sound"
+        assert not any(math.isfinite(cell.value) for cell in cells)
+        assert blocks[name].caption.endswith(f"Not scored: {why}.")
+    assert not any(row[0] == "shipped model" for row in blocks["calibration"].rows)
+    write_document(document, tmp_path)
+    assert "&lt;b&gt;: not the array of the model" in (tmp_path / "report.html").read_text("utf-8")
 
 
 def test_an_approach_without_video_is_drawn_without_images_and_says_so():

@@ -30,7 +30,6 @@ from worldstate.studies.signatures.simulated_corpora import (
 )
 from worldstate.studies.trials.pass_cache import PassCache
 
-pytestmark = pytest.mark.xdist_group("signatures")
 RECORDINGS = {TOWN_ROAD: 4, CITY_STREET: 2}
 
 

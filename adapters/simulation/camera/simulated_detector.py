@@ -1,19 +1,20 @@
 """What the camera's detector reports: boxes that begin at line of sight, with its small imperfections."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.simulation.scene.ego_motion import ARRAY_HEIGHT_M
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import LIGHT, VehicleKind
-from worldstate.adapters.simulation.scene.occluders import hidden_by
+from worldstate.adapters.simulation.scene.sight import camera_sees
 from worldstate.adapters.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
 from worldstate.ground.typing import BoolArray, FloatArray
 
-ARRAY_HEIGHT_M = 1.7  # origin of `base_link` above the road: the array's centre on the roof
 LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs
 # Miss rates measured in the paper: 4 % at boresight, 14 % at 20-30 deg.
 MISS_AZIMUTH_DEG = (0.0, 10.0, 25.0)
@@ -47,12 +48,8 @@ def visible_part(
 def line_of_sight(
     trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
 ) -> BoolArray:
-    """Tell when the camera sees the middle of the vehicle's front, shape (T,)."""
-    ahead, across = trajectory.behind(0.0)
-    eye = (ego_x_m + camera.position_m[0], camera.position_m[1])
-    right, left = site.sights_m(ahead, eye)
-    between = (across > right) & (across < left)
-    return np.asarray(between & ~hidden_by(site.occluders, ahead, across, eye))
+    """Tell when the middle of the vehicle's front is in the camera's view, shape (T,)."""
+    return camera_sees(site, camera, *trajectory.behind(0.0), ego_x_m)
 
 
 def detect(
@@ -64,7 +61,7 @@ def detect(
     frames: list[Frame] = []
     for x, low, high, sight in zip(trajectory.behind(0.0)[0], right, left, seen, strict=True):
         share = (high - low) / min(kind.length_m, LENGTH_M)
-        clear = share > LEAST_VISIBLE and (sight or not site.occluders)
+        clear = share > LEAST_VISIBLE and (sight or not site.is_open)
         box = _project(camera, x, low, high, kind) if clear else None
         missed = rng.random() < _miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)
@@ -89,6 +86,17 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
     return [
         (SimulatedDetection(_inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)
+    ]
+
+
+def lost(frames: Sequence[Frame], missed: FloatArray, rng: np.random.Generator) -> list[Frame]:
+    """Lose a share of the boxes of every frame.
+
+    Shapes: missed (frames,).
+    """
+    return [
+        tuple(box for box in frame if rng.random() >= share)
+        for frame, share in zip(frames, missed, strict=True)
     ]
 
 

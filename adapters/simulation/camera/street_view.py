@@ -5,11 +5,11 @@ from functools import lru_cache, partial
 
 import numpy as np
 
+from worldstate.adapters.simulation.scene.ego_motion import ARRAY_HEIGHT_M
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
 from worldstate.ground.typing import BoolArray, Float32Array, ImageArray
 
 from .rays import OVERSAMPLING, Panel, Patch, View, cast_panels, reduced
-from .simulated_detector import ARRAY_HEIGHT_M
 from .textures import Facade, asphalt, flags, grass, leaves, paving, smooth_noise, tinted
 
 ROAD_Z_M = -ARRAY_HEIGHT_M

@@ -27,10 +27,11 @@ from worldstate.adapters.datasets.ovad_layout import (
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import deferred_signals, write_text
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
+from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
-from worldstate.adapters.simulation.scene.occlusions import OCCLUSIONS, occluded_scene
+from worldstate.adapters.simulation.scene.places import PLACES, place
 from worldstate.adapters.simulation.scene.presets import preset
-from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings
+from worldstate.adapters.simulation.scene.settings import APPROACHES, draw_settings, rate_for
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
@@ -40,12 +41,12 @@ from worldstate.ground.typing import ImageArray
 
 from .plan import DatasetSettings, Plan
 from .recording import SimulatedRecording, simulate_recording
+from .recording_folder import put_in_place, refuse_foreign, sound_format
 from .rendered_video import camera_frames, write_video
 
-WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
-# OVAD's location numbers 00 to 09, then the scenes in the open.
-PLACES = (*SITES, *MOVING_SITES, *(occluded_scene(name).site.name for name in OCCLUSIONS))
-UNKNOWN_PLACE = 99
+# OVAD's location numbers 00 to 09, then the other places.
+LOCATIONS = (*SITES, *MOVING_SITES, *(place(name).site.name for name in PLACES))
+UNKNOWN_LOCATION = 99
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +129,7 @@ def write_dataset(
     if (folder / ARRAY_NAME).exists():
         _name_array(folder / ARRAY_NAME, listening)
     for plan in plans:
-        _refuse_foreign(folder / _log_row(plan.environment, plan.approach, plan.number, 0).folder)
+        refuse_foreign(folder / _log_row(plan.environment, plan.approach, plan.number, 0).folder)
     rows = []
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as unlisted:
         simulate = partial(_simulate_one, Path(unlisted), wanted, listening)
@@ -139,7 +140,7 @@ def write_dataset(
                 _name_array(folder / ARRAY_NAME, listening)
                 with deferred_signals():
                     try:
-                        _replace(folder / row.folder, Path(unlisted) / row.folder)
+                        put_in_place(folder / row.folder, Path(unlisted) / row.folder)
                     finally:
                         write_log(folder, [one for one in listed.values() if (folder / one.folder).is_dir()])
                 if progress is not None:
@@ -192,7 +193,7 @@ def write_recording(
     settings = recording.truth["settings"]
     row = _log_row(settings["site"]["name"], settings["approach"], number, recording.t0_frame)
     target = Path(root) / row.folder
-    _refuse_foreign(target)
+    refuse_foreign(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     _name_array(Path(root) / ARRAY_NAME, recording.array)
     with TemporaryDirectory(prefix=".simulated-", dir=target.parent) as folder:
@@ -204,7 +205,7 @@ def write_recording(
         _write_json(temporary / TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
-        _replace(target, temporary)
+        put_in_place(target, temporary)
     return row
 
 
@@ -217,10 +218,14 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     write_text(Path(root) / LOG_NAME, text.getvalue())
 
 
-def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray | None, plan: Plan) -> LogRow:
+def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray, plan: Plan) -> LogRow:
     rng = np.random.default_rng(plan.seed)
     drawn = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind)
     settings = replace(drawn, preset=preset(wanted.preset))
+    if wanted.bandwidth_hz is not None:
+        settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
+    if wanted.sounds:
+        settings = with_sounds(settings, wanted.sounds, array.n_microphones, rng.spawn(1)[0])
     recording = simulate_recording(settings, rng, array)
     # A generator of its own: what is drawn for the picture changes nothing else.
     frames = None
@@ -230,7 +235,7 @@ def _simulate_one(root: Path, wanted: DatasetSettings, array: MicrophoneArray | 
 
 
 def _log_row(environment: str, approach: str, number: int, t0_frame: int) -> LogRow:
-    location = PLACES.index(environment) if environment in PLACES else UNKNOWN_PLACE
+    location = LOCATIONS.index(environment) if environment in LOCATIONS else UNKNOWN_LOCATION
     identity = f"{APPROACHES.index(approach) + 1}_{location:02d}_{number:04d}"
     return LogRow(identity, environment, approach, t0_frame)
 
@@ -253,22 +258,9 @@ def _listed(root: Path) -> dict[Path, LogRow]:
     return {row.folder: row for row in rows}
 
 
-def _refuse_foreign(target: Path) -> None:
-    if target.exists() and not (target / TRUTH_NAME).is_file():
-        raise InputFileError(target, "expected a free name or a simulated recording, found something else")
-
-
-def _replace(target: Path, finished: Path) -> None:
-    """Put a finished recording in the place of an old one, which goes with the folder of the new one."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if target.exists():
-        target.replace(finished.with_suffix(".old"))
-    finished.replace(target)
-
-
 def _write_audio(path: Path, recording: SimulatedRecording) -> None:
     samples, channels = recording.audio.shape
-    kind = "RF64" if 3 * samples * channels > WAV_LIMIT_BYTES else "WAV"
+    kind = sound_format(samples, channels)
     rate = round(recording.sample_rate_hz)
     try:
         soundfile.write(path, recording.audio, rate, subtype="PCM_24", format=kind)

@@ -7,14 +7,19 @@ import numpy as np
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
-from worldstate.adapters.simulation.scene.occlusions import occluded_scene
+from worldstate.adapters.simulation.scene.places import PLACES, place, place_of
 from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
+from worldstate.adapters.simulation.scene.settings import MAX_SOUNDS
+from worldstate.adapters.simulation.scene.sound_kinds import sound_kind
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
-JUNCTION = "junction"
+JUNCTION, ALL = "junction", "all"
+# Below, nothing is left of the band that bearings and features are taken from.
+BANDWIDTHS_HZ = (700.0, 32_000.0)
+APPROACH_SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +45,8 @@ class DatasetSettings:
     seed : int
         Of the whole data set.
     scene : str
-        "junction", or one of `OCCLUSIONS`: there the ego only stands and the vehicle comes from the left.
+        "junction", or one of `PLACES`, where the ego only stands and a vehicle comes from the sides that the
+        place has; "all" for the junctions and every place in turn.
     kind : str
         What drives there, one of `KINDS`.
     duration_s : float
@@ -50,6 +56,10 @@ class DatasetSettings:
         a standing ego at a junction.
     video_width_px : int
         Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
+    bandwidth_hz : float, optional
+        Render up to here only, 700 to 32,000 Hz, at the rate `rate_for`; the full rate if not given.
+    sounds : tuple of str
+        What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
     preset : str
         Name of the levels of everything that is not geometry.
 
@@ -73,6 +83,8 @@ class DatasetSettings:
     video: bool = False
     video_width_px: int = PinholeCamera().width_px
     preset: str = DEFAULT_PRESET
+    sounds: tuple[str, ...] = ()
+    bandwidth_hz: float | None = None
 
     def __post_init__(self) -> None:
         in_range("n_static", self.n_static, 0, MAX_RECORDINGS)
@@ -82,9 +94,14 @@ class DatasetSettings:
         in_range("duration_s", self.duration_s, 0.5, 60.0)
         in_range("video_width_px", self.video_width_px, 64, PinholeCamera().width_px)
         vehicle_kind(self.kind)
+        if self.bandwidth_hz is not None:
+            in_range("bandwidth_hz", self.bandwidth_hz, *BANDWIDTHS_HZ)
+        in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
+        for name in self.sounds:
+            sound_kind(name)
         preset(self.preset)
-        if self.scene != JUNCTION:
-            occluded_scene(self.scene)
+        if self.scene not in (JUNCTION, ALL):
+            place(self.scene)
         if self.n_dynamic and self.scene != JUNCTION:
             raise InvalidArgumentError(
                 f"n_dynamic: expected 0 with scene {self.scene!r}, got {self.n_dynamic}"
@@ -108,15 +125,28 @@ class DatasetSettings:
         [('SA1', 'left'), ('DA1', 'left'), ('DA1', 'none')]
         """
         children = np.random.SeedSequence(self.seed).spawn(self.n_static + self.n_dynamic)
-        sites = SITES if self.scene == JUNCTION else (occluded_scene(self.scene).site.name,)
-        groups = (range(self.n_static), sites), (range(self.n_dynamic), MOVING_SITES)
-        wanted = [(names[(i // 2) % len(names)], self._approach(i)) for group, names in groups for i in group]
+        groups = (range(self.n_static), self._sites()), (range(self.n_dynamic), MOVING_SITES)
+        wanted = [_site_and_approach(i, names) for group, names in groups for i in group]
         return [
             Plan(number, *what, child, self.kind)
             for number, (what, child) in enumerate(zip(wanted, children, strict=True))
         ]
 
-    def _approach(self, number: int) -> str:
-        if number % 2:
-            return "none"
-        return "left" if number % 4 == 0 or self.scene != JUNCTION else "right"
+    def _sites(self) -> tuple[str, ...]:
+        if self.scene == JUNCTION:
+            return SITES
+        names = PLACES if self.scene == ALL else (self.scene,)
+        return (*(SITES if self.scene == ALL else ()), *(place(name).site.name for name in names))
+
+
+def _site_and_approach(number: int, names: tuple[str, ...]) -> tuple[str, str]:
+    """Return site after site with an approach each, and the same without."""
+    pair = number // 2
+    name = names[pair % len(names)]
+    if number % 2:
+        return name, "none"
+    known = place_of(name)
+    sides = APPROACH_SIDES if known is None else known.approaches
+    # An even number of sites would otherwise give each the same side for ever.
+    turn = pair + (pair // len(names) if len(names) % 2 == 0 else 0)
+    return name, sides[turn % len(sides)]

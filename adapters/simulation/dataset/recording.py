@@ -9,19 +9,20 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.simulation.camera.simulated_detector import (
-    ARRAY_HEIGHT_M,
     Frame,
     detect,
     line_of_sight,
+    lost,
     park,
 )
+from worldstate.adapters.simulation.emitters.placed_sound import add_signal, add_sound
 from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.vehicle import Trajectory
 from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.ego_sound import add_ego_echo, ego_noise
-from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.receiver import Receiver, standing_m
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.vehicle_sound import add_vehicle
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -88,11 +89,16 @@ def simulate_recording(
     rng : numpy.random.Generator
         Source of randomness; the same state gives the same recording.
     array : MicrophoneArray, optional
-        Default `ovad_array`; its centre stands 1.7 m above the road.
+        Default `ovad_array`. Its centre stands 1.7 m above the road, whatever heights its positions name.
 
     Returns
     -------
     SimulatedRecording
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a microphone would stand below the road.
 
     Examples
     --------
@@ -113,8 +119,10 @@ def simulate_recording(
     return SimulatedRecording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
-        t0_frame=_t0_frame(len(frames), sights),
-        detections=_detections(settings, seen, len(frames), camera, to_camera),
+        t0_frame=_t0_frame(len(frames), sights if settings.approach != "none" else []),
+        detections=_through_rain(
+            _detections(settings, seen, len(frames), camera, to_camera), settings, to_camera
+        ),
         truth=describe(settings, frames, seen, sights),
         array=array,
     )
@@ -130,6 +138,8 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(static, settings.site, settings.preset, path, receiver, draws)
     positions, rate = receiver.positions_m, settings.sample_rate_hz
+    # Generators of their own, and only where something sounds: the rest stays what it is without.
+    _add_sounds(static, settings, paths, receiver, rng)
     static.render()
     add_background(sound, receiver, settings.site, settings.preset, to_street)
     if not settings.ego.stands:
@@ -140,8 +150,24 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     return _to_samples(sound, settings, to_channels)
 
 
+def _add_sounds(
+    static: StaticSources,
+    settings: SimulationSettings,
+    paths: list[Trajectory],
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add what vehicles warn with, and what else sounds."""
+    site, preset = settings.site, settings.preset
+    for path, vehicle in zip(paths, settings.traffic, strict=True):
+        if vehicle.signal:
+            add_signal(static, vehicle.signal, path, site, preset, receiver, rng.spawn(1)[0])
+    for sound in settings.sounds:
+        add_sound(static, sound, site, preset, receiver, rng.spawn(1)[0])
+
+
 def _receiver(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Receiver:
-    positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
+    positions = standing_m(array)
     skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
     blocks = -(-_samples(settings) // KNOT_SAMPLES)
     knots = np.arange(blocks + 1) * KNOT_SAMPLES / settings.sample_rate_hz
@@ -194,3 +220,15 @@ def _detections(
         passing = detect(path, settings.site, camera, rng)
         boxes = [standing + moving for standing, moving in zip(boxes, passing, strict=True)]
     return tuple(boxes)
+
+
+def _through_rain(
+    detections: tuple[Frame, ...], settings: SimulationSettings, rng: np.random.Generator
+) -> tuple[Frame, ...]:
+    """Lose the detections that drops on the lens take while it rains."""
+    missed = np.zeros(len(detections))
+    time = np.arange(len(detections)) / FRAME_RATE_HZ
+    for sound in settings.sounds:
+        raining = (time >= sound.start_s) & (time < sound.end_s)
+        missed = np.maximum(missed, sound.lens_missed * raining)
+    return tuple(lost(detections, missed, rng)) if missed.any() else detections

@@ -5,13 +5,13 @@ from functools import partial
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.ground.typing import FloatArray
+from worldstate.ground.typing import BoolArray, FloatArray
 
 from .junction import Site
 from .kinds import vehicle_kind
-from .occluders import hidden_by
 from .route import along, turn_in
 from .settings import SimulationSettings, VehicleSettings
+from .sight import camera_sees, image_edges_rad
 from .vehicle import Trajectory, drive, follow
 
 SEARCH_STEP_M = 0.1
@@ -35,7 +35,7 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
         kind=vehicle_kind(vehicle.kind),
     )
     if vehicle.route_m:
-        way = along(vehicle.route_m, _first_sight(settings.site, vehicle))
+        way = along(vehicle.route_m, _first_sight(settings.site, vehicle)[0])
         return follow(passing(time_s, entry_s=vehicle.entry_s), entry_y, way)
     if vehicle.manoeuvre == "turn":
         turn = turn_in(lane, entry_y)
@@ -50,18 +50,47 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
 def _entry(settings: SimulationSettings, vehicle: VehicleSettings) -> tuple[float, float]:
     """Return the lane, and where in it the camera sees the vehicle when it comes into sight."""
     near, far = settings.site.lanes_m
-    lane = near if vehicle.approach == "left" else far
     eye_x, eye_y, _ = PinholeCamera().position_m
     ego_x = float(settings.ego.x_m(np.array([vehicle.entry_s]))[0])
+    lane = near if vehicle.approach == "left" else far
     right, left = settings.site.sight_m(lane, (ego_x + eye_x, eye_y))
-    return lane, left if vehicle.approach == "left" else right
+    ahead = lane - ego_x - eye_x
+    right_edge, left_edge = (eye_y + ahead * np.tan(edge) for edge in image_edges_rad(PinholeCamera()))
+    return lane, min(left, left_edge) if vehicle.approach == "left" else max(right, right_edge)
 
 
-def _first_sight(site: Site, vehicle: VehicleSettings) -> float:
-    """Return the distance along a route at which it leaves the last body that hides it."""
+def comes_into_view_s(settings: SimulationSettings, vehicle: VehicleSettings) -> float | None:
+    """Return when the camera first sees a vehicle: 0 where it always has, None where it never does."""
+    if not vehicle.route_m:
+        return vehicle.entry_s
+    _, found = _first_sight(settings.site, vehicle)
+    return {"hidden at first": vehicle.entry_s, "in view at first": 0.0, "never": None}[found]
+
+
+def _first_sight(site: Site, vehicle: VehicleSettings) -> tuple[float, str]:
+    """Return how far along a route the vehicle comes into view, and whether it does.
+
+    Where it is in view at first, or never, that is where it is nearest to the ego.
+    """
     route = along(vehicle.route_m)
     length = float(np.hypot(*np.diff(np.array(vehicle.route_m), axis=0).T).sum())
     driven = np.arange(0.0, length, SEARCH_STEP_M)
-    eye_x, eye_y, _ = PinholeCamera().position_m
-    hidden = np.flatnonzero(hidden_by(site.occluders, *route.at(driven), (eye_x, eye_y)))
-    return float(driven[hidden[-1]]) + SEARCH_STEP_M if len(hidden) else 0.0
+    x, y = route.at(driven)
+    seen = camera_sees(site, PinholeCamera(), x, y)
+    if seen.any() and not seen[0]:
+        return float(driven[_longest_begins(seen)]), "hidden at first"
+    return float(driven[np.hypot(x, y).argmin()]), "in view at first" if seen.any() else "never"
+
+
+def _longest_begins(seen: BoolArray) -> int:
+    """Return where the longest run of True begins.
+
+    Examples
+    --------
+    >>> _longest_begins(np.array([False, True, False, True, True]))
+    3
+    """
+    # A glimpse before a body hides the vehicle again is not yet the sight that a driver acts on.
+    edges = np.flatnonzero(np.diff(np.r_[0, seen.astype(int), 0]))
+    begins, ends = edges[::2], edges[1::2]
+    return int(begins[(ends - begins).argmax()])

@@ -8,6 +8,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
 BRAKING_MPS2 = 2.5
+ARRAY_HEIGHT_M = 1.7  # origin of `base_link` above the road: the array's centre on the roof
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from worldstate.ground.typing import BoolArray, FloatArray
 from .octave_bands import smooth_step
 
 # x, which may move (T,), and y.
-Place = tuple[float | FloatArray, float]
+GroundPoint = tuple[float | FloatArray, float]
 
 MAX_CORNERS = 16
 # A shorter side is no mirror at the wavelengths of tyres and engines (.3 to 3 m): most passes round it.
@@ -60,7 +60,7 @@ class Wall:
         normal_x, normal_y = self._normal
         return x_m - 2.0 * off * normal_x, y_m - 2.0 * off * normal_y
 
-    def reflects(self, x_m: FloatArray, y_m: FloatArray, eye_m: Place) -> FloatArray:
+    def reflects(self, x_m: FloatArray, y_m: FloatArray, eye_m: GroundPoint) -> FloatArray:
         """1 where a wall mirrors a point to an eye, 0 where the ray misses it, shape (T,)."""
         along, off = self.along_and_off(x_m, y_m)
         eye_along, eye_off = self.along_and_off(*eye_m)
@@ -122,7 +122,7 @@ def box(near_m: float, far_m: float, right_m: float, left_m: float) -> Occluding
 
 
 def hidden_by(
-    occluders: Sequence[OccludingBody], x_m: FloatArray, y_m: FloatArray, eye_m: Place
+    occluders: Sequence[OccludingBody], x_m: FloatArray, y_m: FloatArray, eye_m: GroundPoint
 ) -> BoolArray:
     """Tell when a body stands between an eye and a point that moves, shape (T,)."""
     hidden = np.zeros(np.shape(y_m), np.bool_)
@@ -132,7 +132,7 @@ def hidden_by(
 
 
 def detours(
-    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: Place
+    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: GroundPoint
 ) -> tuple[FloatArray, NDArray[np.int_]]:
     """Return how much longer the way round a body is, and by which corner it goes, shape (T,) each."""
     # The detour is negative where the line is clear; it passes through 0 where the line touches the body.
@@ -156,7 +156,7 @@ def detours(
 
 
 def _offsets(
-    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: Place
+    occluder: OccludingBody, x_m: FloatArray, y_m: FloatArray, end_m: GroundPoint
 ) -> tuple[FloatArray, FloatArray]:
     """Lateral offset of every corner from the line, and how far along it is, 0..1, shape (corners, T)."""
     corners = np.array(occluder.corners_m)[:, :, None]

@@ -1,6 +1,6 @@
 """What is simulated: a site, an approach, and how the vehicles drive."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,18 +9,34 @@ from worldstate.ground.errors import InvalidArgumentError
 
 from .ego_motion import EgoMotion
 from .junction import MOVING_SITES, Site, site
-from .kinds import vehicle_kind
-from .occlusions import scene_of
+from .kinds import VehicleKind, vehicle_kind
+from .places import Way, place_of
 from .presets import Preset, preset
+from .sound_kinds import SIGNALS
+from .sound_settings import SoundSettings
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
 MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
-MAX_OTHERS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 64, 0.1
+MAX_OTHERS, MAX_SOUNDS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 16, 64, 0.1
 # Narrow streets and a blind junction ahead: most drivers slow down before it, and a wall makes them slower.
 SPEEDS_MPS, WALLED_SPEEDS_MPS = (4.5, 9.0), (4.2, 5.6)
 BRAKING_SHARE, BRAKING_MPS2 = 0.85, (1.0, 3.5)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
+
+
+def rate_for(bandwidth_hz: float) -> float:
+    """Return the sample rate that sound of a bandwidth is rendered at, three to six times it.
+
+    Examples
+    --------
+    >>> rate_for(2000.0), rate_for(2500.0), rate_for(16_000.0)
+    (6000.0, 12000.0, 47998.0)
+    """
+    # Halvings of the full rate, so that frames of 512 samples become 256, 128 or 64 and bins stay. Files
+    # hold whole rates: 5,999.75 Hz read as 6,000 would be a tenth of a second late after an hour.
+    halvings = max(int(np.floor(np.log2(SAMPLE_RATE_HZ / (3.0 * bandwidth_hz)) + 1e-3)), 0)
+    return float(round(SAMPLE_RATE_HZ / 2**halvings))
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +59,8 @@ class VehicleSettings:
         "pass" or "turn": turn into the ego's street, and stop there.
     route_m : tuple of (float, float)
         Where it goes instead of along the crossing street: points x, y, at least 2; empty for none.
+    signal : str
+        What it warns with all the time, one of `SIGNALS`; empty for nothing.
 
     Raises
     ------
@@ -62,9 +80,11 @@ class VehicleSettings:
     kind: str = "light"
     manoeuvre: str = "pass"
     route_m: tuple[tuple[float, float], ...] = ()
+    signal: str = ""
 
     def __post_init__(self) -> None:
         _one_of("approach", self.approach, ("left", "right"))
+        _one_of("signal", self.signal, ("", *SIGNALS))
         _one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
         vehicle_kind(self.kind)
         in_range("entry_s", self.entry_s, -60.0, 120.0)
@@ -107,15 +127,17 @@ class SimulationSettings:
     parked_car : bool
         Whether a car stands in view.
     sample_rate_hz : float
-        8 to 96 kHz.
+        2 to 96 kHz; sound is rendered up to a third of it.
     preset : Preset
         Levels of everything else.
-    kind, manoeuvre, route_m
+    kind, manoeuvre, route_m, signal
         Of the vehicle: see `VehicleSettings`.
     others : tuple of VehicleSettings
-        More vehicles, at most 8; none where `approach` is "none".
+        More vehicles, at most 8; with `approach` "none" all there are, none of them a hidden hazard.
     ego : EgoMotion
         How the ego moves; it stands if not given.
+    sounds : tuple of SoundSettings
+        What else sounds, at most 16.
 
     Raises
     ------
@@ -142,6 +164,8 @@ class SimulationSettings:
     route_m: tuple[tuple[float, float], ...] = ()
     others: tuple[VehicleSettings, ...] = ()
     ego: EgoMotion = field(default_factory=EgoMotion)
+    signal: str = ""
+    sounds: tuple[SoundSettings, ...] = ()
 
     def __post_init__(self) -> None:
         _one_of("approach", self.approach, APPROACHES)
@@ -149,16 +173,16 @@ class SimulationSettings:
         in_range("entry_s", self.entry_s, 0.0, self.duration_s if self.approach != "none" else 60.0)
         in_range("speed_mps", self.speed_mps, 1.0, 30.0)
         in_range("braking_mps2", self.braking_mps2, 0.0, 8.0)
-        in_range("sample_rate_hz", self.sample_rate_hz, 8_000.0, 96_000.0)
-        most = 0 if self.approach == "none" else MAX_OTHERS
-        in_range("others: number of vehicles", len(self.others), 0, most)
+        in_range("sample_rate_hz", self.sample_rate_hz, 2_000.0, 96_000.0)
+        in_range("others: number of vehicles", len(self.others), 0, MAX_OTHERS)
+        in_range("sounds: their number", len(self.sounds), 0, MAX_SOUNDS)
         self.traffic  # noqa: B018  (building the first vehicle checks what is left)
 
     @property
     def traffic(self) -> tuple[VehicleSettings, ...]:
         """All vehicles, the one that `approach` names first."""
         if self.approach == "none":
-            return ()
+            return self.others
         first = VehicleSettings(
             self.approach,
             self.entry_s,
@@ -167,6 +191,7 @@ class SimulationSettings:
             self.kind,
             self.manoeuvre,
             self.route_m,
+            self.signal,
         )
         return (first, *self.others)
 
@@ -181,8 +206,9 @@ def draw_settings(
     Parameters
     ----------
     site_name : str
-        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h, or of a
-        scene in the open, where the vehicle takes the scene's route.
+        One of `SITES`, or of `MOVING_SITES`, where the ego drives up to the corner at 10 to 30 km/h, or of
+        one of `PLACES`, where a vehicle takes one of the place's ways; half of the hazard-free recordings
+        there have one that is in plain view, or never in view.
     approach : str
         "left", "right" or "none".
     rng : numpy.random.Generator
@@ -200,7 +226,7 @@ def draw_settings(
     Raises
     ------
     InvalidArgumentError
-        For an unknown name, or a scene that has no such approach.
+        For an unknown name, or a place that has no such approach.
 
     Examples
     --------
@@ -208,23 +234,40 @@ def draw_settings(
     'SB1'
     """
     in_range("duration_s", duration_s, 0.5, 60.0)
-    scene = scene_of(site_name)
-    if scene is not None:
-        _one_of("approach", approach, (scene.approach, "none"))
+    known = place_of(site_name)
+    if known is not None:
+        _one_of("approach", approach, (*known.approaches, "none"))
     brakes = rng.random() < BRAKING_SHARE
-    place = site(site_name) if scene is None else scene.site
-    return SimulationSettings(
-        site=place,
+    plan = site(site_name) if known is None else known.site
+    drawn = SimulationSettings(
+        site=plan,
         approach=approach,
         duration_s=duration_s,
         entry_s=duration_s * rng.uniform(0.65, 0.75),
-        speed_mps=rng.uniform(*(SPEEDS_MPS if place.opposite_wall_m is None else WALLED_SPEEDS_MPS)),
+        speed_mps=rng.uniform(*speeds_mps(plan, vehicle_kind(kind))),
         braking_mps2=rng.uniform(*BRAKING_MPS2) if brakes else 0.0,
-        parked_car=bool(rng.random() < 0.3) and scene is None,
+        parked_car=bool(rng.random() < 0.3) and known is None,
         kind=kind,
-        route_m=() if scene is None else scene.route_m,
         ego=_draw_ego(rng, duration_s) if site_name in MOVING_SITES else EgoMotion(),
     )
+    way = None if known is None else known.drawn_way(approach, rng)
+    return drawn if way is None else _on_way(drawn, way)
+
+
+def _on_way(settings: SimulationSettings, way: Way) -> SimulationSettings:
+    """Return a recording of a vehicle that takes a way: the one of the approach, or one that is no hazard."""
+    if way.approach != "none":
+        return replace(settings, route_m=way.route_m)
+    plain = VehicleSettings(
+        "left", settings.entry_s, settings.speed_mps, 0.0, settings.kind, route_m=way.route_m
+    )
+    return replace(settings, others=(plain,))
+
+
+def speeds_mps(site: Site, kind: VehicleKind) -> tuple[float, float]:
+    """Range of the speeds of a kind of vehicle at a site, before braking."""
+    street = SPEEDS_MPS if site.opposite_wall_m is None else WALLED_SPEEDS_MPS
+    return kind.ridden_mps or street
 
 
 def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from worldstate.ground.typing import Float32Array, FloatArray
 
-from .kinds import LIGHT, TYRE_M, VehicleKind
+from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
 from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 from .route import Route
 
@@ -18,7 +18,9 @@ SOURCE_HEIGHT_M = 0.3
 REFERENCE_KMH = 70.0
 # Sound power to pressure at 1 m over hard ground: -11 dB of a free sphere, +3 dB of the ground's half-space.
 POWER_TO_1M_DB = -8.0
+FADE_KMH = 5.0  # a warning sound that ends at some speed is gone so much above it
 SLOWEST_KMH = 10.0  # the law is fitted above 20; a log of zero speed would be silence
+CREEPING_MPS = 1.0  # below, tyres fade with the speed: who stands before a corner is an engine alone
 HARMONIC_SHARE = 0.5  # of the propulsion power; the rest is broadband
 HARMONICS = 24
 # Firing frequency of four cylinders over speed in gears 1 to 4, Hz per m/s; up at 2400 rpm, idle at 850 rpm.
@@ -128,8 +130,10 @@ def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatA
 
 def propulsion_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
     """Sound power level of the engine, L = A + B (v - 70) / 70, shape (8, T)."""
-    relative = 3.6 * speed_mps / REFERENCE_KMH - 1.0
-    return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative
+    speed_kmh = 3.6 * speed_mps
+    fade_db = SILENT_DB * np.clip((speed_kmh - kind.propulsion_until_kmh) / FADE_KMH, 0.0, 1.0)
+    relative = speed_kmh / REFERENCE_KMH - 1.0
+    return _octaves(kind.propulsion_a_db) + _octaves(kind.propulsion_b_db) * relative + fade_db
 
 
 def load_db(trajectory: Trajectory) -> FloatArray:
@@ -167,6 +171,7 @@ def emit(
     time = trajectory.time_s[0] + np.arange(samples) / sample_rate_hz
     drawing = _Drawing(trajectory, time, sample_rate_hz, rng)
     rolling = _pressure(rolling_level_db(trajectory.speed_mps, kind) + level_offset_db)
+    rolling *= np.clip(trajectory.speed_mps / CREEPING_MPS, 0.0, 1.0)
     tyres = rolling / np.sqrt(len(kind.axles_m))
     sources = [SourceSignal(drawing.noise(tyres), behind, TYRE_M) for behind in kind.axles_m]
     if max(kind.propulsion_a_db) > SILENCE_DB:
@@ -217,7 +222,12 @@ class _Drawing:
         signal = np.zeros(len(self.time), np.float32)
         for order, band in enumerate(octave.tolist(), start=1):
             phase = 2.0 * np.pi * np.mod(order * cycles + self.rng.random(), 1.0)
-            signal += levels[band] * np.cos(phase.astype(np.float32))
+            # Above half the rate a line would come back folded, as a wrong one.
+            signal += (
+                levels[band]
+                * np.cos(phase.astype(np.float32))
+                * (order * firing_hz < 0.5 * self.sample_rate_hz)
+            )
         return signal
 
     def _at_samples(self, knots: FloatArray) -> Float32Array:

@@ -44,14 +44,20 @@ NOISE_BAND_HZ = 24_000.0  # the band that electronic noise is stated for
 
 
 def add_background(
-    out: Float32Array, receiver: Receiver, site: Site, preset: Preset, rng: np.random.Generator
+    out: Float32Array,
+    receiver: Receiver,
+    site: Site,
+    preset: Preset,
+    rng: np.random.Generator,
+    here: Ambience | None = None,
 ) -> None:
-    """Add everything that a street without a vehicle sounds like.
+    """Add everything that a street without a vehicle sounds like; what a recording makes of it, unless given.
 
     Shapes: out (M, n).
     """
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
-    here = recording_ambience(site_ambience(site, preset), preset, rng)
+    if here is None:
+        here = recording_ambience(site_ambience(site, preset), preset, rng)
     azimuth = 2.0 * np.pi * (np.arange(preset.ambient_waves) + rng.random()) / preset.ambient_waves
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
     directions, offsets = unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m

@@ -117,7 +117,7 @@ def ego_sound(
     # the sound power of CNOSSOS-EU, category 1, the airflow that of a dipole (sixth power of the speed),
     # wind grows with the dynamic pressure.
     positions, speed = _checked(positions_m, speed_mps)
-    rate = in_range("sample_rate_hz", sample_rate_hz, 8_000.0, 192_000.0)
+    rate = in_range("sample_rate_hz", sample_rate_hz, 2_000.0, 192_000.0)
     # Everything ran before the recording began; what is on its way then is heard at its beginning.
     lead = round(HEAD_START_S * rate)
     driven = np.pad(speed, (lead, 0), mode="edge")
@@ -266,7 +266,8 @@ def _lines(firing: FloatArray, share: float, rate: float, rng: np.random.Generat
     lines = np.zeros(len(firing), np.float32)
     for order, band in zip(orders, octave, strict=True):
         phase = 2.0 * np.pi * np.mod(order * cycles + rng.random(), 1.0)
-        lines += np.float32(np.sqrt(2.0 * share / crowd[band])) * np.cos(phase.astype(np.float32))
+        heard = order * firing < 0.5 * rate  # above, a line would come back folded
+        lines += np.float32(np.sqrt(2.0 * share / crowd[band])) * np.cos(phase.astype(np.float32)) * heard
     return lines
 
 

@@ -143,7 +143,7 @@ def trace_paths(
         end_m = receiver_x_m, float(receiver.mirror(np.zeros(1))[0])
         passage = through_mouth(site, (source.x_m, source_y_m), end_m, height_m)
         walls = source.gain * receiver.gain * near_facade(site, source, source_y_m, passage.aim_y_m)
-        walls = walls * side_walls(site, receiver, receiver_x_m, passage.aim_y_m)
+        walls = walls * side_walls(site, receiver, receiver_x_m, (site.corner_ahead_m, passage.aim_y_m))
         gain = walls[:, None] * facades**source.order * sides**receiver.order * passage.screen_gain(cap_db)
         edge_y = np.where(passage.edge == LEFT, site.corner_left_m, -site.corner_right_m)
         before = np.hypot(source.x_m - site.corner_ahead_m, source_y_m - edge_y)
@@ -217,24 +217,28 @@ def through_mouth(
 
 
 def side_walls(
-    site: Site, receiver: ReceiverImage, end_x_m: float | FloatArray, aim_y_m: FloatArray
+    site: Site,
+    receiver: ReceiverImage,
+    end_x_m: float | FloatArray,
+    aim_m: tuple[float | FloatArray, FloatArray],
 ) -> FloatArray:
-    """1 where every reflection in a side wall meets wall, 0 where one meets an opening, shape (T,).
+    """1 where every reflection on the way to a place meets wall, 0 where one meets an opening, shape (T,).
 
     Examples
     --------
     >>> plan = Site("SA1", 2.8, 2.8, 4.0, 10.0, 2.8, 2.8, 6.0, left_openings_m=((1.0, 3.0),))
     >>> image = receiver_images(plan)[1]
-    >>> side_walls(plan, image, 0.0, np.array([0.0, -2.8])).round(2)  # it is met at 2.0 and at 1.33 m
+    >>> side_walls(plan, image, 0.0, (4.0, np.array([0.0, -2.8]))).round(2)  # met at 2.0 and 1.33 m
     array([0.  , 0.07])
     """
     openings = site.left_openings_m, site.right_openings_m
     end_y = float(receiver.mirror(np.zeros(1))[0])
-    weight = np.ones_like(aim_y_m)
+    aim_x, aim_y = aim_m
+    weight = np.ones_like(aim_y)
     for wall, plane in receiver.walls:
         if openings[wall]:
-            share = (plane - end_y) / (aim_y_m - end_y)
-            weight = weight * on_wall(openings[wall], end_x_m + share * (site.corner_ahead_m - end_x_m))
+            share = (plane - end_y) / (aim_y - end_y)
+            weight = weight * on_wall(openings[wall], end_x_m + share * (aim_x - end_x_m))
     return weight
 
 

@@ -13,7 +13,7 @@ from .air import air_gain, ground_gain
 from .delay import Table, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import MovingSource
-from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, trace_paths
+from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls, trace_paths
 from .receiver import NEAREST_M, Receiver, add_turning
 from .screened import ScreenedLeg, open_images, screened_legs
 from .static_field import StaticSources
@@ -57,7 +57,7 @@ def _paths(source: MovingSource, around: Surroundings) -> list[Path]:
     paths = trace_paths(around.site, *place, around.cap_db, receiver_x_m=heard_x, specular=mirrored)
     beside = in_own_street(around.site, source.x_m, source.y_m)
     if beside.any():
-        paths = [_beside(path, source, beside, mirrored[1], heard_x, above) for path in paths]
+        paths = [_beside(path, source, beside, mirrored[1], heard_x, around) for path in paths]
     return [replace(path, gain=path.gain * _media(path.bent_m, source, around)) for path in paths]
 
 
@@ -67,7 +67,7 @@ def _beside(
     share: FloatArray,
     specular: FloatArray,
     heard_x_m: float | FloatArray,
-    above_m: float,
+    around: Surroundings,
 ) -> Path:
     """Return the path of a source that stands, as far as `share` says, in the ego's own street.
 
@@ -80,8 +80,11 @@ def _beside(
         # The near facade comes first, and there a source in the own street stands behind it.
         return replace(path, gain=path.gain * (1.0 - share)[:, None])
     across = source.y_m - float(image.mirror(np.zeros(1))[0])
-    straight = np.sqrt((source.x_m - heard_x_m) ** 2 + across**2 + above_m**2)
-    whole = image.gain * specular**image.order
+    straight = np.sqrt(
+        (source.x_m - heard_x_m) ** 2 + across**2 + around.receiver.above(source.height_m) ** 2
+    )
+    walls = side_walls(around.site, image, heard_x_m, (source.x_m, source.y_m))
+    whole = image.gain * walls[:, None] * specular**image.order
     return replace(
         path,
         lit=np.maximum(path.lit, share),

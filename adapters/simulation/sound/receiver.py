@@ -5,8 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
+from worldstate.adapters.simulation.scene.ego_motion import ARRAY_HEIGHT_M, EgoMotion
 from worldstate.adapters.simulation.scene.octave_bands import resample_whole
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import KNOT_SAMPLES, OVERSAMPLING, Table, add_delayed
@@ -58,6 +60,22 @@ class Receiver:
             x = self.ego.x_m(emit_s + length / SPEED_OF_SOUND_MPS)
             length = length_m(x)
         return length, x
+
+
+def standing_m(array: MicrophoneArray) -> FloatArray:
+    """Positions in `base_link`, z above the road, of an array with its centre at `ARRAY_HEIGHT_M`, (M, 3).
+
+    Examples
+    --------
+    >>> standing_m(MicrophoneArray([[1.0, 0.1, 3.0], [1.0, -0.1, 3.2]])).round(2).tolist()
+    [[0.0, 0.1, 1.6], [0.0, -0.1, 1.8]]
+    """
+    positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
+    lowest = float(positions[:, 2].min())
+    if lowest <= 0.0:
+        got = f"one {ARRAY_HEIGHT_M - lowest:.2f} m below its centre"
+        raise InvalidArgumentError(f"array: expected microphones above the road, got {got}")
+    return np.asarray(positions)
 
 
 def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> FloatArray:

@@ -187,4 +187,4 @@ def seen_through_mouth(
     """
     end_m = ego_x_m, float(image.mirror(np.zeros(1))[0])
     passage = through_mouth(site, (float(place_m[0]), np.full_like(ego_x_m, place_m[1])), end_m, 0.0)
-    return passage.lit * image.gain * side_walls(site, image, ego_x_m, passage.aim_y_m)
+    return passage.lit * image.gain * side_walls(site, image, ego_x_m, (site.corner_ahead_m, passage.aim_y_m))

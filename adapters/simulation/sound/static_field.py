@@ -17,6 +17,7 @@ from .diffraction import SPEED_OF_SOUND_MPS
 
 BLOCK = 4096
 HOP = BLOCK // 2
+BINS, FINE_BINS = HOP + 1, 64
 BLOCKS_AT_ONCE = 16
 PENDING = 160  # as many sources wait, with their signals, to be rendered together
 
@@ -59,9 +60,7 @@ class StaticSources:
             return
         signals, delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in range(3))
         self._waiting.clear()
-        frequencies = np.fft.rfftfreq(BLOCK, 1.0 / self.sample_rate_hz)
-        steering = np.exp(-2j * np.pi * frequencies[:, None, None] * delays).astype(np.complex64)
-        steering *= gains.astype(np.float32)
+        steering = _phase_ramps(delays, gains, self.sample_rate_hz)
         microphones, samples = self.out.shape
         padded = np.zeros((microphones, _blocks(samples) * HOP + HOP), np.float32)
         for start, spectra in _analyse(signals):
@@ -70,6 +69,18 @@ class StaticSources:
                 at = (start + i) * HOP
                 padded[:, at : at + BLOCK] += block
         self.out[:] += padded[:, HOP : HOP + samples]
+
+
+def _phase_ramps(delays_s: FloatArray, gains: FloatArray, sample_rate_hz: float) -> Complex64Array:
+    r"""Return :math:`g\, e^{-2 \pi j f \tau}` at the bins of a block, shapes (Q, M) -> (F, Q, M)."""
+    # Bin k = 64 i + j is a product of two powers of the first: a tenth of the time of an exponential for
+    # each, which takes longer than all the rest of a recording of half a second.
+    first = -2j * np.pi * sample_rate_hz / BLOCK * delays_s
+    fine = np.exp(np.arange(FINE_BINS)[:, None, None] * first)
+    ramps = np.empty((-(-BINS // FINE_BINS), *fine.shape), np.complex64)
+    for i, bins in enumerate(ramps):
+        np.multiply(fine, gains * np.exp(i * FINE_BINS * first), out=bins, casting="same_kind")
+    return ramps.reshape(-1, *delays_s.shape)[:BINS]
 
 
 def _blocks(samples: int) -> int:

@@ -5,7 +5,7 @@ import numpy as np
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import KNOT_SAMPLES
 from .emission import Emission, MovingSource
@@ -44,7 +44,9 @@ def add_vehicle(
     add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])
     add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
     add_scattered(static, far, around)
-    dry = whole * _late_gain(site, preset, path, receiver)
+    if site.is_open:
+        return  # nothing stands there that could send late sound
+    dry = whole * late_gain(site, preset, *path.behind(0.0), path.time_s, receiver)
     heard = dry[: round((receiver.knots_s[0] - path.time_s[0]) * rate) + receiver.samples]
     field = street_field(site, preset.late_lobe_share)
     add_late_field(static, heard, preset.late_decay_s, receiver.positions_m, rng, field)
@@ -56,10 +58,14 @@ def _moving(
     return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
 
 
-def _late_gain(site: Site, preset: Preset, path: Trajectory, receiver: Receiver) -> Float32Array:
-    """How strongly the source feeds the late field: less the farther it, or the ego, is from the mouth."""
-    x, y = path.behind(0.0)
-    away = np.hypot(x - site.corner_ahead_m, y) - receiver.ego.x_m(path.time_s)
+def late_gain(
+    site: Site, preset: Preset, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray, receiver: Receiver
+) -> Float32Array:
+    """How strongly a source feeds the late field: less the farther it, or the ego, is from the mouth.
+
+    Shapes: x_m, y_m, time_s (T,), at emission knots.
+    """
+    away = np.hypot(x_m - site.corner_ahead_m, y_m) - receiver.ego.x_m(time_s)
     late_db = preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
     gain = 10.0 ** (late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
     knots = np.arange(len(gain)) * KNOT_SAMPLES

@@ -97,7 +97,6 @@ def test_nothing_in_view_is_no_accuracy() -> None:
     assert found["prominence_without"] == 1.2
 
 
-@pytest.mark.xdist_group("approach")
 def test_run_draws_the_curve_of_a_recording(approach, tmp_path, capsys) -> None:
     figure = tmp_path / "gating.png"
     assert main(["run", str(approach.folder), "--gating", str(figure), "--json"]) == 0

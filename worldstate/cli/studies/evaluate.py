@@ -19,6 +19,9 @@ PNG and CSV.
 What was heard is kept in OUT/cache by the content of each recording: an interrupted run goes on where it
 stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for
 leaving junctions out two junctions that have both; what a protocol lacks is said before anything is heard.
+
+A recording that cannot be heard is named and left out. Rows of a model that was not made for the array of the
+recordings are named and not scored.
 """
 
 import argparse
@@ -52,7 +55,7 @@ examples:
 
 # Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
 STATIC, DYNAMIC = 83, 59
-SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 8.0
+SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 6.0
 # Images of OVAD's size take more than half of the time of a simulated recording.
 SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
@@ -60,6 +63,8 @@ FULL_SEEDS = 5
 PASSAGES = 6
 # What two evaluations must have in common for their figures to be comparable.
 COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
+# Where the work is done and what is printed of it.
+_NO_FIGURE = ("run", "json", "dataset", "out", "jobs", "engine", "scheduler", "against")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
 
 
@@ -80,7 +85,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, for the signature study")
     add("--against", type=Path, metavar="DIR", help="a finished evaluation to compare this one with")
     add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
-    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times")
+    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times, all filmed recordings swept")
     add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     add("--jobs", type=int, default=cores, help="processes (default: one a core)")
@@ -98,6 +103,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.studies.trials.hearing import Hearing
 
     _check(arguments)
+    if arguments.scheduler is not None:
+        _in_full(arguments)
     output_folder(arguments.out, "evaluation.json")
     takes = _takes(arguments)
     lacking_data(takes)
@@ -111,7 +118,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
             _Bars(stack),
             EvaluationSettings(
-                seeds, arguments.hazard_free_hours, degradation=_degradation(arguments, classifiers)
+                seeds, arguments.hazard_free_hours, degradation=_degradation(arguments, classifiers, takes)
             ),
         )
     save_scores(arguments.out, found.scores, COMPARABLE)
@@ -119,7 +126,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     report = _report(found) | {"against": [_difference(one) for one in compared]}
     write_report(arguments.out / "evaluation.json", report)
     signatures = None if arguments.smoke else _signatures(arguments)
-    write_document(evaluation_document(found, signatures), arguments.out)
+    write_document(evaluation_document(found, signatures, _configuration(arguments)), arguments.out)
     shown = {"out": str(arguments.out), "data": takes.origin, "windows": classifiers.told}
     return CommandResult(report, table=shown, lines=[*_lines(found), *_against_lines(compared)])
 
@@ -152,17 +159,21 @@ def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
         return signature_study(roads, city, draws, bar.advance)
 
 
-def _degradation(arguments: argparse.Namespace, classifiers: "Classifiers") -> "DegradationSettings":
+def _degradation(
+    arguments: argparse.Namespace, classifiers: "Classifiers", takes: "TakeList"
+) -> "DegradationSettings":
     """Return the sweep over camera states; in a smoke test of one detector on small images.
 
     It listens with --model, else with a model trained on the training windows, else with the one that ships.
     """
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.degradation.looks import StagedDetector, motion_detectors
+    from worldstate.studies.evaluation.camera_failure import whole_sweep
     from worldstate.studies.trials.training_windows import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
-    if model is None and classifiers.windows is not None and not arguments.smoke:
+    filmed = any(take.filmed for take in takes.static)
+    if filmed and model is None and classifiers.windows is not None and not arguments.smoke:
         model = model_from_windows(classifiers.windows, arguments.out / "cache", seed)
     if arguments.smoke:
         return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
@@ -170,7 +181,8 @@ def _degradation(arguments: argparse.Namespace, classifiers: "Classifiers") -> "
         onnx = argparse.Namespace(**vars(arguments), detector="onnx")
         second = detector_name(onnx), detector_maker(onnx), detector_filter(onnx)
         detectors = detectors[0], StagedDetector(*second)
-    return DegradationSettings(detectors, model, seed=seed)
+    settings = DegradationSettings(detectors, model, seed=seed)
+    return whole_sweep(takes, settings) if arguments.full else settings
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -182,6 +194,27 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
     if arguments.dataset is not None and arguments.smoke:
         raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
+
+
+def _in_full(arguments: argparse.Namespace) -> None:
+    """Name all files in full: the workers of a cluster were started in folders of their own."""
+    for name, value in vars(arguments).items():
+        if isinstance(value, Path):
+            setattr(arguments, name, value.absolute())
+        elif isinstance(value, list) and all(isinstance(one, Path) for one in value):
+            setattr(arguments, name, [one.absolute() for one in value])
+
+
+def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:
+    """Return the options that figures may depend on, as they were given or by default."""
+    names = [name for name in vars(arguments) if name not in _NO_FIGURE]
+    return [(f"--{name.replace('_', '-')}", _told(getattr(arguments, name))) for name in names]
+
+
+def _told(value: object) -> str:
+    if isinstance(value, list):
+        return " ".join(map(_told, value)) or "none"
+    return "none" if value is None else value.name if isinstance(value, Path) else str(value)
 
 
 def _compared(arguments: argparse.Namespace) -> "tuple[Comparison, ...]":
@@ -283,7 +316,10 @@ def _simulated(arguments: argparse.Namespace) -> Path:
 
 
 def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifiers":
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.files.array_match import microphone_order
     from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
+    from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.studies.trials import training_windows as windows
     from worldstate.studies.trials.classification import Classifiers
 
@@ -292,7 +328,9 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
     if arguments.features is not None:
         return Classifiers(*windows.windows_from_table(arguments.features, takes))
     found = windows.windows_from_recordings(takes, folder)
-    if found is None and takes.simulated:
+    # Windows are simulated with OVAD's array: those of another one would teach another feature.
+    usual = microphone_order(ovad_array().positions_m, choose_array(takes.root)) is not None
+    if found is None and takes.simulated and usual:
         count = SMOKE_WINDOWS if arguments.smoke else windows.PER_APPROACH
         sites = sorted({take.site for take in (*takes.static, *takes.dynamic)} & {*SITES, *MOVING_SITES})
         with progress_bar("simulating windows", 4 * count * len(sites)) as bar:
@@ -319,6 +357,8 @@ def _report(found: "Evaluation") -> dict[str, object]:
         "data": found.takes.origin,
         "recordings": len(found.trials),
         "failed": {one.name: one.problem for one in found.failed},
+        "stands_on": {name: run.stands_on for name, run in found.runs.items()},
+        "refused": {name: refused for name, refused in found.refused.items() if refused},
         "lacking": dict(found.lacking),
         "cautions": {name: run.cautions for name, run in found.runs.items()},
         "protocols": {
@@ -340,16 +380,27 @@ def _lines(found: "Evaluation") -> list[str]:
         hours = next(iter(scores.values())).figures()["hazard_free_hours"]
         head = f"{run.protocol.title}: {len(run.trials)} recordings, {hours:.3f} h of them hazard-free"
         lines += ["", head, *run.cautions]
-        lines.append(f"{'':36}{'lead s':>8}{'detected':>10}{'FA/h':>8}{'(95 %)':>14}{'bearing deg':>13}")
+        lines.append(
+            f"{'':36}{'lead s':>8}{'detected':>10}{'random':>8}{'FA/h':>8}{'(95 %)':>14}{'bearing deg':>13}"
+        )
         lines += [_row(name, score) for name, score in scores.items() if not name.startswith("curve")]
+        refused = found.refused.get(name, {})
+        lines += [f"{method:36}not scored" for method in refused]
+        lines += [f"not scored: {why}" for why in dict.fromkeys(refused.values())]
     return lines if found.degradation is None else [*lines, *degradation_lines(found.degradation)]
 
 
 def _row(method: str, score: "Score") -> str:
     figures, (low, high) = score.figures(), score.poisson()
-    forms = {"lead_s": ".2f", "detection": ".2f", "false_alarms_per_hour": ".0f", "bearing_deg": ".1f"}
-    lead, detected, alarms, bearing = (
+    forms = {
+        "lead_s": ".2f",
+        "detection": ".2f",
+        "random_detection": ".2f",
+        "false_alarms_per_hour": ".0f",
+        "bearing_deg": ".1f",
+    }
+    lead, detected, random, alarms, bearing = (
         "-" if figures[name] != figures[name] else format(figures[name], form) for name, form in forms.items()
     )
     interval = f"[{low:.0f}, {high:.0f}]" if low == low else "-"
-    return f"{method:36}{lead:>8}{detected:>10}{alarms:>8}{interval:>14}{bearing:>13}"
+    return f"{method:36}{lead:>8}{detected:>10}{random:>8}{alarms:>8}{interval:>14}{bearing:>13}"

@@ -78,8 +78,9 @@ def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "Featu
     import sys
     from dataclasses import replace
 
-    from worldstate.adapters.files.acoustic_domain import OVAD_RATE_HZ, check_array, domain_of, ovad_domain
+    from worldstate.adapters.files.acoustic_domain import check_array, domain_of, ovad_domain
     from worldstate.adapters.files.array_file import read_array
+    from worldstate.frontend.direction.feature import FEATURE_RATE_HZ
 
     environments = table.environments.tolist()
     if arguments.array is None:
@@ -90,5 +91,5 @@ def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "Featu
     if table.domain is not None:
         check_array(table.domain, array)
         return table
-    rate_hz = arguments.sample_rate or OVAD_RATE_HZ
+    rate_hz = arguments.sample_rate or FEATURE_RATE_HZ
     return replace(table, domain=domain_of(array, [rate_hz], environments))

@@ -5,6 +5,9 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+
+from .weighted_figures import ratio
 
 
 def poisson_interval(count: int, exposure: float, confidence: float = 0.95) -> tuple[float, float]:
@@ -30,24 +33,28 @@ def poisson_interval(count: int, exposure: float, confidence: float = 0.95) -> t
     return low / time, float(gammaincinv(whole + 1.0, 1.0 - tail)) / time
 
 
-def random_detection(windows_s: ArrayLike, alarms: int, scored_s: float) -> float:
+def random_detection(
+    windows_s: ArrayLike, alarms: ArrayLike, scored_s: ArrayLike, times: ArrayLike = 1.0
+) -> FloatArray:
     r"""Return the detection rate of as many alarms at uniformly random moments; NaN without an approach.
 
-    .. math:: \frac1n \sum_i 1 - (1 - w_i / T)^N
+    .. math:: \sum_i t_i \left(1 - (1 - w_i / T)^N\right) / \sum_i t_i
 
-    `windows_s` (n,) holds w, the time before each T0 in which an onset counts; T is all scored time.
+    `windows_s` (n,) holds w, the time before each T0 in which an onset counts; T is all scored time. On
+    samples of the approaches, which hold each of them `times` (D, n), `alarms` and `scored_s` are (D,).
 
     Examples
     --------
-    >>> random_detection([5.0, 2.5], alarms=2, scored_s=10.0)
+    >>> float(random_detection([5.0, 2.5], alarms=2, scored_s=10.0))
     0.59375
     """
     windows = finite_array("windows_s", windows_s, (None,))
-    total_s = in_range("scored_s", scored_s, 0.0, np.inf, open_low=True)
-    number = in_range("alarms", alarms, 0, np.inf)
-    if not windows.size:
-        return float("nan")
-    if windows.min() < 0.0 or windows.max() > total_s:
+    number, total_s = (np.asarray(one, np.float64)[..., None] for one in (alarms, scored_s))
+    in_range("scored_s", float(total_s.min(initial=1.0)), 0.0, np.inf, open_low=True)
+    in_range("alarms", float(number.min(initial=0.0)), 0, np.inf)
+    share, weight = np.broadcast_arrays(windows / total_s, np.asarray(times, np.float64))
+    if ((share < 0.0) | (share > 1.0))[weight > 0.0].any():
         got = f"{windows.min():g} to {windows.max():g} s"
-        raise InvalidArgumentError(f"windows_s: expected each within the {total_s:g} s scored, got {got}")
-    return float(np.mean(1.0 - (1.0 - windows / total_s) ** number))
+        raise InvalidArgumentError(f"windows_s: expected each within the time scored, got {got}")
+    detected = 1.0 - (1.0 - np.clip(share, 0.0, 1.0)) ** number
+    return ratio((weight * detected).sum(axis=-1), weight.sum(axis=-1))

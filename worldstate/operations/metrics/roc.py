@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import rankdata
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
@@ -43,8 +42,7 @@ def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
     n_positive, n_negative = int(labels.sum()), int((~labels).sum())
     if not n_positive or not n_negative:
         return None
-    rank_sum = float(rankdata(values)[labels].sum())
-    return (rank_sum - n_positive * (n_positive + 1) / 2) / (n_positive * n_negative)
+    return float(rank_wins([values[labels]], [values[~labels]])[0, 0]) / (n_positive * n_negative)
 
 
 def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:

@@ -64,7 +64,7 @@ def _limits(model: Model) -> list[str]:
     low, high = domain.sample_rate_hz
     limits = [
         "another array: refused; microphones more than 1 mm elsewhere count as another",
-        f"sample rates outside {low:.0f} to {high:.0f} Hz: refused",
+        f"sample rates outside {low:.0f} to {high:.0f} Hz and their halves, quarters and eighths: refused",
         "other sites than those named: thresholds were set on these; see worldstate calibrate",
         "sound of anything but vehicles: the model does not know it",
     ]

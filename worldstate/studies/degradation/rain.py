@@ -16,26 +16,26 @@ from worldstate.ground.typing import Float32Array
 RAIN_DB = (-np.inf, -20.0, -10.0, 0.0, 10.0)
 
 
-def rained(source: Source, level: int, rng: np.random.Generator) -> Source:
-    """Return a source to be heard once, with rain on the roof over its sound.
+def rained(source: Source, level: int, dry_rms: float, rng: np.random.Generator) -> Source:
+    """Return a source to be heard once, with rain on the roof over its sound, whose `level_rms` is `dry_rms`.
 
     Drops fall on each microphone's surroundings by themselves: unlike wind or traffic, what they add is not
     coherent between microphones.
     """
-    with open_sound(source.sound, source.array.n_microphones) as first:
-        noise_rms = level_rms(first) * 10.0 ** (RAIN_DB[level] / 20.0)
+    noise_rms = dry_rms * 10.0 ** (RAIN_DB[level] / 20.0)
     audio = open_sound(source.sound)
     stream = io.BufferedReader(_Rain(audio, noise_rms, rng))
     return replace(source, sound=RawPcm(stream, audio.sample_rate_hz, audio.channels, "f32", str(audio.path)))
 
 
-def level_rms(audio: Audio) -> float:
+def level_rms(source: Source) -> float:
     """Return the root mean square over all channels, without their means."""
-    n, total, squares = 0, np.zeros(audio.channels), np.zeros(audio.channels)
-    for block in audio.blocks():
-        n += len(block)
-        total += block.sum(axis=0, dtype=np.float64)
-        squares += np.square(block, dtype=np.float64).sum(axis=0)
+    with open_sound(source.sound, source.array.n_microphones) as audio:
+        n, total, squares = 0, np.zeros(audio.channels), np.zeros(audio.channels)
+        for block in audio.blocks():
+            n += len(block)
+            total += block.sum(axis=0, dtype=np.float64)
+            squares += np.square(block, dtype=np.float64).sum(axis=0)
     return float(np.sqrt(np.mean(squares / n - (total / n) ** 2)))
 
 

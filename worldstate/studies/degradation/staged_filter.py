@@ -24,7 +24,7 @@ from worldstate.operations.recordings.hop_table import HopTable, joined
 
 from .conditions import OFF, Condition, all_conditions
 from .looks import READINGS, StagedDetector, degradation_in, detections_in
-from .rain import rained
+from .rain import level_rms, rained
 
 # Changes whenever the same sound and looks would give other beliefs.
 VERSION = 1
@@ -72,14 +72,15 @@ def filter_in_conditions(
     P(hidden) + P(visible) of the filter; and `found`, whether a moving object that is in view was detected,
     where `seen` takes any detection.
     """
-    with one_blas_thread():
+    rms = level_rms(source)
+
+    def at(level: int) -> Source:
         # The same drops at every level, only louder: what differs between levels is no draw of the noise.
-        heard = {
-            level: list(
-                measure_steps(rained(source, level, np.random.default_rng(seed)) if level else source)
-            )
-            for level in sorted({state.sound_level for state in conditions})
-        }
+        return rained(source, level, rms, np.random.default_rng(seed)) if level else source
+
+    with one_blas_thread():
+        levels = sorted({state.sound_level for state in conditions})
+        heard = {level: list(measure_steps(at(level))) for level in levels}
         reference = _reference(source, [frame.stamp_ns for frame, _ in next(iter(heard.values()))])
         return {
             one.detector.name: joined(

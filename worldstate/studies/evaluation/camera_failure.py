@@ -1,10 +1,12 @@
 """The degradation sweep on the recordings of an evaluation that were filmed."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.files.model_file import read_model
 from worldstate.studies.degradation.degradation_study import (
     DegradationSettings,
     DegradationStudy,
@@ -14,14 +16,25 @@ from worldstate.studies.degradation.degradation_study import (
 )
 from worldstate.studies.degradation.sweep_data import sweep_data
 from worldstate.studies.trials.engine import Engine, Failed
+from worldstate.studies.trials.listening import model_refusal
 from worldstate.studies.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
 from worldstate.studies.trials.takes import TakeList
 
 Begin = Callable[[str, int], None]
 
 
+def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSettings:
+    """Return the settings of a sweep over all filmed recordings, in place of an even choice of them."""
+    calm = [take.hazard_free for take in takes.static if take.filmed]
+    return replace(settings, approaches=calm.count(False), hazard_free=calm.count(True))
+
+
 def lacking_films(takes: TakeList, settings: DegradationSettings) -> str | None:
-    """Say what the sweep needs and does not find."""
+    """Say what the sweep needs and does not find; its model has to be made for the sound."""
+    model = read_model(settings.model)
+    for take in takes.static:
+        if take.filmed and (refusal := model_refusal(take, model)) is not None:
+            return f"needs a model that was made for this sound; {refusal}"
     return sweep_data(_filmed(takes), settings.approaches, settings.hazard_free).lacks
 
 

@@ -1,7 +1,7 @@
 """The whole evaluation: recordings are heard once, every protocol is run on them, everything is scored."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol as Interface
 
 import numpy as np
@@ -10,23 +10,21 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import IndexArray
 from worldstate.operations.metrics.recording_draws import DRAWS, stratified_draws
 from worldstate.studies.degradation.degradation_study import DegradationSettings, DegradationStudy
-from worldstate.studies.methods.table_rows import methods_for
-from worldstate.studies.paper.ablations import AblationRow, AblationSwitches, ablation_table
+from worldstate.studies.methods.table_rows import methods_for, refused_methods
 from worldstate.studies.trials.classification import Classifiers
 from worldstate.studies.trials.engine import Engine, Failed
 from worldstate.studies.trials.hearing import Hearing, hear, within_hours
-from worldstate.studies.trials.takes import TakeList
+from worldstate.studies.trials.takes import Take, TakeList
 from worldstate.studies.trials.trial import Trial
 
 from .camera_failure import camera_failure, lacking_films
 from .front_end_study import FrontEndStudy, front_end_study
 from .protocol_run import ProtocolRun, run_protocol
-from .protocols import PROTOCOLS, STATIC
+from .protocols import PROTOCOLS
 from .scores import Score
 
-# The paper's alpha; the ablations are told at it.
+# The paper's alpha.
 ALPHA = 0.02
-SUSTAIN_HOPS = 3
 
 
 class Steps(Interface):
@@ -63,18 +61,20 @@ class Evaluation:
     scores: Mapping[str, Mapping[str, Score]]  # By protocol and method
     draws: Mapping[str, IndexArray]  # Samples of recordings by protocol, the same for every method
     front_end: FrontEndStudy | None  # Of the standing ego, whose camera is a reference
-    ablations: Mapping[str, AblationRow]
     degradation: DegradationStudy | None  # Ablation (c), on the filmed recordings
     settings: EvaluationSettings
+    # By protocol and method that is not scored: why its model was not made for the sound of a recording.
+    refused: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
-def lacking_data(takes: TakeList) -> dict[str, str]:
+def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
     """Say for each protocol that cannot be run what it lacks; refuse where none can."""
     every = (*takes.static, *takes.dynamic)
     lacking = {one.name: what for one in PROTOCOLS if (what := one.lacks(every)) is not None}
     if len(lacking) == len(PROTOCOLS):
         told = "; ".join(f"{name} {what}" for name, what in lacking.items())
-        raise InvalidArgumentError(f"{takes.root}: no protocol can be run: {told}")
+        unheard = "".join(f"; not heard: {one.name}: {one.problem}" for one in failed)
+        raise InvalidArgumentError(f"{takes.root}: no protocol can be run: {told}{unheard}")
     return lacking
 
 
@@ -87,25 +87,23 @@ def evaluate(
     settings: EvaluationSettings,
 ) -> Evaluation:
     """Hear all recordings, run every protocol that they suffice for and score every method."""
-    lacking = lacking_data(takes)
+    lacking_data(takes)
     every = (*takes.static, *takes.dynamic)
     steps.begin("listening", len(every))
     heard, failed = hear(every, hearing, engine, steps.advance)
     trials = within_hours(heard, settings.hazard_free_hours)
+    left = _left(takes, trials)
+    # Again, on what is left: one broken recording of a small data set may be one too many.
+    lacking = lacking_data(left, failed)
     chosen = [protocol for protocol in PROTOCOLS if protocol.name not in lacking]
     steps.begin("fitting and deciding", len(chosen))
-    runs = {}
+    runs, refused = {}, {}
     for protocol in chosen:
         own = [trial for trial in trials if bool(trial.hops.about["moving"]) == protocol.moving]
         runs[protocol.name] = run_protocol(protocol, own, methods_for(own), classifiers, settings.seeds)
+        refused[protocol.name] = refused_methods(own)
         steps.advance()
-    steps.begin("scoring", sum(len(run.decisions) for run in runs.values()))
-    scores: dict[str, dict[str, Score]] = {}
-    for name, run in runs.items():
-        scores[name] = {}
-        for method, passes in run.decisions.items():
-            scores[name][method] = Score.of(run.trials, passes)
-            steps.advance()
+    scores = _scored(runs, steps)
     rng = np.random.default_rng(settings.seeds[0])
     standing = [trial for trial in trials if not trial.hops.about["moving"]]
     filmed = any(np.isfinite(trial.hops.reference_rad).any() for trial in standing)
@@ -121,10 +119,31 @@ def evaluate(
             for name, run in runs.items()
         },
         front_end_study(standing, rng, settings.draws) if filmed else None,
-        _ablations(standing, classifiers, settings.seeds[0]) if STATIC.name in runs else {},
-        _degradation(takes, hearing, engine, steps, settings.degradation, lacking),
+        _degradation(left, hearing, engine, steps, settings.degradation, lacking),
         settings,
+        refused,
     )
+
+
+def _scored(runs: Mapping[str, ProtocolRun], steps: Steps) -> dict[str, dict[str, Score]]:
+    steps.begin("scoring", sum(len(run.decisions) for run in runs.values()))
+    scores: dict[str, dict[str, Score]] = {}
+    for name, run in runs.items():
+        scores[name] = {}
+        for method, passes in run.decisions.items():
+            scores[name][method] = Score.of(run.trials, passes)
+            steps.advance()
+    return scores
+
+
+def _left(takes: TakeList, trials: Sequence[Trial]) -> TakeList:
+    """Return the recordings that were heard and are scored, a stream if any piece of it is."""
+    names = {str(trial.hops.about.get("stream", trial.name)) for trial in trials}
+
+    def kept(some: Sequence[Take]) -> tuple[Take, ...]:
+        return tuple(take for take in some if take.name in names)
+
+    return replace(takes, static=kept(takes.static), dynamic=kept(takes.dynamic))
 
 
 def _degradation(
@@ -141,18 +160,9 @@ def _degradation(
     if lacks is not None:
         lacking["degradation sweep"] = lacks
         return None
-    return camera_failure(takes, hearing.folder, engine, settings, steps.begin, steps.advance)
-
-
-def _ablations(trials: Sequence[Trial], classifiers: Classifiers, seed: int) -> dict[str, AblationRow]:
-    """Remove absence, calibration and looming one at a time, with the published scores if there are any."""
-    scores = "shipped"
-    if classifiers.windows is not None:
-        scores, trials = "published", classifiers.classify(trials, "all", (), trials, seed)
-    streams = [
-        # A vehicle is in view where the camera's own detections say so: nothing else is known of it.
-        trial.hops.replace(log_likelihoods=trial.hops.columns[scores], there=trial.hops.seen)
-        for trial in trials
-    ]
-    switches = AblationSwitches(alpha=ALPHA, sustain_hops=SUSTAIN_HOPS)
-    return ablation_table(streams, trials[0].hops.about["prior"][scores], seed, switches)
+    try:
+        return camera_failure(takes, hearing.folder, engine, settings, steps.begin, steps.advance)
+    except InvalidArgumentError as error:
+        # Broken videos may leave it fewer recordings than it needs: no reason to lose all other figures.
+        lacking["degradation sweep"] = str(error)
+        return None

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.operations.recordings.advisories import caution
+from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, caution
+from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.studies.trials.classification import Classifiers
 from worldstate.studies.trials.trial import Decisions, Method, Trial
 
@@ -22,6 +23,13 @@ class ProtocolRun:
     decisions: Mapping[str, tuple[tuple[Decisions, ...], ...]]
     seeds: tuple[int, ...]
     trained_on: str  # What the published classifier was trained on
+
+    @property
+    def stands_on(self) -> dict[str, float]:
+        """How many recordings of either kind were scored, and the hours without a vehicle."""
+        calm = [len(trial.hops) for trial in self.trials if trial.hazard_free]
+        counts = {"recordings": len(self.trials), "approaches": len(self.trials) - len(calm)}
+        return {**counts, "hazard_free": len(calm), "hazard_free_hours": sum(calm) * HOP_S / SECONDS_PER_HOUR}
 
     @property
     def cautions(self) -> tuple[str, ...]:

@@ -68,9 +68,12 @@ _CLEAR = (
 )
 # Whether the greater or the smaller value is the worse one, where junctions are compared.
 _WORSE: dict[str, Literal["low", "high"]] = {
-    "detection": "low",
-    "false_alarms_per_hour": "high",
-    "auroc_all": "low",
+    **dict.fromkeys(("detection", "lead_s", "lead_missed_zero_s", "side_correct", "hazard_awareness"), "low"),
+    **dict.fromkeys(("auroc_all", "auroc_2s", "auroc_1s", "brier_skill", "visible_coverage"), "low"),
+    **dict.fromkeys(("false_alarms_per_hour", "advisory_share", "early_onsets_per_approach"), "high"),
+    **dict.fromkeys(("bearing_deg", "bearing_gated_deg", "azimuth_error_deg", "gospa_deg"), "high"),
+    **dict.fromkeys(("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz"), "high"),
+    **dict.fromkeys(("fragmentation_rate_hz", "track_latency_s", "visible_error_s"), "high"),
 }
 
 
@@ -181,10 +184,12 @@ class Score:
 
     def by_site(self) -> dict[str, dict[str, float]]:
         """Return the figures of each junction, by name."""
-        groups: dict[str, list[int]] = {}
-        for row, one in enumerate(self.recordings):
-            groups.setdefault(one.site, []).append(row)
-        return {site: self.figures(np.array(groups[site])) for site in sorted(groups)}
+        sites = sorted({one.site for one in self.recordings})
+        inside = np.array([[one.site == site for one in self.recordings] for site in sites], np.float64)
+        found = self._values(inside)
+        return {
+            site: {name: float(values[i]) for name, values in found.items()} for i, site in enumerate(sites)
+        }
 
     def worst_sites(self) -> dict[str, tuple[str, float]]:
         """Return the worst junction and its value, of figures with a better and a worse end."""
@@ -262,12 +267,11 @@ class Score:
     def _random_detection(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> FloatArray:
         """Return what as many onsets at random moments before T0 would detect, shape (S, D)."""
         rates = np.full(sums["before_s"].shape, np.nan)
-        times = (weights * ~self._free).astype(np.intp)
-        for s, d in zip(*np.nonzero(sums["before_s"] > 0.0), strict=True):
-            windows_s = np.repeat(self.counts["window_s"][s], times[d])
-            rates[s, d] = random_detection(
-                windows_s, int(sums["onsets_before"][s, d]), sums["before_s"][s, d]
-            )
+        times = weights * ~self._free
+        for s, before_s in enumerate(sums["before_s"]):
+            scored = before_s > 0.0
+            onsets, windows_s = np.floor(sums["onsets_before"][s]), self.counts["window_s"][s]
+            rates[s, scored] = random_detection(windows_s, onsets[scored], before_s[scored], times[scored])
         return rates
 
 

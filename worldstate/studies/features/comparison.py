@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
@@ -116,7 +116,7 @@ def _row_figures(
     figures = mean_figures([window_figures(table, one) for one in passes])
     n = int(table.hazard_free.sum())
     # Probability of as many false positives or more, were the true rate the budget.
-    p_value = float(binom.sf(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
+    p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
     return {**figures, "fpr_p_value": p_value, "intervals": draws.intervals()}
 
 

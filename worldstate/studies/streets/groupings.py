@@ -32,11 +32,13 @@ def halves(sites: list[str]) -> tuple[Grouping, ...]:
     >>> [str(one) for one in halves(["SA1", "SA2", "SB1", "SB2"])]
     ['SA1 SB1 | SA2 SB2', 'SA1 SB2 | SA2 SB1']
     """
+    # As equal as possible: one junction against four is told apart at .99, whatever it is.
     found = []
     for one in combinations(sites, len(sites) // 2):
         other = tuple(name for name in sites if name not in one)
         if len(one) < len(other) or one[0] == sites[0]:  # of equal sets every split comes twice
             found.append(Grouping(one, other))
+    # Type A against type B would measure the wall across the street (transfer .87).
     mixed = [one for one in found if len(_types(one.one)) == len(_types(one.other)) == len(_types(sites))]
     return tuple(mixed or found)
 
@@ -52,6 +54,7 @@ def within_types(sites: list[str]) -> tuple[Grouping, ...]:
     found = []
     for name in sites:
         others = tuple(other for other in sites if other != name and other[:2] == name[:2])
+        # Of two junctions of a type the one order is the other.
         if others and (len(others) > 1 or name < others[0]):
             found.append(Grouping((name,), others))
     return tuple(found)

@@ -2,19 +2,23 @@
 
 from collections.abc import Mapping
 
-from .realism import Realism, RealismRow, Span
+from .asked import Span
+from .realism import Realism
+from .realism_rows import RealismRow
 from .side import FAR_AZIMUTHS_DEG
 
 
 def realism_lines(found: Realism) -> list[str]:
-    """Return the figures, the transfers and the profiles of the side; `!` marks a figure that is outside."""
+    """Return figures, transfers and profiles; `!` marks what is outside, `x` what is not as asked."""
     names = list(dict.fromkeys(name for row in found.rows for name in row.simulated))
     lines = [f"real against real: {'; '.join(found.groupings)}", _head(names)]
     lines += [_line(row, names) for row in found.rows]
-    inside = {name: [row.inside.get(name) for row in found.rows] for name in names}
-    lines += [
-        f"{name}: inside {told.count(True)}, outside {told.count(False)}" for name, told in inside.items()
-    ]
+    for name in names:
+        inside, met = ([how.get(name) for how in told] for told in _verdicts(found))
+        lines.append(
+            f"{name}: inside {inside.count(True)}, outside {inside.count(False)}; "
+            f"as asked {met.count(True)}, not {met.count(False)}"
+        )
     for name, one in found.transfers.items():
         low, high = one.gain or (float("nan"),) * 2
         lines.append(
@@ -24,21 +28,25 @@ def realism_lines(found: Realism) -> list[str]:
     return lines + _profile_lines(found.profiles)
 
 
+def _verdicts(found: Realism) -> tuple[list[dict[str, bool | None]], list[dict[str, bool | None]]]:
+    return [row.inside for row in found.rows], [row.met for row in found.rows]
+
+
 def _head(names: list[str]) -> str:
-    columns = "".join(f"{name[-10:]:>12}" for name in names)
-    return f"{'figure':<50}{'windows':<14}{'real':>8}{'real against real':>19}{'of a type':>13}{columns}"
+    spans = f"{'real against real':>19}{'of a type':>13}{'asked':>13}"
+    return f"{'figure':<53}{'windows':<14}{'real':>8}{spans}" + "".join(
+        f"{name[-10:]:>11}  " for name in names
+    )
 
 
 def _line(row: RealismRow, names: list[str]) -> str:
-    columns = "".join(
-        f"{_number(row.simulated.get(name)):>11}{_mark(row.inside.get(name))}" for name in names
-    )
-    spans = f"{_span(row.halves):>19}{_span(row.junctions):>13}"
-    return f"{row.figure:<50}{row.windows:<14}{_number(row.real):>8}{spans}{columns}"
+    columns = "".join(f"{_number(row.simulated.get(name)):>11}{_marks(row, name):<2}" for name in names)
+    spans = f"{_span(row.halves):>19}{_span(row.junctions):>13}{_span(row.asked):>13}"
+    return f"{row.figure:<53}{row.windows:<14}{_number(row.real):>8}{spans}{columns}"
 
 
-def _mark(inside: bool | None) -> str:
-    return "!" if inside is False else " "
+def _marks(row: RealismRow, name: str) -> str:
+    return "!" * (row.inside.get(name) is False) + "x" * (row.met.get(name) is False)
 
 
 def _number(value: float | None) -> str:

@@ -28,7 +28,7 @@ def set_figures(table: FeatureTable) -> dict[FigureKey, float]:
     if len(hidden) >= LEAST_WINDOWS:
         figures |= {(name, "hidden"): value for name, value in _hidden_peaks(hidden).items()}
     area = second_half_area(table)
-    return figures if area is None else figures | {("AUROC of the second half's peak", "hidden, none"): area}
+    return figures if area is None else figures | {("area of the second half's peak", "hidden, none"): area}
 
 
 def second_half_area(table: FeatureTable) -> float | None:

@@ -24,6 +24,7 @@ def side_accuracy(
     levels = [_levels(table, without_site_mean) for table in (train, test)]
     found = {}
     for site in np.unique(test.environments[test.hazards]):
+        # Real on real has to leave the junction out; the others do, so that all learn from as many.
         learned = train.hazards & (train.environments != site)
         asked = test.hazards & (test.environments == site)
         right = np.asarray(train.labels[learned] == "right")
@@ -47,6 +48,8 @@ def _site_means(table: FeatureTable) -> FloatArray:
 
 def _told_right(levels: FloatArray, right: BoolArray, asked: FloatArray) -> FloatArray:
     inputs = np.concatenate([levels, mirror_features(levels)])
+    # Real on real: .95 by this machine, .87 by the published classifier of four classes, .81 by a logistic
+    # regression without mirror images. A weaker one would leave open whether the street or it is at fault.
     mean, scale = standardisation(inputs)
     machine = SVC(kernel="linear").fit((inputs - mean) / scale, np.concatenate([right, ~right]))
     return np.asarray(machine.predict((asked - mean) / scale))
@@ -69,6 +72,7 @@ def odd_profiles(table: FeatureTable) -> dict[str, FloatArray]:
         ]
         if min(map(len, means)):
             left, right = (one.mean(axis=0).reshape(SEGMENTS, -1) for one in means)
+            # Half of it: how far either side is from their mean.
             difference = 0.5 * (left - right)
             odd = 0.5 * (difference - difference[:, ::-1])
             found[str(site)] = odd[:, odd.shape[1] // 2 :]

@@ -8,7 +8,7 @@ array's rate with a quarter of the frame length, which leaves the feature's bins
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import scipy.signal
@@ -21,13 +21,15 @@ from worldstate.adapters.simulation.dataset.recording import simulate_recording
 from worldstate.adapters.simulation.scene.junction import SITES
 from worldstate.adapters.simulation.scene.presets import Preset, preset
 from worldstate.adapters.simulation.scene.settings import SimulationSettings, draw_settings
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.array.steering import cross_spectra
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_NFFT,
     FEATURE_SEGMENTS,
     feature_steering,
-    pair_sum,
+    pair_sum_of,
     segment_feature,
 )
 from worldstate.frontend.spectra.bins import band_bins
@@ -35,7 +37,7 @@ from worldstate.frontend.spectra.phat import whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.parallel import in_processes
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 DECIMATION = 4
 RATE_HZ = 47_998.0 / DECIMATION
@@ -47,6 +49,8 @@ LAYOUT = 3
 ENTRY_S, DURATION_S = 1.65, 3.8
 FRAME_S = 1.0 / FRAME_RATE_HZ
 MAX_PER_CLASS = 1000
+# Any permutation will do; one and the same, or seeds would differ by their arrays.
+PERMUTATION = 56
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,20 +73,36 @@ def simulated_windows(
     progress: Callable[[], None] = lambda: None,
 ) -> FeatureTable:
     """Simulate windows of junctions."""
+    return simulated_window_pair(
+        per_approach, seed, sites=sites, jobs=jobs, levels=levels, progress=progress
+    )[0]
+
+
+def simulated_window_pair(
+    per_approach: int,
+    seed: int,
+    *,
+    sites: Sequence[str] = SITES,
+    jobs: int = 1,
+    levels: Preset | None = None,
+    progress: Callable[[], None] = lambda: None,
+) -> tuple[FeatureTable, FeatureTable]:
+    """Simulate windows of junctions: their features, and those with the microphones' positions permuted."""
     in_range("per_approach", per_approach, 1, MAX_PER_CLASS)
     in_range("jobs", jobs, 1, 256)
     rows = []
-    work = partial(_windows, preset() if levels is None else levels)
+    work = partial(windows_of_recording, preset() if levels is None else levels)
     for found in in_processes(work, _plans(per_approach, seed, sites), jobs):
         rows += found
         progress()
     features, labels, environments, recordings = zip(*rows, strict=True)
     keys = np.array(recordings)
-    return FeatureTable(
-        np.array(features), np.array(labels), keys, np.array(environments), keys, (None,) * len(rows)
-    )
+    about = np.array(labels), keys, np.array(environments), keys, (None,) * len(rows)
+    right, permuted = np.array(features).transpose(1, 0, 2)
+    return FeatureTable(right, *about), FeatureTable(permuted, *about)
 
 
+# Features (2, 60), class, junction, recording.
 Row = tuple[FloatArray, str, str, str]
 
 
@@ -93,14 +113,18 @@ def _plans(per_approach: int, seed: int, sites: Sequence[str]) -> list[WindowPla
     return [WindowPlan(i, *what, child) for i, (what, child) in enumerate(zip(wanted, seeds, strict=True))]
 
 
-def _windows(levels: Preset, plan: WindowPlan) -> list[Row]:
+def windows_of_recording(levels: Preset, plan: WindowPlan) -> list[Row]:
+    """Simulate one recording and return the features of its windows by right and permuted positions."""
     rng = np.random.default_rng(plan.seed)
     scene = _scene(plan, levels, rng)
     first_frame_s = ENTRY_S + float(rng.uniform(0.0, FRAME_S))
     audio = simulate_recording(scene, rng).audio
     ends = window_ends_s(plan.approach, first_frame_s, not scene.ego.stands)
     about = (plan.environment, str(plan.number))
-    return [(window_feature(_cut(audio, end - WINDOW_S)), label, *about) for label, end in ends.items()]
+    arrays = ovad_array(), permuted_array()
+    return [
+        (window_features(_cut(audio, end - WINDOW_S), arrays), label, *about) for label, end in ends.items()
+    ]
 
 
 def _scene(plan: WindowPlan, levels: Preset, rng: np.random.Generator) -> SimulationSettings:
@@ -117,13 +141,27 @@ def _cut(audio: Float32Array, start_s: float) -> Float32Array:
     return audio[first : first + round(WINDOW_S * RATE_HZ)]
 
 
-def window_feature(samples: Float32Array) -> FloatArray:
-    """Compute the published feature of a window at `RATE_HZ`, shape (n, 56) -> (60,)."""
-    bins, array = band_bins(FEATURE_BAND_HZ, RATE_HZ, NFFT), ovad_array()
+@lru_cache(maxsize=1)
+def permuted_array() -> MicrophoneArray:
+    """Return OVAD's positions dealt to other channels, once for all: an array whose geometry is wrong."""
+    positions = ovad_array().positions_m
+    return MicrophoneArray(positions[np.random.default_rng(PERMUTATION).permutation(len(positions))])
+
+
+def window_features(samples: Float32Array, arrays: Sequence[MicrophoneArray]) -> FloatArray:
+    """Compute the published feature of a window at `RATE_HZ` by each array, shape (n, 56) -> (arrays, 60)."""
+    bins = band_bins(FEATURE_BAND_HZ, RATE_HZ, NFFT)
     spectra = scipy.signal.stft(samples, nperseg=NFFT, axis=0)[2][bins.start : bins.stop]
     whitened = whiten(np.ascontiguousarray(spectra.transpose(2, 0, 1), np.complex64))
     length = len(whitened) // FEATURE_SEGMENTS
     with one_blas_thread():
-        steering = feature_steering(array, bins, RATE_HZ, NFFT)
-        sums = [pair_sum(whitened[i * length :][:length], steering) for i in range(FEATURE_SEGMENTS)]
+        matrices = [
+            cross_spectra(whitened[i * length :][:length].transpose(1, 0, 2)) for i in range(FEATURE_SEGMENTS)
+        ]
+        return np.array([_feature(matrices, array, bins, length) for array in arrays])
+
+
+def _feature(matrices: list[Complex64Array], array: MicrophoneArray, bins: range, length: int) -> FloatArray:
+    steering = feature_steering(array, bins, RATE_HZ, NFFT)
+    sums = [pair_sum_of(one, steering) for one in matrices]
     return np.concatenate([segment_feature([s], length, len(bins), array.n_microphones) for s in sums])

@@ -16,7 +16,14 @@ from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.origin import origin_of
 
 from .engine import Engine, Failed
-from .listening import VERSION, chain_tables, filtered_decisions, front_end_tables, unfiltered_decisions
+from .listening import (
+    VERSION,
+    chain_tables,
+    filtered_decisions,
+    front_end_tables,
+    model_refusal,
+    unfiltered_decisions,
+)
 from .pass_cache import FingerprintMemo, PassCache, content_hash, fingerprint
 from .takes import Take
 from .trial import DECISION_COLUMNS, Decisions, Trial
@@ -25,6 +32,9 @@ ALPHA = 0.02
 # Streams are cut into pieces of this length, dealt to folds in their order: a threshold is then set on other
 # minutes of the same stream, and an alarm that lasts over a cut counts once more.
 PIECE_S = 60.0
+# What a model says of a recording that it was made for: decisions of whole chains, and scores by hop.
+CHAIN_NAMES = ("shipped", "adapted", "filtered", "ego_noise")
+SCORES = ("shipped", "grounded", "rateless")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +53,12 @@ class Hearing:
         about.append("" if array is None else content_hash(array))
         cache = PassCache(self.folder)
         heard = cache.tables("front_end", about, partial(front_end_tables, take))
+        hops = heard["hops"].replace(about={**heard["hops"].about, "fingerprint": mark})
+        refused = model_refusal(take, model)
+        if refused is not None:
+            unasked = (*(CHAIN_NAMES if take.moving else CHAIN_NAMES[:-1]), *SCORES)
+            told = {**hops.about, "refused": dict.fromkeys(unasked, refused)}
+            return Trial(hops.replace(about=told), heard["boxes"], heard["truth"])
         # What the chains say depends on the model, too, which the shipped one may change with a release.
         signed = [*about, origin_of(encode(model))]
         # A standing vehicle's own noise is not what the cancellation was made for.
@@ -61,15 +77,11 @@ class Hearing:
             chains["ego_noise"] = filtered_decisions(said["ego_noise"])
         stream = said["plain"]["stream"]
         prior = list(model.signature.reference_prior)
-        hops = heard["hops"].replace(
+        hops = hops.replace(
             shipped=stream.log_likelihoods,
             grounded=stream.grounded,
             rateless=stream.rateless,
-            about={
-                **heard["hops"].about,
-                "fingerprint": mark,
-                "prior": dict.fromkeys(("shipped", "grounded", "rateless"), prior),
-            },
+            about={**hops.about, "prior": dict.fromkeys(SCORES, prior)},
         )
         return Trial(hops, heard["boxes"], heard["truth"], chains)
 

@@ -14,16 +14,20 @@ from worldstate.adapters.acoustic_grounding import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.static_boxes import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.adapters.files.acoustic_domain import TRAIN, feature_order
+from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listen import ListenSettings, Source, Step, listen_steps, measure_steps, open_source
 from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_stream import HOP_S, hop_stream
@@ -110,6 +114,22 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     t0_s = np.nan if take.t0_s is None else take.t0_s
     hops = HopTable(columns, take.name, take.label, t0_s, about)
     return {"hops": hops, "boxes": boxes, "truth": truth}
+
+
+def model_refusal(take: Take, model: Model) -> str | None:
+    """Say why a model was not made for the sound of a recording; None where it was, or names no array."""
+    # The chains listen uncalibrated, as their budgets are not what is scored: nothing else would refuse it.
+    source = open_source(take.path, model=model, settings=CHAINS["plain"])
+    domain = model.domain
+    if domain is None:
+        return None
+    with open_audio(source.audio_path, strict=False) as audio:
+        rate_hz = audio.sample_rate_hz
+    try:
+        feature_order(domain, source.array, rate_hz, source.settings.front_end(source.array, rate_hz), TRAIN)
+    except OutOfDomainError as error:
+        return str(error)
+    return None
 
 
 def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str, HopTable]:
@@ -271,7 +291,8 @@ def _music(
     audio: AudioSource, array: MicrophoneArray, frames: Iterable[AcousticFrame], wanted: BoolArray
 ) -> FloatArray:
     """MUSIC bearings of the very samples that the SRP bearings were read from, NaN where not wanted."""
-    chosen, rate = FrontEndSettings(), audio.sample_rate_hz
+    rate = audio.sample_rate_hz
+    chosen = FrontEndSettings(nfft=feature_nfft(rate))
     bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)
     azimuths = chosen.azimuths_rad()
     steering = array.steering(bin_frequencies_hz(bins, rate, chosen.nfft), azimuths).astype(np.complex64)

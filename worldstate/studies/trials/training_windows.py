@@ -10,10 +10,11 @@ from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.feature_extraction import LabelledWindow, extract_features, feature_table
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.datasets.sample_windows import sample_windows
-from worldstate.adapters.files.acoustic_domain import ovad_domain
+from worldstate.adapters.files.acoustic_domain import check_array, ovad_domain
 from worldstate.adapters.files.model_file import save_model
 from worldstate.adapters.simulation.scene.junction import SITES
 from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, preset
+from worldstate.ground.errors import OutOfDomainError
 from worldstate.operations.training.training import TrainingSettings, train_model
 from worldstate.studies.origin import origin_of
 from worldstate.studies.streets.simulated_windows import LAYOUT, simulated_windows
@@ -28,8 +29,21 @@ PER_APPROACH = 17
 
 
 def windows_from_table(path: Path, takes: TakeList) -> tuple[FeatureTable, str]:
-    """Read a table of windows and leave out those of the tested recordings; say what was left out."""
+    """Read a table of windows and leave out those of the tested recordings; say what was left out.
+
+    Raises
+    ------
+    OutOfDomainError
+        If the windows are of another array than the recordings.
+    """
     table = read_features(path)
+    domain = table.domain or ovad_domain(table.environments.tolist())
+    try:
+        check_array(
+            domain, choose_array(takes.root), "Extract windows of these recordings (extract-features)"
+        )
+    except OutOfDomainError as error:
+        raise OutOfDomainError(f"{path}: windows of another array; {error}") from error
     tested = {take.name for take in (*takes.static, *takes.dynamic)}
     kept = table.without(tested) if set(table.ids.tolist()) & tested else table
     left_out = len(table) - len(kept)

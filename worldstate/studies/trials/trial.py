@@ -98,7 +98,8 @@ class Trial:
         What the front-end read, one row a decision of 0.1 s: `time_s`, `features` (n, 60), `srp_rad`,
         `prominence`, `log_slope_hz` of looming, the camera's `answer`, `miss_rate` and `clutter_rate`, and
         the reference `reference_rad` of a moving box in view. Name, label and T0 are the recording's;
-        `about` holds its `site` and whether the ego moves.
+        `about` holds its `site`, whether the ego moves, and by what the model was not asked, why it was not
+        made for this sound (`refused`).
     boxes : HopTable
         What the camera reported, one row a box: `frame`, `time_s`, `box_px` (n, 4) as x1, y1, x2, y2,
         `score`, `class_name`, `azimuth_rad` of its middle, `moving`; no rows where there is no camera.
@@ -140,6 +141,11 @@ class Trial:
     def t0_s(self) -> float:
         """Line-of-sight entry, seconds; NaN without one."""
         return self.hops.t0_s
+
+    @property
+    def refused(self) -> Mapping[str, str]:
+        """By chain or score that the model was not asked for: why it was not made for this sound."""
+        return dict(self.hops.about.get("refused", {}))
 
     @property
     def site(self) -> str:

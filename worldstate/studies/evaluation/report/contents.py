@@ -21,8 +21,12 @@ from .document import Document, ReportTable, Section, Value
 from .measured_values import Values, measured_values
 
 
-def evaluation_document(found: Evaluation, signatures: SignatureStudy | None = None) -> Document:
-    """Return the whole report; sections that nothing was measured for say so."""
+def evaluation_document(
+    found: Evaluation,
+    signatures: SignatureStudy | None = None,
+    configuration: Sequence[tuple[str, str]] = (),
+) -> Document:
+    """Return the whole report; sections that nothing was measured for say so, and the options end it."""
     values = measured_values(
         found,
         ({} if found.degradation is None else sweep_values(found.degradation))
@@ -51,7 +55,7 @@ def evaluation_document(found: Evaluation, signatures: SignatureStudy | None = N
         f"{data}: {found.takes.origin}, {len(found.trials)} recordings, {_hours(found):.3f} h of them "
         "hazard-free.",
         tuple(sections),
-        _facts(found),
+        (*_facts(found), *configuration),
     )
 
 

@@ -8,7 +8,7 @@ from itertools import chain
 
 from .document import Cell, Curves, ReportTable, Value
 
-_PARTS = ("value", "low", "high", "paper", "paper_low", "paper_high")
+_PARTS = ("value", "low", "high", "note", "paper", "paper_low", "paper_high")
 
 
 def csv_text(source: ReportTable | Curves) -> str:
@@ -46,11 +46,11 @@ def _parts(title: str, cells: Sequence[Cell]) -> list[list[float | str]]:
 
 def _numbers(cell: Cell) -> tuple[float | str, ...]:
     if not isinstance(cell, Value):
-        return (cell, *[math.nan] * 5)
+        return (cell, *[math.nan] * 6)
     paper = cell.paper or Value(math.nan)
     # What is not there says why, as in the report.
-    value = cell.note if math.isnan(cell.value) else cell.value
-    return value, cell.low, cell.high, paper.value, paper.low, paper.high
+    value, note = (cell.note, "") if math.isnan(cell.value) else (cell.value, cell.note)
+    return value, cell.low, cell.high, note, paper.value, paper.low, paper.high
 
 
 def _unknown(value: float | str) -> bool:

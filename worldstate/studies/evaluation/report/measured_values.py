@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.operations.arrays.array_bounds import array_bounds
 from worldstate.operations.metrics.recording_draws import middle
+from worldstate.operations.metrics.weighted_figures import ratio
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate.studies.evaluation.evaluation import Evaluation
 from worldstate.studies.evaluation.front_end_study import FrontEndStudy
@@ -67,7 +69,22 @@ def score_values(score: Score, found: Evaluation, protocol: str) -> dict[str, Va
     intervals["false_alarms_per_hour"] = intervals["false_alarms_per_hour_poisson"]
     # A draw repeats recordings, and so its ECE lies above that of all: only the value is stated.
     intervals |= dict.fromkeys(("ece", "ece_raw", "ece_floor"), (math.nan, math.nan))
-    return {name: Value(value, *intervals[name], figure_digits(name)) for name, value in figures.items()}
+    notes = _worst_notes(score)
+    return {
+        name: Value(value, *intervals[name], figure_digits(name), notes.get(name, ""))
+        for name, value in figures.items()
+    }
+
+
+def _worst_notes(score: Score) -> dict[str, str]:
+    """Say of every figure which junction is the worst; nothing where there is one alone."""
+    if len({one.site for one in score.recordings}) < 2:
+        return {}
+    return {
+        name: f"worst {site} {Value(value, digits=figure_digits(name)).number}"
+        for name, (site, value) in score.worst_sites().items()
+        if math.isfinite(value)
+    }
 
 
 def site_values(score: Score, found: Evaluation, protocol: str) -> dict[str, dict[str, Value]]:
@@ -138,13 +155,17 @@ def _array_values() -> Iterator[tuple[Place, Value]]:
 def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
     for name, place in _FRONT_END.items():
         yield place, Value(study.figures[name], *study.intervals[name], figure_digits(name))
-    medians = [one.median_deg for one in study.by_site.values()] or [math.nan]
+    medians = sorted(
+        (Value(one.median_deg, *one.interval_deg, 1, site) for site, one in study.by_site.items()),
+        key=lambda one: one.value,
+    )
+    ends = ("bearing_best_site_deg", "bearing_worst_site_deg")
+    for name, median in zip(ends, (*medians[:1], *medians[-1:]), strict=False):
+        yield ("front-end", "bearing in view", name), median
     counts = {
         "frames": study.frames,
         "recordings": study.approaches,
         "gated_coverage": PUBLISHED_COVERAGE,
-        "bearing_best_site_deg": min(medians),
-        "bearing_worst_site_deg": max(medians),
     }
     for name, value in counts.items():
         yield ("front-end", "bearing in view", name), _plain(name, value)
@@ -153,27 +174,33 @@ def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
 
 def _derived_values(values: Values, found: Evaluation) -> Iterator[tuple[Place, Value]]:
     """Values that the paper states as differences, worst cases or counts over the figures."""
-    sustained, proposed = (
-        values.get(("static", method, "false_alarms_per_hour"))
-        for method in ("published, sustained", "proposed .02")
-    )
-    if sustained and proposed and sustained.value > 0.0:
-        fewer = 1.0 - proposed.value / sustained.value
-        yield ("static", "against the sustained rule", "fewer_false_alarms"), Value(fewer)
     if STATIC.name in found.runs:
+        yield ("static", "against the sustained rule", "fewer_false_alarms"), _fewer(found)
         early = seen_early_s(found.runs[STATIC.name].trials)
         count = Value(float((early > 0.0).sum()), digits=0, note=f"of {early.size}")
         yield ("static", "Vision-only", "approaches_with_early_box"), count
         yield from _seed_range(found)
     if RETRAINED.name in found.scores:
-        sites = found.scores[RETRAINED.name]["proposed .02"].by_site()
-        shares = [one["detection"] for one in sites.values() if math.isfinite(one["detection"])]
-        for name, share in (("detection_worst", min(shares)), ("detection_best", max(shares))):
-            yield (RETRAINED.name, "proposed .02", name), Value(share)
+        sites = site_values(found.scores[RETRAINED.name]["proposed .02"], found, RETRAINED.name)
+        shares = [replace(one["detection"], note=site) for site, one in sites.items() if "detection" in one]
+        shares.sort(key=lambda one: one.value)
+        for name, share in (("detection_worst", shares[0]), ("detection_best", shares[-1])):
+            yield (RETRAINED.name, "proposed .02", name), share
     for row, figure in (("raw statistic", "ece_raw"), ("calibrated risk", "ece")):
         value = values.get(("static", "proposed .02", figure))
         if value:
             yield ("ablations", row, "ece"), value
+
+
+def _fewer(found: Evaluation) -> Value:
+    """Return the share of false alarms that the proposed method saves, on the same draws of recordings."""
+    every = np.vstack([np.arange(len(found.runs[STATIC.name].trials)), found.draws[STATIC.name]])
+    ours, others = (
+        found.scores[STATIC.name][method].draws(every)["false_alarms_per_hour"]
+        for method in ("proposed .02", "published, sustained")
+    )
+    fewer = 1.0 - ratio(ours, others)
+    return Value(float(fewer[0]), *middle(fewer[1:]))
 
 
 def _seed_range(found: Evaluation) -> Iterator[tuple[Place, Value]]:

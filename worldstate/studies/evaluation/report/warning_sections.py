@@ -1,8 +1,7 @@
 """Sections on warnings: Table I, budgets and false alarms, calibrated cueing, one approach, differences."""
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,7 @@ from .approach_timeline import ApproachImage, ApproachTimeline, approach_figure,
 from .cueing_panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
 from .document import Cell, ReportFigure, ReportTable, Section, Value
 from .measured_values import Values, figure_digits, score_values
+from .method_table import method_table, methods_of, stands_on
 from .recording_panels import lead_figure
 
 PROPOSED = "proposed .02"
@@ -66,6 +66,7 @@ _STRATA = (
     ("clear: hazard awareness (share)", "hazard_awareness"),
     ("clear: bearing (deg)", "bearing_deg"),
     ("occluded: detected (share)", "detection"),
+    ("occluded: random alarms detect (share)", "random_detection"),
     ("occluded: AUROC, all windows", "auroc_all"),
     ("occluded: AUROC, last 2 s", "auroc_2s"),
     ("occluded: AUROC, last 1 s", "auroc_1s"),
@@ -82,39 +83,6 @@ _PAIRS = (
     ("+ ego-noise cancellation", "world-state advisory"),
 )
 _COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all", "ece", "gospa_deg")
-_UNSTATED = {
-    "bearing_deg": "states none",
-    "side_correct": "states none",
-    "gospa_deg": "states none",
-    "lead_s": "none detected",
-}
-
-
-def method_table(
-    name: str,
-    title: str,
-    values: Values,
-    protocol: str,
-    methods: Iterable[str],
-    columns: Sequence[tuple[str, str]],
-    caption: str = "",
-) -> ReportTable:
-    """Return a table with a row for each method and a column for each figure."""
-    rows: list[tuple[Cell, ...]] = []
-    for method in methods:
-        found = [values.get((protocol, method, figure), Value(np.nan)) for _, figure in columns]
-        cells = [
-            one if math.isfinite(one.value) else replace(one, note=_UNSTATED.get(figure, ""))
-            for one, (_, figure) in zip(found, columns, strict=True)
-        ]
-        rows.append((method, *cells))
-    heads = ("method", *(head for head, _ in columns))
-    return ReportTable(name, title, heads, tuple(rows), caption)
-
-
-def methods_of(found: Evaluation, protocol: str) -> list[str]:
-    """Return the names of the methods that have a row of their own."""
-    return [name for name in found.scores[protocol] if not name.startswith("curve")]
 
 
 def table_i(found: Evaluation, values: Values) -> Section:
@@ -122,16 +90,18 @@ def table_i(found: Evaluation, values: Values) -> Section:
     early = values["static", "Vision-only", "approaches_with_early_box"]
     hours, quantum = (values["static", PROPOSED, name] for name in ("hazard_free_hours", "quantum_per_hour"))
     table = method_table(
-        "table_i",
-        "Table I: warning performance, standing ego",
+        found,
         values,
         STATIC.name,
         methods_of(found, STATIC.name),
         _WARNING,
-        "Each cell: value, 95 % interval over recordings (of false alarms the exact Poisson interval), the "
-        "paper's value. Lead: mean of line-of-sight entry T0 minus the first alarm in the 5 s before it, "
-        "detected approaches only. Random alarms: what as many alarms at random moments would detect. The "
-        "folds are those of the protocol; thresholds are set on the other folds.",
+        name="table_i",
+        title="Table I: warning performance, standing ego",
+        caption="Each cell: value, 95 % interval over recordings (of false alarms the exact Poisson "
+        "interval), the worst junction and its value, the paper's value. Lead: mean of line-of-sight entry "
+        "T0 minus the first alarm in the 5 s before it, detected approaches only. Random alarms: what as "
+        "many alarms at random moments would detect. The folds are those of the protocol; thresholds are "
+        "set on the other folds.",
     )
     leads = {
         method: lead
@@ -183,16 +153,23 @@ def budget_section(found: Evaluation, values: Values) -> Section:
             continue
         method = next((name for name, budget in _BUDGETS.items() if budget == alpha), None)
         curve = score_values(score, found, STATIC.name)
-        names = ("false_alarms_per_hour", "detection", "lead_s")
+        names = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
         cells = [values[STATIC.name, method, name] if method else curve[name] for name in names]
         rows.append((f"{alpha:g}", *cells))
     table = ReportTable(
         "alpha",
         "Budget and achieved false alarms, proposed method",
-        ("alpha (share of windows)", "false alarms (1/h)", "detected (share)", "lead (s)"),
+        (
+            "alpha (share of windows)",
+            "false alarms (1/h)",
+            "detected (share)",
+            "random alarms detect (share)",
+            "lead (s)",
+        ),
         tuple(rows),
-        "alpha bounds the share of hazard-free windows in alarm on the calibration folds; the alarms an "
-        "hour are counted on the folds that were not used. Intervals as in Table I.",
+        f"{stands_on(found, STATIC.name)}. alpha bounds the share of hazard-free windows in alarm on the "
+        "calibration folds; the alarms an hour are counted on the folds that were not used. Intervals as in "
+        "Table I.",
     )
     return Section("Budget and false alarms", (), (table,))
 
@@ -224,13 +201,14 @@ def cueing_section(found: Evaluation, values: Values, awareness: Sequence[Report
             operating_figure(_points(found, values), quantum),
             *awareness,
             method_table(
-                "calibration",
-                "Discrimination and calibration of windows",
+                found,
                 values,
                 STATIC.name,
                 [name for name in methods_of(found, STATIC.name) if _known(values, name, "auroc_all")],
                 _CALIBRATION,
-                "ECE over ten equal bins at the recordings' own share of hazard windows, beside what "
+                name="calibration",
+                title="Discrimination and calibration of windows",
+                caption="ECE over ten equal bins at the recordings' own share of hazard windows, beside what "
                 "perfectly calibrated labels would score with as many windows; it has no interval, as "
                 "drawing recordings again only raises it. Raw: the statistic read as a probability, where "
                 "it is between 0 and 1.",
@@ -240,7 +218,8 @@ def cueing_section(found: Evaluation, values: Values, awareness: Sequence[Report
 
 
 def _known(values: Values, method: str, figure: str) -> bool:
-    return math.isfinite(values[STATIC.name, method, figure].value)
+    value = values.get((STATIC.name, method, figure))
+    return value is not None and math.isfinite(value.value)
 
 
 def _reliability(pairs: Sequence[tuple[Trial, Decisions]], values: Values) -> ReportFigure:
@@ -319,14 +298,15 @@ def tracking_section(found: Evaluation, values: Values) -> Section:
         if any(_known(values, name, figure) for _, figure in _TRACKING)
     ]
     table = method_table(
-        "tracking",
-        "Tracks and time to visible, standing ego",
+        found,
         values,
         STATIC.name,
         methods,
         _TRACKING,
-        "GOSPA on bearing with a cut-off of 60 degrees, mean over hops with a vehicle. Time to visible "
-        "beside the constant that fits these approaches best, which knows the answer.",
+        name="tracking",
+        title="Tracks and time to visible, standing ego",
+        caption="GOSPA on bearing with a cut-off of 60 degrees, mean over hops with a vehicle. Time to "
+        "visible beside the constant that fits these approaches best, which knows the answer.",
     )
     return Section("Tracking measures", (), (table,))
 
@@ -334,14 +314,15 @@ def tracking_section(found: Evaluation, values: Values) -> Section:
 def strata_section(found: Evaluation, values: Values) -> Section:
     """Return the figures by condition: clear, occluded, and where the degraded camera is told of."""
     table = method_table(
-        "strata",
-        "Clear and occluded, standing ego",
+        found,
         values,
         STATIC.name,
         methods_of(found, STATIC.name),
         _STRATA,
-        "Clear: after T0 with the vehicle in view; awareness is an alarm or a moving box. Occluded: before "
-        "T0. The third condition, a degraded camera, is the section on vision degradation.",
+        name="strata",
+        title="Clear and occluded, standing ego",
+        caption="Clear: after T0 with the vehicle in view; awareness is an alarm or a moving box. Occluded: "
+        "before T0. The third condition, a degraded camera, is the section on vision degradation.",
     )
     return Section("Conditions", (), (table,))
 
@@ -354,12 +335,13 @@ def difference_section(found: Evaluation) -> Section:
             if ours in scores and other in scores:
                 gains = paired(scores[ours], scores[other], found.draws[protocol])
                 cells = [Value(*gains[figure], figure_digits(figure)) for figure in _COMPARED]
-                rows.append((found.runs[protocol].protocol.title, f"{ours} less {other}", *cells))
+                run = found.runs[protocol]
+                rows.append((run.protocol.title, str(len(run.trials)), f"{ours} less {other}", *cells))
     heads = ("detected (share)", "lead (s)", "false alarms (1/h)", "AUROC", "ECE", "GOSPA (deg)")
     table = ReportTable(
         "differences",
         "Differences between methods",
-        ("protocol", "difference", *heads),
+        ("protocol", "recordings", "difference", *heads),
         tuple(rows),
         "First method less the second on the same recordings, with the middle 95 % over the same draws of "
         "them: an interval that leaves out 0 is a difference that these recordings show.",

@@ -1,0 +1,83 @@
+"""What a stream is, before anything is drawn."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from worldstate.adapters.simulation.scene.junction import MOVING_SITES, Site
+from worldstate.adapters.simulation.scene.presets import Preset, preset
+from worldstate.adapters.simulation.scene.settings import SAMPLE_RATE_HZ
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+
+from .traffic import Traffic, traffic_named
+
+# A log of detections holds 100,000 images, ten a second.
+MAX_MINUTES = 160.0
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """One continuous stream.
+
+    Parameters
+    ----------
+    site : Site
+        The junction; the ego stands.
+    minutes : float
+        Length, 0.05 to 160.
+    seed : int
+        Of everything that is drawn.
+    traffic : Traffic
+        Who drives how often.
+    preset : Preset
+        Levels of everything else.
+    sample_rate_hz : float
+        2 to 96 kHz; sound is rendered up to half of it.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or the ego of the site moves.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.simulation import site
+    >>> settings = StreamSettings(site("SA1"), minutes=60.0, sample_rate_hz=6000.0)
+    >>> settings.samples, settings.traffic.name
+    (21600000, 'calm')
+    """
+
+    site: Site
+    minutes: float
+    seed: int = 1
+    traffic: Traffic = field(default_factory=lambda: traffic_named("calm"))
+    preset: Preset = field(default_factory=preset)
+    sample_rate_hz: float = SAMPLE_RATE_HZ
+
+    def __post_init__(self) -> None:
+        in_range("minutes", self.minutes, 0.05, MAX_MINUTES)
+        in_range("seed", self.seed, 0, 2**63)
+        in_range("sample_rate_hz", self.sample_rate_hz, 2_000.0, 96_000.0)
+        if self.site.name in MOVING_SITES:
+            raise InvalidArgumentError(
+                f"site: expected one where the ego stands, got {self.site.name}: streams have no moving ego"
+            )
+        if self.site.is_open:
+            raise InvalidArgumentError(
+                f"site: expected a junction, got {self.site.name}: no arms to come out of"
+            )
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return 60.0 * self.minutes
+
+    @property
+    def samples(self) -> int:
+        """Length in samples."""
+        return round(self.duration_s * self.sample_rate_hz)
+
+    def generator(self, *purpose: int) -> np.random.Generator:
+        """Return the generator of one purpose, whatever was drawn before for others."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=purpose))

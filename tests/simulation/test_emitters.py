@@ -1,0 +1,192 @@
+"""Synthesised sounds: their level, their spectra, their rhythm, at any sample rate."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import bilinear_zpk, find_peaks, sosfilt, stft, zpk2sos
+
+from worldstate.adapters.simulation.emitters.emitter import SYNTHESES, emitted
+from worldstate.adapters.simulation.emitters.tools import saw, saw_motion
+from worldstate.adapters.simulation.scene.octave_bands import split_octaves
+from worldstate.adapters.simulation.scene.sound_kinds import MICROPHONES, SOUNDS
+
+FS = 32_000.0
+SECONDS = 6
+
+
+@pytest.fixture(scope="module")
+def sounds():
+    return {
+        name: emitted(SOUNDS[name], int(SECONDS * FS), FS, np.random.default_rng(7)) for name in SYNTHESES
+    }
+
+
+def a_weighting_filter(fs):
+    """IEC 61672-1 by its poles, as an analogue filter brought to the sample rate: not our formula."""
+    poles = -2 * np.pi * np.array([20.598997, 20.598997, 107.65265, 737.86223, 12194.217, 12194.217])
+    gain = (2 * np.pi * 12194.217) ** 2 * 10 ** (1.9997 / 20)
+    return zpk2sos(*bilinear_zpk(np.zeros(4), poles, gain, fs))
+
+
+def power_spectrum(x, fs=FS):
+    """Frequencies and power at a resolution of 4 Hz."""
+    frequencies, _, spectra = stft(x, fs, nperseg=int(fs / 4))
+    return frequencies, (np.abs(spectra) ** 2).mean(axis=1)
+
+
+def share(x, low, high):
+    frequencies, power = power_spectrum(x)
+    return power[(frequencies >= low) & (frequencies <= high)].sum() / power.sum()
+
+
+def envelope(x, fs=FS, rate=100):
+    """RMS a hundred times a second."""
+    block = int(fs / rate)
+    return np.sqrt((x[: len(x) // block * block].reshape(-1, block).astype(float) ** 2).mean(axis=1))
+
+
+@pytest.mark.parametrize("name", SYNTHESES)
+def test_every_sound_has_the_level_of_the_table(sounds, name):
+    heard = sosfilt(a_weighting_filter(FS), sounds[name].astype(float))
+    power = envelope(heard, rate=8) ** 2
+    level = 10 * np.log10(power[power > power.max() / 10].mean() / 20e-6**2)
+    assert level == pytest.approx(SOUNDS[name].level_db, abs=1.0)
+
+
+def test_a_raised_voice_has_the_level_and_the_spectrum_of_the_standards(sounds):
+    """66 dB(A) with its pauses: ISO 9921; octaves of raised speech, 125 Hz to 4 kHz: ANSI S3.5-1997."""
+    heard = sosfilt(a_weighting_filter(FS), sounds["voice"].astype(float))
+    assert 20 * np.log10(heard.std() / 20e-6) == pytest.approx(66.0, abs=1.5)
+    octaves = 20 * np.log10(split_octaves(sounds["voice"], FS).std(axis=1) / 20e-6)
+    np.testing.assert_allclose(octaves[1:7], [53.0, 60.5, 64.9, 62.7, 57.2, 51.2], atol=4.0)
+
+
+def test_a_voice_is_modulated_by_its_syllables(sounds):
+    swell = envelope(sounds["voice"])
+    power = np.abs(np.fft.rfft(swell - swell.mean())) ** 2
+    rate = np.fft.rfftfreq(len(swell), 0.01)
+    bands = [power[(rate >= low) & (rate < 2 * low)].sum() for low in (0.75, 1.5, 3.0, 6.0, 12.0)]
+    assert np.argmax(bands) == 2
+
+
+def test_a_siren_alternates_between_two_tones_a_fourth_apart(sounds):
+    frequencies, _, spectra = stft(sounds["siren"], FS, nperseg=6400)
+    low, high = (np.abs(spectra[np.argmin(abs(frequencies - tone))]) for tone in (410.0, 547.0))
+    upper = high > low
+    assert 0.4 < upper.mean() < 0.6
+    # Changes every three quarters of a second.
+    assert np.abs(np.diff(upper.astype(int))).sum() == pytest.approx(SECONDS / 0.75, abs=2)
+    clear = np.maximum(low, high) / np.minimum(low, high)
+    assert np.median(clear) > 5.0
+
+
+def test_a_wail_sweeps_between_its_ends(sounds):
+    frequencies, _, spectra = stft(sounds["wail"], FS, nperseg=3200)
+    pitch = frequencies[np.abs(spectra).argmax(axis=0)][2:-2]
+    assert 580 <= pitch.min() <= 700 and 1300 <= pitch.max() <= 1420
+    assert np.abs(np.diff(pitch)).max() < 200.0
+
+
+def test_a_beeper_is_on_and_off_once_a_second(sounds):
+    swell = envelope(sounds["beeper"])
+    on = swell > 0.5 * swell.max()
+    assert np.diff(on.astype(int)).clip(0).sum() == pytest.approx(SECONDS, abs=1)
+    assert on.mean() == pytest.approx(0.5, abs=0.06)
+    assert share(sounds["beeper"], 990.0, 1210.0) > 0.95
+
+
+def test_a_horn_is_loudest_where_the_regulation_asks(sounds):
+    """UN Regulation No. 28, 6.1.5: the band of 1.8 to 3.55 kHz is above every other above it."""
+    assert share(sounds["horn"], 1800.0, 3550.0) > 0.5
+
+
+def test_birds_sing_above_two_kilohertz(sounds):
+    assert share(sounds["birds"], 2000.0, 8000.0) > 0.98
+
+
+def test_a_minor_third_rings_in_a_church_bell(sounds):
+    frequencies, power = power_spectrum(sounds["bell"])
+    peaks = find_peaks(power, height=power.max() * 1e-3)[0]
+    strong = frequencies[peaks]
+    ratios = strong[:, None] / strong
+    assert (np.abs(ratios - 1.2) < 0.015).any() and (np.abs(ratios - 2.0) < 0.015).any()
+
+
+def test_a_saw_sings_at_the_frequency_of_its_teeth():
+    samples = int(4 * FS)
+    teeth, turns, load = saw_motion(samples, FS, np.random.default_rng(3))
+    sound = saw(samples, FS, np.random.default_rng(3))
+    # Mixed down by the teeth's own phase the tone stands still; beside it there is only noise.
+    for shift, strong in ((0.0, True), (40.0, False), (-40.0, False)):
+        phase = 2 * np.pi * np.cumsum(teeth + shift) / FS
+        line = abs((sound * np.exp(-1j * phase)).mean()) ** 2 / (sound**2).mean()
+        assert (line > 1e-2) == strong
+    np.testing.assert_allclose(teeth, np.round(teeth[0] / turns[0]) * turns)
+    assert teeth[0] / turns[0] >= 24 and 40.0 < turns.min() <= turns.max() < 80.0
+    busy = load > 0.9
+    assert sound[busy].std() > 1.5 * sound[load < 0.1].std()
+    assert teeth[busy].mean() < 0.9 * teeth[load < 0.1].mean()
+
+
+def test_steps_keep_a_walkers_pace(sounds):
+    swell = envelope(sounds["steps"])
+    # Heel and sole are 0.14 s apart: nothing nearer than a third of a second is another step.
+    heels = find_peaks(swell, height=0.3 * swell.max(), distance=33)[0]
+    assert np.diff(heels).mean() / 100 == pytest.approx(1 / 1.9, rel=0.15)
+
+
+def test_music_keeps_time(sounds):
+    kick = split_octaves(sounds["music"], FS)[0]
+    swell = envelope(kick) - envelope(kick).mean()
+    likeness = np.correlate(swell, swell, "full")[len(swell) :]
+    beat = (35 + likeness[35:80].argmax() + 1) / 100
+    assert 60 / 130 - 0.02 <= beat <= 60 / 95 + 0.02
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    st.sampled_from(sorted(SYNTHESES)),
+    st.floats(6_000.0, 50_000.0),
+    st.integers(1, 40_000),
+    st.integers(0, 2**32 - 1),
+)
+def test_any_rate_and_length_gives_the_samples_asked_and_the_same_for_the_same_seed(
+    name, rate, samples, seed
+):
+    first, again = (emitted(SOUNDS[name], samples, rate, np.random.default_rng(seed)) for _ in range(2))
+    assert first.shape == (samples,) and first.dtype == np.float32
+    assert np.isfinite(first).all()
+    assert first.tobytes() == again.tobytes()
+
+
+@pytest.mark.parametrize("name", ["horn", "saw", "bell"])
+def test_a_low_rate_hears_the_same_sound_band_limited(name):
+    """48 kHz is twice 24 kHz, 6 kHz a quarter: the sound drawn at 24 kHz is one and the same."""
+    low = emitted(SOUNDS[name], 12_000, 6_000.0, np.random.default_rng(5))
+    high = emitted(SOUNDS[name], 48_000, 24_000.0, np.random.default_rng(5))
+    spectrum = np.fft.rfft(high)[: len(low) // 2 + 1] / 4
+    inside = np.fft.rfftfreq(len(low), 1 / 6_000.0) < 2_800.0
+    np.testing.assert_allclose(np.fft.rfft(low)[inside], spectrum[inside], atol=1e-3 * np.abs(spectrum).max())
+
+
+def test_an_unknown_sound_is_refused_by_name():
+    from worldstate.adapters.simulation.scene.sound_kinds import sound_kind
+    from worldstate.ground.errors import InvalidArgumentError
+
+    with pytest.raises(InvalidArgumentError, match="vuvuzela"):
+        sound_kind("vuvuzela")
+
+
+def test_the_documentation_lists_every_sound_with_its_level():
+    text = (Path(__file__).parents[2] / "docs/simulation.md").read_text()
+    rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
+    for kind in SOUNDS.values():
+        cells = [cell.strip() for cell in rows[kind.name].strip("|").split("|")]
+        assert cells[1] == kind.label
+        assert float(cells[2].split()[0]) == kind.level_db
+        if kind.origin != MICROPHONES:
+            assert cells[3].startswith(f"{kind.back_db[4]:g} / {kind.back_db[6]:g}")
+            assert cells[4] == f"{kind.height_m:g} m"

@@ -1,0 +1,290 @@
+"""Sounds at a place, on a vehicle and at the microphones: where they come from, how loud, how coherent."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import coherence, stft
+
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.simulation import (
+    SITES,
+    SOUNDS,
+    SimulationSettings,
+    Site,
+    SoundSettings,
+    draw_settings,
+    preset,
+    simulate_recording,
+    site,
+)
+from worldstate.adapters.simulation.emitters.emitter import emitted
+from worldstate.adapters.simulation.emitters.placed_sound import add_signal, add_sound, directivity
+from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
+from worldstate.adapters.simulation.scene.kinds import vehicle_kind
+from worldstate.adapters.simulation.scene.octave_bands import split_octaves
+from worldstate.adapters.simulation.scene.sound_kinds import SIGNALS, sound_kind
+from worldstate.adapters.simulation.scene.vehicle import drive
+from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.receiver import Receiver
+from worldstate.adapters.simulation.sound.static_field import StaticSources
+from worldstate.cli.main import main
+from worldstate.cli.users import simulate as cli
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.ground.errors import InvalidArgumentError
+
+FS = 8_000.0
+OPEN = Site("Open1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, in_the_open=True)
+QUIET = replace(
+    preset(),
+    ambient_octaves_db=(-20.0,) * 8,
+    far_rate=0.0,
+    wind_100hz_db=-20.0,
+    self_noise_db=0.0,
+    gain_mismatch_db=0.0,
+    delay_mismatch_s=0.0,
+    late_walled_db=-90.0,
+    late_open_db=-90.0,
+    wall_scattering=0.0,
+)
+RING = MicrophoneArray([[0.2 * np.cos(a), 0.2 * np.sin(a), 0.0] for a in np.arange(8) * np.pi / 4])
+PAIR = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
+ONE = np.array([[0.0, 0.0, 1.7]])
+
+
+def listener(positions_m, seconds, fs=FS):
+    knots = np.arange(int(seconds * fs / KNOT_SAMPLES) + 1) * KNOT_SAMPLES / fs
+    return Receiver(np.asarray(positions_m), np.zeros(len(positions_m)), knots)
+
+
+def heard(sound, positions_m=ONE, plan=OPEN, seed=1, seconds=1.0, fs=FS):
+    """What the microphones hear of one sound alone, Pa."""
+    receiver = listener(positions_m, seconds, fs)
+    out = np.zeros((len(positions_m), receiver.samples), np.float32)
+    static = StaticSources(out, fs)
+    add_sound(static, sound, plan, QUIET, receiver, np.random.default_rng(seed))
+    static.render()
+    return out
+
+
+def placed(kind, azimuth_deg, range_m, **more):
+    angle = np.radians(azimuth_deg)
+    place = range_m * np.cos(angle), range_m * np.sin(angle)
+    return SoundSettings(kind, 0.0, 1.0, place, **more)
+
+
+def level_db(signal):
+    return 20 * np.log10(np.std(signal) / 20e-6)
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    twice = [heard(placed("steps", 30.0, 5.0), plan=site("SB1"), seed=3).tobytes() for _ in range(2)]
+    assert twice[0] == twice[1] != heard(placed("steps", 30.0, 5.0), plan=site("SB1"), seed=4).tobytes()
+
+
+@pytest.mark.parametrize("azimuth", [20.0, -75.0, 110.0, -160.0])
+@pytest.mark.parametrize("kind", ["voice", "saw"])
+def test_a_sound_comes_from_where_it_stands(kind, azimuth):
+    sound = heard(placed(kind, azimuth, 12.0), RING.positions_m + np.array([0.0, 0.0, 1.7]))
+    frequencies, _, spectra = stft(sound, FS, nperseg=256)
+    band = (frequencies > 400.0) & (frequencies < 2000.0)
+    grid = np.radians(np.arange(-180.0, 180.0, 2.0))
+    steering = Steering.towards(RING, frequencies[band], grid)
+    frames = np.ascontiguousarray(spectra[:, band].transpose(2, 1, 0)[1:-1].astype(np.complex64))
+    found = np.degrees(grid[srp_phat(frames, steering).argmax()])
+    assert abs((found - azimuth + 180) % 360 - 180) <= 4.0
+
+
+@settings(max_examples=3, deadline=None)
+@given(st.floats(6.0, 14.0), st.floats(2.0, 4.0), st.floats(0.0, 360.0))
+def test_pressure_falls_with_distance(range_m, factor, azimuth):
+    """1/r beside what air takes; birds sing too high for the interference of the road, and 3.3 m above us."""
+    near, far = (heard(placed("birds", azimuth, r)) for r in (range_m, factor * range_m))
+    lost = level_db(near) - level_db(far)
+    spread = 20 * np.log10(np.hypot(factor * range_m, 3.3) / np.hypot(range_m, 3.3))
+    assert lost == pytest.approx(spread, abs=0.3 + 0.04 * factor * range_m)
+
+
+def test_a_sound_over_hard_ground_has_its_level_and_three_decibels():
+    """The road sends as much again; birds sing too high for the two to interfere. Air takes 0.3 dB."""
+    dry = emitted(sound_kind("birds"), int(FS), FS, np.random.default_rng(1))
+    signal = heard(placed("birds", 0.0, 15.0), seed=1, seconds=1.2)[0]
+    found = 10 * np.log10(np.square(signal).sum() / np.square(dry).sum())
+    assert found == pytest.approx(3.0 - 20 * np.log10(np.hypot(15.0, 3.3)) - 0.3, abs=0.7)
+
+
+@pytest.mark.parametrize("kind", ["voice", "music", "horn"])
+def test_a_directional_sound_is_weaker_behind_by_its_table(kind):
+    """Beyond the difference of the bands nothing changes: the same draw faces here and away."""
+    front, back = (heard(placed(kind, 0.0, 10.0, facing_rad=way)) for way in (np.pi, 0.0))
+    octaves = [split_octaves(one[0], FS).std(axis=1) for one in (front, back)]
+    loud = octaves[0] > 0.03 * octaves[0].max()
+    found = 20 * np.log10(octaves[1][loud] / octaves[0][loud])
+    np.testing.assert_allclose(found, np.array(sound_kind(kind).back_db)[loud], atol=1.5)
+
+
+@given(st.sampled_from(sorted(SOUNDS)), st.floats(-7.0, 7.0), st.floats(0.0, 3.0))
+def test_directivity_is_whole_in_front_even_and_never_grows_to_the_back(kind, angle, more):
+    near, far = np.sort(np.abs([np.arccos(np.cos(angle)), min(np.arccos(np.cos(angle)) + more, np.pi)]))
+    gains = directivity(sound_kind(kind), np.array([0.0, near, far, -far]))
+    np.testing.assert_allclose(gains[0], 1.0)
+    assert np.all(gains[1] >= gains[2] - 1e-12)
+    np.testing.assert_allclose(gains[2], gains[3])
+
+
+def test_a_house_between_takes_from_a_siren_in_another_street():
+    plan = site("SB1")
+    behind = heard(placed("siren", 120.0, 60.0), plan=plan)
+    free = heard(placed("siren", 120.0, 60.0))
+    assert 10.0 < level_db(free) - level_db(behind) < QUIET.screen_cap_db + 1.0
+    assert level_db(behind) > 55.0  # and is still heard
+
+
+def test_rain_is_loud_at_every_microphone_and_common_to_none():
+    positions = 4 * RING.positions_m + np.array([0.0, 0.0, 1.7])
+    sound = heard(SoundSettings("rain", 0.0, 3.0), positions, seconds=3.0, fs=24_000.0)
+    levels = [level_db(channel) for channel in sound]
+    assert np.ptp(levels) < 3.0
+    # Moderately loud: A-weighted 58 dB, and a bit less or more without the weighting.
+    assert np.mean(levels) == pytest.approx(sound_kind("rain").level_db, abs=3.0)
+    frequencies, between = coherence(sound[0], sound[4], 24_000.0, nperseg=512)
+    assert between[(frequencies > 500) & (frequencies < 8000)].mean() < 0.1
+
+
+def test_rain_at_a_low_rate_is_the_low_part_of_the_same_rain():
+    in_band = []
+    for fs in (6_000.0, 24_000.0):
+        drops = heard(SoundSettings("rain", 0.0, 5.0), RING.positions_m[:2], seconds=5.0, fs=fs)
+        spectrum = np.abs(np.fft.rfft(drops[0])) ** 2 / len(drops[0]) ** 2
+        frequencies = np.fft.rfftfreq(len(drops[0]), 1 / fs)
+        in_band.append(spectrum[(frequencies > 300) & (frequencies < 2500)].sum())
+    # 240 drops of exponential strengths: their power is known to a tenth.
+    assert 10 * np.log10(in_band[0] / in_band[1]) == pytest.approx(0.0, abs=1.5)
+
+
+def test_gusts_shake_their_microphones_and_no_other():
+    sound = heard(SoundSettings("gusts", 0.5, 3.0, channels=(1, 2)), RING.positions_m, seconds=4.0)
+    assert not sound[[0, 3, 4, 5, 6, 7]].any()
+    assert not sound[:, : int(0.5 * FS)].any() and not sound[:, int(3.6 * FS) :].any()
+    octave = split_octaves(sound[1], FS)[:2].std(axis=1)
+    assert octave.max() > 10 * split_octaves(sound[1], FS)[4].std()
+    blowing = np.square(sound[[1, 2], : len(sound[0]) // 600 * 600].reshape(2, -1, 600)).mean(axis=2)
+    assert (blowing > 1e-6 * blowing.max()).mean() < 0.9  # they come and go
+    assert abs(np.corrcoef(sound[1], sound[2])[0, 1]) < 0.3
+
+
+def test_a_signal_of_a_vehicle_moves_with_it():
+    """The beeper's one tone is higher coming than going, by the speed along the line of sight."""
+    speed, lane = 15.0, 8.0
+    receiver = listener(ONE, seconds=4.0)
+    knots = np.arange(-250, 251) * KNOT_SAMPLES / FS
+    path = drive(
+        knots, entry_s=2.0, entry_y_m=1e-9, lane_x_m=lane, speed_mps=speed, kind=vehicle_kind("medium")
+    )
+    out = np.zeros((1, receiver.samples), np.float32)
+    static = StaticSources(out, FS)
+    add_signal(static, "beeper", path, OPEN, QUIET, receiver, np.random.default_rng(2))
+    static.render()
+    frequencies, times, spectra = stft(out[0], FS, nperseg=2048, nfft=16384, noverlap=1024)
+    band = (frequencies > 900) & (frequencies < 1300)
+    tone = np.abs(spectra[band])
+    rear = np.interp(times, path.time_s, path.behind(path.kind.length_m)[1])
+    pitch, loud = frequencies[band][tone.argmax(axis=0)], tone.max(axis=0)
+    coming, going = (
+        np.median(pitch[there & (loud > 0.3 * loud[there].max())]) for there in (rear > 18.0, rear < -18.0)
+    )
+    along = speed * np.cos(np.arctan(lane / 24.0))
+    assert coming / going == pytest.approx((343.0 + along) / (343.0 - along), abs=0.01)
+
+
+def test_what_else_sounds_leaves_the_rest_as_it_is():
+    """The recording with a voice is the one without and the voice; before it begins nothing differs."""
+    scene = SimulationSettings(site("SB1"), "left", duration_s=1.0, entry_s=0.7, sample_rate_hz=FS)
+    with_voice = replace(scene, sounds=(SoundSettings("voice", 0.5, 0.4, (4.0, 0.0)),))
+    plain, voiced = (simulate_recording(one, np.random.default_rng(4), PAIR) for one in (scene, with_voice))
+    assert plain.detections == voiced.detections and plain.truth["frames"] == voiced.truth["frames"]
+    # Octave bands begin a little earlier; sources that are rendered together round together.
+    begin = int(0.45 * FS)
+    np.testing.assert_allclose(plain.audio[:begin], voiced.audio[:begin], atol=2e-6)
+    added = voiced.audio - plain.audio
+    assert added[begin:].std() > 1e-4
+    (told,) = voiced.truth["sounds"]
+    assert (told["kind"], told["start_s"], told["end_s"]) == ("voice", 0.5, 0.9)
+    assert np.flatnonzero(told["sounding"]).tolist() == list(range(5, 9))
+    assert told["azimuth_rad"][0] == 0.0 and told["range_m"][0] == 4.0
+
+
+def test_rain_on_the_lens_takes_detections_while_it_falls():
+    scene = SimulationSettings(
+        site("SB1"), "none", duration_s=6.0, parked_car=True, sample_rate_hz=8000.0, preset=QUIET
+    )
+    wet = replace(scene, sounds=(SoundSettings("rain", 2.0, 4.0, lens_missed=0.7),))
+    dry, seen = (simulate_recording(each, np.random.default_rng(1), PAIR).detections for each in (scene, wet))
+    assert seen[:20] == dry[:20]
+    before, after = (sum(len(frame) for frame in each[20:]) for each in (dry, seen))
+    assert after / before == pytest.approx(0.3, abs=0.2)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.sampled_from((*SITES, "SM1")),
+    st.sampled_from(["left", "none"]),
+    st.lists(st.sampled_from(sorted(SOUNDS)), max_size=4),
+    st.integers(0, 2**32 - 1),
+)
+def test_drawn_sounds_are_those_asked(name, approach, kinds, seed):
+    rng = np.random.default_rng(seed)
+    drawn = with_sounds(draw_settings(name, approach, rng), kinds, 4, rng)
+    signals = [kind for kind in kinds if kind in SIGNALS]
+    assert drawn.signal == (signals[-1] if signals and approach != "none" else "")
+    assert [sound.kind for sound in drawn.sounds] == [kind for kind in kinds if kind != drawn.signal]
+    for sound in drawn.sounds:
+        assert sound.start_s >= 0.0 and sound.end_s <= drawn.duration_s + 1e-9
+        assert all(0 <= channel < 4 for channel in sound.channels)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"kind": "vuvuzela"}, "vuvuzela"),
+        ({"kind": "gusts"}, "channels"),
+        ({"kind": "voice", "duration_s": 0.0}, "duration_s"),
+        ({"kind": "voice", "place_m": (1e4, 0.0)}, "place_m"),
+        ({"kind": "steps", "route_m": ((5.0, 0.0),)}, "route_m"),
+    ],
+)
+def test_wrong_sounds_are_refused_by_name(wrong, told):
+    with pytest.raises(InvalidArgumentError, match=told):
+        SoundSettings(**wrong)
+
+
+def test_the_command_adds_sounds_and_tells_them(tmp_path, capsys):
+    write_array_xml(tmp_path / "pair.xml", PAIR)
+    arguments = [
+        "simulate",
+        "--static",
+        "1",
+        "--scene",
+        "merge",
+        "--duration",
+        "0.5",
+        "--array",
+        str(tmp_path / "pair.xml"),
+    ]
+    assert main([*arguments, "--sounds", "siren,gusts", "--out", str(tmp_path / "d"), "--json"]) == 0
+    (folder,) = json.loads(capsys.readouterr().out)["folders"]
+    truth = json.loads((tmp_path / "d" / folder / "truth.json").read_text())
+    assert truth["settings"]["signal"] == "siren"
+    assert [sound["kind"] for sound in truth["sounds"]] == ["gusts"]
+    assert main([*arguments, "--sounds", "vuvuzela", "--out", str(tmp_path / "e")]) == 2
+    assert "vuvuzela" in capsys.readouterr().err
+
+
+def test_the_command_offers_the_sounds_there_are():
+    assert sorted(cli.SOUNDS) == sorted(SOUNDS)
+    assert SOUNDS.keys() >= set(SIGNALS)

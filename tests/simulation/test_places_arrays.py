@@ -1,0 +1,108 @@
+"""Any array, from two microphones to sixty-four in space: shape, level, bearing, what the data set keeps."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.simulation import SimulationSettings, place, preset, simulate_recording
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.ground.errors import InvalidArgumentError
+
+FS, NFFT = 12_000.0, 128
+GRID = np.stack(np.meshgrid(*[np.arange(4.0)] * 2), axis=-1).reshape(-1, 2)
+ZERO = np.zeros((16, 1))
+CUBE = np.stack(np.meshgrid(*[np.arange(2.0)] * 3), axis=-1).reshape(-1, 3)
+# In metres; the cube stands on a mast.
+ARRAYS = {
+    "pair": [[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]],
+    "line across": np.outer(np.arange(5.0), [0.0, 0.09, 0.0]),
+    "line along": np.outer(np.arange(8.0), [0.08, 0.0, 0.0]),
+    "upright": 0.1 * np.concatenate([ZERO, GRID], axis=1),
+    "lying": 0.1 * np.concatenate([GRID, ZERO], axis=1),
+    "cube": 0.2 * CUBE + [0.0, 0.0, 3.0],
+    "ball": np.random.default_rng(4).uniform(-0.4, 0.4, (64, 3)),
+    "too tall": [[0.0, 0.1, 0.0], [0.0, -0.1, 3.6]],
+}
+POSSIBLE = sorted(set(ARRAYS) - {"too tall"})
+FRONT_AS_BACK, LEFT_AS_RIGHT = ("pair", "line across", "upright"), ("line along",)
+AZIMUTHS_DEG = np.arange(-180.0, 180.0, 2.0)
+STILL = {"ambient_octaves_db": (-20.0,) * 8, "wind_100hz_db": -20.0, "self_noise_db": 0.0}
+EXACT = {"gain_mismatch_db": 0.0, "delay_mismatch_s": 0.0, "vehicle_spread_db": 0.0}
+QUIET = replace(preset(), far_rate=0.0, ambient_waves=8, **STILL, **EXACT)
+
+
+@lru_cache
+def passing(azimuth_deg: float, name: str) -> np.ndarray:
+    """What an array hears of a slow car that is 15 m away at an azimuth, in the open."""
+    x, y = 15.0 * np.cos(np.radians(azimuth_deg)), 15.0 * np.sin(np.radians(azimuth_deg))
+    # Its axles are behind the front: towards us, so that both are at the same azimuth.
+    way = ((2.0 * x, 2.0 * y), (x, y))
+    scene = SimulationSettings(
+        place("open-road").site, "left", 0.5, entry_s=0.3, speed_mps=1.0, sample_rate_hz=FS, route_m=way,
+        preset=QUIET,
+    )  # fmt: skip
+    return simulate_recording(scene, np.random.default_rng(1), MicrophoneArray(ARRAYS[name])).audio
+
+
+def spectrum(sound: np.ndarray, array: MicrophoneArray) -> np.ndarray:
+    bins = slice(4, 16)
+    steering = Steering.towards(array, np.arange(bins.start, bins.stop) * FS / NFFT, np.radians(AZIMUTHS_DEG))
+    frames = len(sound) // NFFT
+    cut = sound[: frames * NFFT].reshape(frames, NFFT, -1) * np.hanning(NFFT)[:, None]
+    return srp_phat(np.ascontiguousarray(np.fft.rfft(cut, axis=1)[:, bins].astype(np.complex64)), steering)
+
+
+def wrapped(degrees: float) -> float:
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def apart_deg(one: float, other: float) -> float:
+    return abs(wrapped(one - other))
+
+
+@pytest.mark.parametrize("name", POSSIBLE)
+@pytest.mark.parametrize("azimuth_deg", [30.0, -124.0])
+def test_an_array_hears_a_vehicle_where_its_geometry_allows(name, azimuth_deg):
+    array = MicrophoneArray(ARRAYS[name])
+    sound = passing(azimuth_deg, name)
+    assert sound.shape == (6000, array.n_microphones)
+    power = spectrum(sound, array)
+    mirrored = 180.0 - azimuth_deg if name in FRONT_AS_BACK else -azimuth_deg
+    here, there = (
+        power[np.argmin([apart_deg(a, at) for a in AZIMUTHS_DEG])] for at in (azimuth_deg, mirrored)
+    )
+    found = AZIMUTHS_DEG[power.argmax()]
+    if name in (*FRONT_AS_BACK, *LEFT_AS_RIGHT):
+        assert min(apart_deg(found, azimuth_deg), apart_deg(found, mirrored)) <= 6.0
+        assert there == pytest.approx(here, rel=0.02)
+    else:
+        assert apart_deg(found, azimuth_deg) <= 4.0
+        assert there < 0.9 * here
+
+
+def test_the_level_is_that_of_the_place_whatever_the_array():
+    levels = [10 * np.log10(np.mean(passing(30.0, name) ** 2)) for name in POSSIBLE]
+    assert np.ptp(levels) < 0.3
+
+
+def test_the_data_set_keeps_the_array_with_its_heights(tmp_path, capsys):
+    (tmp_path / "cube.json").write_text(json.dumps(np.array(ARRAYS["cube"]).tolist()))
+    arguments = ["simulate", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
+    arguments += ["--scene", "parked-van"]
+    assert main([*arguments, "--array", str(tmp_path / "cube.json")]) == 0
+    (folder,) = json.loads(capsys.readouterr().out)["folders"]
+    np.testing.assert_array_equal(read_array(tmp_path / "d" / "array.xml").positions_m, ARRAYS["cube"])
+    assert soundfile.info(tmp_path / "d" / folder / "out_multi.wav").channels == 8
+
+
+def test_an_array_that_reaches_below_the_road_is_refused():
+    with pytest.raises(InvalidArgumentError, match=r"1\.80 m below"):
+        passing(0.0, "too tall")

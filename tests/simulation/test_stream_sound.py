@@ -1,0 +1,228 @@
+"""Sound of a stream: events add up, levels rise, no seams, the same bytes, bounded memory."""
+
+import csv
+import json
+import shutil
+import tracemalloc
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from scipy.signal import welch
+
+from worldstate.adapters.datasets.array_choice import choose_array
+from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.simulation import SITES, preset, site
+from worldstate.adapters.simulation.scene.ambience import site_ambience
+from worldstate.adapters.simulation.scene.kinds import LIGHT
+from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
+from worldstate.adapters.simulation.stream.ambience import OVERLAP_S
+from worldstate.adapters.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
+from worldstate.adapters.simulation.stream.event_sound import event_sound, levels_db
+from worldstate.adapters.simulation.stream.manoeuvres import MANOEUVRES, Driver
+from worldstate.adapters.simulation.stream.microphones import draw_microphones
+from worldstate.adapters.simulation.stream.rendering import (
+    EVENT,
+    StreamScene,
+    pieces,
+    render_blocks,
+    render_piece,
+    row_times,
+)
+from worldstate.adapters.simulation.stream.settings import StreamSettings
+from worldstate.adapters.simulation.stream.sight import visible_s
+from worldstate.adapters.simulation.stream.traffic import TRAFFICS, traffic_named
+from worldstate.adapters.simulation.stream.writing import write_stream
+from worldstate.cli.main import main
+from worldstate.cli.users import simulate
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import Float32Array
+from worldstate.operations.recordings.true_track import read_true_tracks
+from worldstate.studies.trials.takes import find_takes
+
+PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
+# Nothing that swells or fades by itself: what is left is stationary.
+STILL = replace(preset(), name="still", far_rate=0.0, wave_fluctuation_db=0.0, ambient_waves=8)
+
+
+def scene_of(minutes: float, rate_hz: float = 6000.0) -> StreamScene:
+    settings = StreamSettings(site("SB1"), minutes, preset=STILL, sample_rate_hz=rate_hz)
+    microphones = draw_microphones(settings, PAIR, np.random.default_rng(3))
+    return StreamScene(settings, site_ambience(settings.site, STILL), microphones)
+
+
+def event_at(start_s: float, flow: str = "left", reach_m: float = 20.0) -> VehicleEvent:
+    driver = Driver(site("SB1"), LIGHT, "left", 9.0, 0.0, reach_m)
+    return VehicleEvent(flow, MANOEUVRES[flow](driver, np.random.default_rng(1)), start_s)
+
+
+def sound_of(scene: StreamScene, events: Sequence[Event]) -> Float32Array:
+    return np.concatenate([block.pressure_pa for block in render_blocks(scene, events)], axis=1)
+
+
+def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -> None:
+    scene = scene_of(36.0 / 60.0, rate_hz=3000.0)
+    # The first began before the stream, the second and third overlap over the edge of a piece (30 s), the
+    # last goes on after the end.
+    early, late = event_at(-1.0, reach_m=8.0), event_at(34.5, reach_m=8.0)
+    steps = SoundEvent(SoundSettings("steps", 2.0, 3.0, (3.0, 2.0)), 27.0)
+    events = [early, event_at(28.5, reach_m=8.0), event_at(29.5, "turns_away", 10.0), late, steps]
+    added = sound_of(scene, events) - sound_of(scene, ())
+    expected = np.zeros((2, 36 * 3000))
+    for number, event in enumerate(events):
+        rng = scene.settings.generator(EVENT, number)
+        alone = event_sound(event, scene.settings.site, scene.preset, scene.microphones, rng)
+        begin, end = max(alone.first, 0), min(alone.first + alone.pressure_pa.shape[1], expected.shape[1])
+        expected[:, begin:end] += alone.pressure_pa[:, begin - alone.first : end - alone.first]
+    assert np.abs(expected).max() > 0.05
+    np.testing.assert_allclose(added, expected, atol=1e-6)
+
+
+def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() -> None:
+    scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=42.0)
+    alone = event_sound(event, site("SB1"), scene.preset, scene.microphones, np.random.default_rng(2))
+    rows = row_times(event, scene.settings)
+    levels, t0_s = levels_db(alone, rows, 3000.0), visible_s(event, site("SB1"))
+    assert t0_s is not None
+    seconds = [levels[(rows > t0_s - i - 1) & (rows <= t0_s - i)].mean() for i in range(5)]
+    assert all(later > earlier for later, earlier in pairwise(seconds))
+    assert seconds[0] > seconds[4] + 6.0
+    assert levels.argmax() == pytest.approx(np.searchsorted(rows, t0_s) + 4, abs=8)
+    edge = np.abs(alone.pressure_pa[:, [0, -1]]).max()
+    assert edge < 1e-4 * np.abs(alone.pressure_pa).max()
+    # An oracle of its own: the level of one microphone's samples about one row.
+    at = round((rows[50] - 2.0) * 3000)
+    around = alone.pressure_pa[:, at - 150 : at + 150].astype(float)
+    assert levels[50] == pytest.approx(10 * np.log10((around**2).mean() / 4e-10), abs=0.02)
+
+
+def test_a_signal_is_heard_over_its_vehicle_and_leaves_it_as_it_is() -> None:
+    scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=20.0)
+    plain, warning = (
+        event_sound(one, site("SB1"), scene.preset, scene.microphones, np.random.default_rng(2)).pressure_pa
+        for one in (event, replace(event, signal="siren"))
+    )
+    frequency, power = welch((warning - plain)[0], 3000.0, nperseg=1024)
+    # In the hidden arm it comes towards us: both tones are up to 3 % higher.
+    tones = [(frequency > tone) & (frequency < 1.04 * tone) for tone in (400.0, 535.0)]
+    assert sum(power[tone].sum() for tone in tones) > 0.5 * power[frequency < 700.0].sum()
+    assert (warning - plain).std() > 3 * plain.std()
+
+
+def test_no_seam_can_be_measured_where_pieces_of_background_meet() -> None:
+    scene = scene_of(2.0, rate_hz=2000.0)
+    sound = sound_of(scene, ())
+    edges = [scene.piece * i for i in range(1, 4)]
+    overlap, whole = round(OVERLAP_S * 2000), sound.shape[1]
+    seam = np.zeros(whole, bool)
+    for edge in edges:
+        seam[edge : edge + overlap] = True
+    spectra = [
+        np.mean([welch(channel[part], 2000.0, nperseg=256)[1] for channel in sound], axis=0)
+        for part in (seam, ~seam)
+    ]
+    ratio_db = 10.0 * np.log10(spectra[0] / spectra[1])[8:]  # from 60 Hz
+    assert abs(ratio_db.mean()) < 0.3
+    assert np.abs(ratio_db).max() < 2.0
+    # A click is a sample that its neighbours do not foretell.
+    jump = np.abs(np.diff(sound, n=3)).max(axis=0)
+    near = max(jump[edge - 20 : edge + overlap + 20].max() for edge in edges)
+    assert near < 1.2 * jump.max() and near < 8.0 * jump.std() + jump.mean()
+
+
+def test_pieces_do_not_depend_on_which_were_rendered_before() -> None:
+    scene = scene_of(1.0, rate_hz=2000.0)
+    parts = pieces(scene, [event_at(3.0, "parks", 10.0), event_at(33.0, "parks", 10.0)])
+    forth = [render_piece(scene, part).pressure_pa for part in parts]
+    back = [render_piece(scene, part).pressure_pa for part in reversed(parts)]
+    for one, other in zip(forth, reversed(back), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(forth[0][:, :1000], forth[1][:, :1000])
+
+
+def test_memory_does_not_grow_with_the_length_of_a_stream() -> None:
+    def peak(minutes: float) -> int:
+        tracemalloc.start()
+        for block in render_blocks(scene_of(minutes, rate_hz=2000.0), ()):
+            del block
+        reached = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return reached
+
+    assert peak(2.0) < 1.05 * peak(1.0)
+
+
+def test_a_stream_on_disk_is_read_like_a_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    positions = tmp_path / "pair.json"
+    positions.write_text(json.dumps(PAIR.positions_m.tolist()))
+    command = "simulate --minutes 0.25 --site SB1 --seed 33 --traffic busy --bandwidth 700 --json"
+    assert main([*command.split(), "--array", str(positions), "--out", str(tmp_path)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    folder = tmp_path / "SB1-busy-33"
+    assert told["out"] == str(folder) and (folder / "stream.png").stat().st_size > 20_000
+    recording = Recording.open(folder)
+    with recording.open_audio() as audio:
+        assert (audio.channels, audio.sample_rate_hz) == (2, round(told["sample_rate_hz"]))
+        assert audio.duration_s == pytest.approx(15.0, abs=0.01)
+    log = recording.read_detections()
+    assert log is not None and len(log.frames) == 150
+    np.testing.assert_allclose(choose_array(folder).positions_m, PAIR.positions_m, atol=1e-6)
+    events = json.loads((folder / "events.json").read_text())["vehicles"]
+    tracks = read_true_tracks(folder)
+    with (folder / "vehicles.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(events) == told["vehicles"] == len(tracks) > 0
+    for event, track in zip(events, tracks, strict=True):
+        own = [row for row in rows if int(row["vehicle"]) == event["vehicle"]]
+        np.testing.assert_allclose([float(row["time_s"]) for row in own], track.time_s)
+        np.testing.assert_array_equal([row["in_view"] == "1" for row in own], track.in_view)
+        assert all((row["time_to_visible_s"] == "") == (event["t0_s"] is None) for row in own)
+    # As hazard-free time of an evaluation it is refused while anything comes out of a hidden arm.
+    listed = tmp_path / "SB1" / "none" / "2_02_0000"
+    shutil.copytree(folder, listed)
+    (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n2_02_0000,SB1,none,70\n")
+    with pytest.raises(InputFileError, match="1 vehicles that come out"):
+        find_takes(tmp_path, hazard_free=[folder])
+    quiet = {"vehicles": [event for event in events if not event["hazard"]], "sounds": []}
+    (folder / "events.json").write_text(json.dumps(quiet))
+    taken = find_takes(tmp_path, hazard_free=[folder]).static[-1]
+    assert (taken.path, taken.name, taken.hazard_free) == (folder, "SB1-busy-33", True)
+
+
+def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert list(simulate.TRAFFICS) == list(TRAFFICS)
+    assert simulate.STREAM_SITES == SITES
+    refused = {
+        "--minutes 1 --site DA1": "no moving ego",
+        "--minutes 1 --static 2": "--static",
+        "--static 2 --bandwidth 3": "bandwidth_hz",
+        "--minutes 1 --bandwidth 3": "--bandwidth",
+    }
+    for words, problem in refused.items():
+        assert main(["simulate", "--out", str(tmp_path), *words.split()]) == 2
+        assert problem in capsys.readouterr().err
+    (tmp_path / "SB1-empty-1").mkdir()
+    words = ["--minutes", "1", "--site", "SB1", "--traffic", "empty"]
+    assert main(["simulate", "--out", str(tmp_path), *words]) == 2
+    assert "something else" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_one_process_and_two_write_the_same_bytes(tmp_path: Path) -> None:
+    settings = StreamSettings(site("SB1"), 1.2, 9, traffic_named("calm"), sample_rate_hz=4000.0)
+    written = [write_stream(tmp_path / str(jobs), settings, array=PAIR, jobs=jobs).folder for jobs in (1, 2)]
+    names = sorted(path.name for path in written[0].iterdir())
+    assert "out_multi.wav" in names and "vehicles.csv" in names
+    for name in names:
+        assert (written[0] / name).read_bytes() == (written[1] / name).read_bytes(), name
+    samples, rate = soundfile.read(written[0] / "out_multi.wav", dtype="float32")
+    assert samples.shape == (288_000, 2) and rate == 4000 and samples.std() > 1e-4

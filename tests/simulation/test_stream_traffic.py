@@ -1,0 +1,220 @@
+"""Arrivals, motion and sight of a stream: no sound is rendered here."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.simulation import preset, site
+from worldstate.adapters.simulation.scene.kinds import LIGHT, vehicle_kind
+from worldstate.adapters.simulation.scene.places import place
+from worldstate.adapters.simulation.scene.route import along
+from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
+from worldstate.adapters.simulation.stream.arrivals import (
+    SoundEvent,
+    VehicleEvent,
+    draw_events,
+    draw_sounds,
+)
+from worldstate.adapters.simulation.stream.manoeuvres import Driver, emerges
+from worldstate.adapters.simulation.stream.motion import SpeedLimit, drive_along
+from worldstate.adapters.simulation.stream.settings import StreamSettings
+from worldstate.adapters.simulation.stream.sight import (
+    CLUTTER_IMAGES,
+    CLUTTER_PER_HOUR,
+    detected_frames,
+    visible_s,
+)
+from worldstate.adapters.simulation.stream.traffic import FLOWS, HAZARDS, Traffic, traffic_named
+from worldstate.adapters.simulation.stream.truth import describe_events, vehicle_truth
+from worldstate.ground.errors import InvalidArgumentError
+
+NEVER_SEEN = {"turns_away", "parks", "far"}
+
+
+def events_of(name: str, where: str, seed: int, duration_s: float = 3600.0) -> list[VehicleEvent]:
+    return draw_events(site(where), traffic_named(name), preset(), duration_s, np.random.default_rng(seed))
+
+
+def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
+    rates = {"left": 120.0, "far": 300.0, "turns_away": 60.0}
+    traffic, seeds, hours = Traffic("test", rates), 40, 0.05
+    counts = [
+        Counter(e.flow for e in draw_events(site("SB1"), traffic, preset(), 3600.0 * hours, rng))
+        for rng in map(np.random.default_rng, range(seeds))
+    ]
+    for flow, rate in rates.items():
+        number = np.array([count[flow] for count in counts])
+        expected = rate * hours
+        # Index of dispersion about the mean that was asked for: chi-square with one degree a seed.
+        dispersion = ((number - expected) ** 2 / expected).sum()
+        assert chi2.ppf(1e-4, seeds) < dispersion < chi2.ppf(1.0 - 1e-4, seeds), flow
+
+
+@pytest.mark.parametrize("name", ["SA1", "SB1"])
+def test_a_busy_hour_holds_every_event_and_only_hazards_come_out_of_an_arm(name: str) -> None:
+    settings = StreamSettings(site(name), 60.0, traffic=traffic_named("busy"))
+    events = events_of("busy", name, seed=1)
+    vehicles = [vehicle_truth(number, event, settings) for number, event in enumerate(events)]
+    told = describe_events(vehicles, (), {})["vehicles"]
+    assert {one["flow"] for one in told} == {*FLOWS, "follows"}
+    assert {one["kind"] for one in told} >= {"light", "medium", "heavy", "electric", "bicycle"}
+    for one, vehicle in zip(told, vehicles, strict=True):
+        assert one["hazard"] == (one["flow"] in {*HAZARDS, "follows"})
+        assert (one["t0_s"] is None) == (one["flow"] in NEVER_SEEN)
+        inside = vehicle.in_view & (vehicle.time_s < (one["t0_s"] or np.inf) - 0.01)
+        assert not inside.any()
+        if one["flow"] in {"from_behind", "from_ahead"}:  # in view, and then gone into its arm
+            seen = np.flatnonzero(vehicle.in_view)
+            assert not seen.size or seen[-1] < len(vehicle.time_s) - 5
+            assert abs(vehicle.y_m[-1]) > 5.0 or one["last_s"] > 3600.0
+
+
+def test_followers_keep_their_headway_and_pairs_come_together() -> None:
+    events = events_of("busy", "SB1", seed=3)
+    together = [[visible_s(e, site("SB1")) for e in events if e.flow == "both" and e.manoeuvre.arm == arm]
+                for arm in ("left", "right")]  # fmt: skip
+    left, right = (np.sort(np.array(times, dtype=float)) for times in together)
+    assert len(left) >= 3
+    assert np.abs(left[:, None] - right).min(axis=1).max() < 4 * 0.7
+    for event in events:
+        if event.flow != "follows":
+            continue
+        same = [
+            e.start_s for e in events
+            if e is not event and np.array_equal(e.manoeuvre.motion.driven_m, event.manoeuvre.motion.driven_m)
+        ]  # fmt: skip
+        assert min(abs(event.start_s - start) for start in same) > 1.4
+
+
+def test_no_hazard_traffic_has_no_hazards_and_the_other_flows_do_not_change() -> None:
+    quiet, busy = events_of("no-hazard", "SA1", 5), events_of("busy", "SA1", 5)
+    others = [e for e in busy if e.flow not in {*HAZARDS, "follows"}]
+    assert traffic_named("no-hazard").hazard_free and not traffic_named("busy").hazard_free
+    assert [(e.flow, e.start_s) for e in quiet] == [(e.flow, e.start_s) for e in others]
+
+
+@given(
+    arm=st.sampled_from(["left", "right"]),
+    where=st.sampled_from(["SA1", "SA2", "SB1", "SB3"]),
+    speed=st.floats(3.0, 15.0),
+    kind=st.sampled_from(["light", "heavy", "bicycle"]),
+    start_s=st.floats(-5.0, 50.0),
+)
+def test_at_constant_speed_the_time_to_visible_is_the_way_over_the_speed(
+    arm: str, where: str, speed: float, kind: str, start_s: float
+) -> None:
+    plan = site(where)
+    driver = Driver(plan, vehicle_kind(kind), arm, speed, 0.0, 40.0)
+    event = VehicleEvent(arm, emerges(driver, np.random.default_rng(0)), start_s)
+    settings = StreamSettings(plan, 2.0)
+    truth = vehicle_truth(0, event, settings)
+    # The line from the eye past the corner, by similar triangles.
+    eye_x, eye_y, _ = PinholeCamera().position_m
+    corner = plan.corner_left_m if arm == "left" else -plan.corner_right_m
+    lane = truth.x_m[0]
+    entry = eye_y + (corner - eye_y) * (lane - eye_x) / (plan.corner_ahead_m - eye_x)
+    assert lane in plan.lanes_m
+    left = np.array(truth.time_to_visible_s(), dtype=float)
+    np.testing.assert_allclose(np.diff(left), -0.1, atol=2e-3)
+    np.testing.assert_allclose(left, np.abs(truth.y_m - entry) / speed * np.sign(left), atol=0.02)
+    assert not truth.in_view[left > 0.011].any()
+    assert truth.in_view[(left < 0.0) & (left > -0.2)].all()
+
+
+@given(
+    cruise=st.floats(2.0, 15.0),
+    stop=st.floats(20.0, 60.0),
+    stands_s=st.floats(0.5, 20.0),
+)
+def test_who_stops_brakes_stands_and_goes_on_as_mechanics_says(
+    cruise: float, stop: float, stands_s: float
+) -> None:
+    route = along([[6.0, 0.0], [6.0, -1.0]])
+    motion = drive_along(route, (0.0, 90.0), cruise, [SpeedLimit(stop, 0.0, stands_s)], LIGHT, -1)
+    brake, away = cruise**2 / (2 * 2.0), cruise**2 / (2 * 1.5)
+    before = (stop - brake) / cruise + cruise / 2.0 if brake < stop else None
+    if before is not None:
+        stood = motion.time_s[(motion.driven_m == stop)]
+        np.testing.assert_allclose(stood, [before, before + stands_s], rtol=0.02, atol=0.05)
+        if away < 90.0 - stop:
+            after = cruise / 1.5 + (90.0 - stop - away) / cruise
+            np.testing.assert_allclose(motion.duration_s, before + stands_s + after, rtol=0.02, atol=0.1)
+    assert (np.diff(motion.driven_m) >= 0).all() and (np.diff(motion.time_s) >= 0).all()
+    middle = np.array([motion.reaches_s(stop) - 0.5 * stands_s])
+    assert motion.trajectory(middle).speed_mps[0] == 0.0
+
+
+def test_boxes_follow_what_is_in_view_with_misses_and_clutter() -> None:
+    settings = StreamSettings(site("SB1"), 10.0, traffic=Traffic("test", {"left": 240.0}, kinds={"light": 1}))
+    events = draw_events(settings.site, settings.traffic, preset(), 600.0, np.random.default_rng(2))
+    frames = detected_frames(settings, events, [], np.random.default_rng(1))
+    alone = detected_frames(settings, [], [], np.random.default_rng(1))
+    assert len(frames) == len(alone) == 6000
+    added = np.array([len(a) - len(b) for a, b in zip(frames, alone, strict=True)])
+    vehicles = [vehicle_truth(i, event, settings) for i, event in enumerate(events)]
+    seen = np.zeros(len(frames), dtype=int)
+    for one in vehicles:
+        seen[np.rint(10 * one.time_s[one.in_view]).astype(int)] += 1
+    clear = np.convolve(seen, np.ones(21), "same") == 0  # a second and more from any line of sight
+    assert not added[clear].any()
+    missed = 1.0 - np.minimum(added, seen)[seen > 0].sum() / seen[seen > 0].sum()
+    assert 0.02 < missed < 0.25  # 4 to 14 % by azimuth, and what is seen in part at the image's edge
+    boxes = sum(len(frame) for frame in alone) - (6000 if len(alone[0]) else 0)
+    expected = CLUTTER_PER_HOUR / 6 * np.mean(CLUTTER_IMAGES)
+    assert abs(boxes - expected) < 5 * np.sqrt(expected * 2.5)
+
+
+def test_other_sounds_come_at_their_rate_and_rain_takes_boxes() -> None:
+    rates = {"rain": 60.0, "voice": 240.0, "siren": 30.0}
+    traffic = replace(traffic_named("busy"), sounds=rates)
+    settings = StreamSettings(site("SB1"), 60.0, traffic=traffic)
+    sounds = draw_sounds(settings, 4, np.random.default_rng(1))
+    for kind, rate in rates.items():
+        number = sum(one.sound.kind == kind for one in sounds)
+        assert abs(number - rate) < 4.5 * np.sqrt(rate)
+    assert all(0.0 <= one.start_s < 3600.0 for one in sounds)
+    short = replace(settings, minutes=2.0)
+    soaked = SoundEvent(SoundSettings("rain", 2.0, 58.0, lens_missed=0.999), 0.0)
+    dry, wet = (detected_frames(short, [], rain, np.random.default_rng(9)) for rain in ([], [soaked]))
+    assert sum(map(len, dry[20:600])) > 500  # this seed has a parked car
+    assert sum(map(len, wet[20:600])) < 20
+    assert wet[620:] == dry[620:]
+
+
+def test_streams_refuse_what_they_cannot_be() -> None:
+    with pytest.raises(InvalidArgumentError, match="no moving ego"):
+        StreamSettings(site("DA1"), 1.0)
+    with pytest.raises(InvalidArgumentError, match="junction"):
+        StreamSettings(place("merge").site, 1.0)
+    with pytest.raises(InvalidArgumentError, match="per_hour"):
+        Traffic("test", {"up": 3.0})
+    with pytest.raises(InvalidArgumentError, match="minutes"):
+        replace(StreamSettings(site("SA1"), 1.0), minutes=1000.0)
+
+
+def test_signals_are_the_vehicles_own_and_bells_those_of_riders() -> None:
+    shares = {"siren": 0.3, "bicycle-bell": 0.5}
+    settings = StreamSettings(site("SB1"), 120.0, traffic=replace(traffic_named("busy"), signals=shares))
+    events = draw_events(
+        settings.site, settings.traffic, settings.preset, settings.duration_s, np.random.default_rng(4)
+    )
+    leaders = [event for event in events if event.flow not in ("follows", "far")]
+    riders = {
+        rides: [one for one in leaders if (one.manoeuvre.motion.kind.name in ("bicycle", "scooter")) == rides]
+        for rides in (True, False)
+    }
+    for rides, signal in ((True, "bicycle-bell"), (False, "siren")):
+        warned = Counter(one.signal for one in riders[rides])
+        assert set(warned) <= {"", signal}
+        expected = shares[signal] * len(riders[rides])
+        assert abs(warned[signal] - expected) < 4 * np.sqrt(expected)
+    told = describe_events([vehicle_truth(0, leaders[0], settings)], [], {})["vehicles"][0]
+    assert told["signal"] == (leaders[0].signal or None)
+    with pytest.raises(InvalidArgumentError, match="signals"):
+        Traffic("test", {}, signals={"voice": 0.1})
