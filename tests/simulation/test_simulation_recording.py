@@ -147,7 +147,7 @@ def scenes(draw):
     )
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(scenes(), st.integers(0, 2**32 - 1))
 def test_no_setting_gives_silence_or_nan(scene, seed):
     recording = simulate_recording(scene, np.random.default_rng(seed), PAIR)
