@@ -39,6 +39,7 @@ C = SPEED_OF_SOUND_MPS
 FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, side_order=0, facade_order=0)
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
 HEAD_BLOCKS = 375
+OPEN_NAMES = [place(name).site.name for name in PLACES]
 THROUGH_US, BENT = ((9.0, 30.0), (0.0, 0.0)), ((5.0, -20.0), (5.2, -20.0), (-40.0, 9.0))
 
 
@@ -203,9 +204,7 @@ def band_db(x: np.ndarray) -> float:
 def test_no_scene_gives_silence_nan_or_a_click(data):
     """Any site, kind, way and ego: finite, never still, and no sample leaps out of its neighbourhood."""
     number = st.floats(0.0, 1.0)
-    name = data.draw(
-        st.sampled_from([*MOVING_SITES, "SA2", "SB3", *(place(other).site.name for other in PLACES)])
-    )
+    name = data.draw(st.sampled_from([*MOVING_SITES, "SA2", "SB3", *OPEN_NAMES]))
     duration = data.draw(st.floats(0.5, 1.2))
     drawn = draw_settings(name, "left", np.random.default_rng(data.draw(st.integers(0, 99))), duration)
     other = VehicleSettings(
@@ -215,7 +214,8 @@ def test_no_scene_gives_silence_nan_or_a_click(data):
         data.draw(st.floats(0.0, 8.0)),
         data.draw(st.sampled_from(sorted(KINDS))),
         data.draw(st.sampled_from(["pass", "turn"])),
-        data.draw(st.sampled_from([(), THROUGH_US, BENT])),
+        # In the open these ways would lead through walls and bodies, where no vehicle drives.
+        data.draw(st.sampled_from([(), THROUGH_US, BENT])) if name not in OPEN_NAMES else (),
     )
     scene = replace(
         drawn,
