@@ -47,6 +47,16 @@ from worldstate.ground.parallel import in_processes
 for _ in in_processes(time.sleep, [0.0, 0.0, 60.0, 60.0], 2): print("one", flush=True)
 """
 
+# Workers that do not hear SIGTERM, as one that gets it between two pieces of work may miss it.
+DEAF = """
+import signal, time
+from functools import partial
+from operator import call
+from worldstate.ground.parallel import in_processes
+items = [partial(signal.signal, signal.SIGTERM, signal.SIG_IGN)] * 2 + [partial(time.sleep, 60.0)] * 2
+for _ in in_processes(call, items, 2): print("one", flush=True)
+"""
+
 
 def alive(session):
     """Return how many processes of a session still run."""
@@ -54,9 +64,13 @@ def alive(session):
     return len(listed.stdout.split())
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_no_worker_outlives_the_process_that_started_it(number):
-    command = [sys.executable, "-c", SLEEPERS]
+@pytest.mark.parametrize(
+    ("number", "script"),
+    [(signal.SIGTERM, SLEEPERS), (signal.SIGKILL, SLEEPERS), (signal.SIGKILL, DEAF)],
+    ids=["SIGTERM", "SIGKILL", "deaf"],
+)
+def test_no_worker_outlives_the_process_that_started_it(number, script):
+    command = [sys.executable, "-c", script]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
     ) as run:

@@ -106,6 +106,7 @@ def features(sound: np.ndarray, array: MicrophoneArray, rate: float) -> np.ndarr
     )
 
 
+@pytest.mark.slow
 def test_the_feature_at_an_eighth_of_the_rate_is_that_of_the_full_one() -> None:
     assert feature_errors(0, 1.0, FEWER).max() < 0.01
 

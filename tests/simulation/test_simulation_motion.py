@@ -39,6 +39,7 @@ C = SPEED_OF_SOUND_MPS
 FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, in_the_open=True)
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
 HEAD_BLOCKS = 375
+OPEN_NAMES = [place(name).site.name for name in PLACES]
 THROUGH_US, BENT = ((9.0, 30.0), (0.0, 0.0)), ((5.0, -20.0), (5.2, -20.0), (-40.0, 9.0))
 
 
@@ -111,6 +112,9 @@ SCENES = {
     **{name: (lambda n=name: scene_settings(n)) for name in HIDDEN_IN_THE_OPEN},
 }
 
+# "moving turn" takes the same ways as "moving", and more of them.
+SHOWN = [pytest.param(name, marks=[pytest.mark.slow] * (name == "moving")) for name in SCENES]
+
 
 def scene_settings(name: str) -> SimulationSettings:
     return draw_settings(name, "left", np.random.default_rng(6))
@@ -130,7 +134,7 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
     return out[0].astype(float)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", SHOWN)
 def test_nothing_clicks_while_paths_come_and_go(name):
     """A 500-Hz tone stays one (Doppler aside): a click would spread beyond 2 kHz."""
     sound = heard(SCENES[name](), tone(500.0))
@@ -140,7 +144,7 @@ def test_nothing_clicks_while_paths_come_and_go(name):
     assert 10 * np.log10(spectrum[frequency > 2000].sum() / spectrum.sum()) < -60.0
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", SHOWN)
 def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entry(name):
     """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
     power = (heard(SCENES[name](), noise).reshape(200, -1) ** 2).mean(axis=1)
@@ -153,7 +157,10 @@ def test_truth_tells_ways_sight_and_time_of_every_vehicle():
         VehicleSettings("right", 4.0, 9.0, kind="heavy"),
         VehicleSettings("left", 9.0, manoeuvre="turn"),
     )
-    scene = replace(draw_settings("DA2", "left", np.random.default_rng(2)), others=others, sample_rate_hz=8e3)
+    drawn = draw_settings("DA2", "left", np.random.default_rng(2))
+    # Mirror images only cost time here: the truth does not depend on them.
+    bare = replace(drawn.site, side_order=0, facade_order=0)
+    scene = replace(drawn, site=bare, others=others, sample_rate_hz=8e3)
     recording = simulate_recording(scene, np.random.default_rng(2), PAIR)
     truth = json.loads(json.dumps(recording.truth, allow_nan=False))
     ways = [truth["frames"], *truth["others"]]
@@ -194,14 +201,12 @@ def band_db(x: np.ndarray) -> float:
     return float(10 * np.log10(power[(frequency > 500) & (frequency < 2000)].sum()))
 
 
-@settings(max_examples=12, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@settings(max_examples=8, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.data())
 def test_no_scene_gives_silence_nan_or_a_click(data):
     """Any site, kind, way and ego: finite, never still, and no sample leaps out of its neighbourhood."""
     number = st.floats(0.0, 1.0)
-    name = data.draw(
-        st.sampled_from([*MOVING_SITES, "SA2", "SB3", *(place(other).site.name for other in PLACES)])
-    )
+    name = data.draw(st.sampled_from([*MOVING_SITES, "SA2", "SB3", *OPEN_NAMES]))
     duration = data.draw(st.floats(0.5, 1.2))
     drawn = draw_settings(name, "left", np.random.default_rng(data.draw(st.integers(0, 99))), duration)
     other = VehicleSettings(
@@ -211,7 +216,8 @@ def test_no_scene_gives_silence_nan_or_a_click(data):
         data.draw(st.floats(0.0, 8.0)),
         data.draw(st.sampled_from(sorted(KINDS))),
         data.draw(st.sampled_from(["pass", "turn"])),
-        data.draw(st.sampled_from([(), THROUGH_US, BENT])),
+        # Where bodies stand these ways would lead through them, where no vehicle drives.
+        () if drawn.site.occluders else data.draw(st.sampled_from([(), THROUGH_US, BENT])),
     )
     scene = replace(
         drawn,

@@ -147,7 +147,7 @@ def scenes(draw):
     )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(scenes(), st.integers(0, 2**32 - 1))
 def test_no_setting_gives_silence_or_nan(scene, seed):
     recording = simulate_recording(scene, np.random.default_rng(seed), PAIR)
@@ -160,11 +160,16 @@ def test_no_setting_gives_silence_or_nan(scene, seed):
     json.dumps(recording.truth, allow_nan=False)
 
 
+def quickly(scene: SimulationSettings) -> SimulationSettings:
+    """Leave out the mirror images, for what the camera sees does not depend on them."""
+    return replace(scene, sample_rate_hz=8_000.0, site=replace(scene.site, side_order=0, facade_order=0))
+
+
 @settings(max_examples=6, deadline=None)
 @given(st.sampled_from(SITES), st.sampled_from(["left", "right"]), st.integers(0, 1000))
 def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed):
     rng = np.random.default_rng(seed)
-    scene = replace(draw_settings(name, approach, rng, 5.0), parked_car=False, sample_rate_hz=8_000.0)
+    scene = quickly(replace(draw_settings(name, approach, rng, 5.0), parked_car=False))
     recording = simulate_recording(scene, rng, PAIR)
     t0 = recording.t0_frame
     frames = recording.truth["frames"]
@@ -178,7 +183,7 @@ def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed
 
 
 def test_boxes_lie_where_the_camera_adapter_looks_for_them():
-    scene = replace(draw_settings("SB1", "left", np.random.default_rng(4), 10.0), sample_rate_hz=8_000.0)
+    scene = quickly(draw_settings("SB1", "left", np.random.default_rng(4), 10.0))
     scene = replace(scene, parked_car=False, braking_mps2=0.0, speed_mps=6.0)
     recording = simulate_recording(scene, np.random.default_rng(4), PAIR)
     camera, compared = PinholeCamera(), 0
@@ -205,9 +210,9 @@ def test_line_of_sight_is_the_straight_line_past_the_corner():
 def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp_path):
     """Two of a standing ego, one of a moving one; OVAD has no camera results of the latter."""
     wanted = DatasetSettings(n_static=2, n_dynamic=1, seed=5, duration_s=0.5, kind="bicycle")
-    rows = write_dataset(tmp_path / "one", wanted)
+    rows = write_dataset(tmp_path / "one", wanted, array=PAIR)
     seen = []
-    write_dataset(tmp_path / "two", wanted, jobs=2, progress=seen.append)
+    write_dataset(tmp_path / "two", wanted, array=PAIR, jobs=2, progress=seen.append)
     assert seen == rows
     files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file())
     assert len(files) == 2 * 3 + 2 + 2  # and the log and the array
@@ -222,7 +227,7 @@ def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp
     ]  # fmt: skip
     folder = tmp_path / "one" / "SA1" / "left" / "1_00_0000"
     about = soundfile.info(folder / "out_multi.wav")
-    assert (about.channels, about.samplerate, about.subtype) == (56, 47_998, "PCM_24")
+    assert (about.channels, about.samplerate, about.subtype) == (2, 47_998, "PCM_24")
     assert about.frames == round(0.5 * 47_998)
     assert len(read_detections(folder / "camera_baseline_results.json")) == 5
     truth = json.loads((folder / "truth.json").read_text())
@@ -304,7 +309,7 @@ def test_a_calm_street_is_another_sound_of_the_same_drive(tmp_path, capsys):
     truths = {}
     for name in PRESETS:
         arguments = ["simulate", "--out", str(tmp_path / name), "--static", "1", "--duration", "0.5"]
-        assert main([*arguments, "--preset", name]) == 0
+        assert main([*arguments, "--preset", name, "--bandwidth", "2000"]) == 0
         truth = json.loads((tmp_path / name / "SA1/left/1_00_0000/truth.json").read_text())
         assert truth["settings"]["preset"]["name"] == name
         truths[name] = truth["frames"]

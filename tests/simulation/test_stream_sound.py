@@ -22,7 +22,7 @@ from worldstate.adapters.simulation.scene.kinds import LIGHT
 from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 from worldstate.adapters.simulation.stream.ambience import OVERLAP_S
 from worldstate.adapters.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
-from worldstate.adapters.simulation.stream.event_sound import event_sound, levels_db
+from worldstate.adapters.simulation.stream.event_sound import event_sound, loudness_db
 from worldstate.adapters.simulation.stream.manoeuvres import MANOEUVRES, Driver
 from worldstate.adapters.simulation.stream.microphones import draw_microphones
 from worldstate.adapters.simulation.stream.rendering import (
@@ -87,7 +87,7 @@ def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() 
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=42.0)
     alone = event_sound(event, site("SB1"), scene.preset, scene.microphones, np.random.default_rng(2))
     rows = row_times(event, scene.settings)
-    levels, t0_s = levels_db(alone, rows, 3000.0), visible_s(event, site("SB1"))
+    levels, t0_s = loudness_db(alone, rows, 3000.0), visible_s(event, site("SB1"))
     assert t0_s is not None
     seconds = [levels[(rows > t0_s - i - 1) & (rows <= t0_s - i)].mean() for i in range(5)]
     assert all(later > earlier for later, earlier in pairwise(seconds))

@@ -2,17 +2,14 @@
 
 import csv
 import io
-import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
-import soundfile
 
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import OvadDataset
@@ -41,7 +38,7 @@ from worldstate.ground.typing import ImageArray
 
 from .plan import DatasetSettings, Plan
 from .recording import SimulatedRecording, simulate_recording
-from .recording_folder import put_in_place, refuse_foreign, sound_format
+from .recording_folder import put_in_place, refuse_foreign, sound_writer, write_json
 from .rendered_video import camera_frames, write_video
 
 # OVAD's location numbers 00 to 09, then the other places.
@@ -199,10 +196,12 @@ def write_recording(
     with TemporaryDirectory(prefix=".simulated-", dir=target.parent) as folder:
         temporary = Path(folder) / target.name
         temporary.mkdir()
-        _write_audio(temporary / AUDIO_NAME, recording)
+        samples, channels = recording.audio.shape
+        with sound_writer(temporary / AUDIO_NAME, samples, channels, recording.sample_rate_hz) as file:
+            file.write(recording.audio)
         if recording.detections:
-            _write_json(temporary / DETECTION_NAMES[0], to_json(list(recording.detections)))
-        _write_json(temporary / TRUTH_NAME, recording.truth)
+            write_json(temporary / DETECTION_NAMES[0], to_json(list(recording.detections)))
+        write_json(temporary / TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
         put_in_place(target, temporary)
@@ -256,19 +255,3 @@ def _listed(root: Path) -> dict[Path, LogRow]:
     found = [recording for recording in OvadDataset(root).recordings if recording.path.is_dir()]
     rows = [LogRow(r.recording_id, str(r.environment), str(r.label), r.logged_frame or 0) for r in found]
     return {row.folder: row for row in rows}
-
-
-def _write_audio(path: Path, recording: SimulatedRecording) -> None:
-    samples, channels = recording.audio.shape
-    kind = sound_format(samples, channels)
-    rate = round(recording.sample_rate_hz)
-    try:
-        soundfile.write(path, recording.audio, rate, subtype="PCM_24", format=kind)
-    except soundfile.SoundFileError as error:
-        raise InputFileError(
-            path, f"expected to write {samples} samples, the disk may be full: {error}"
-        ) from error
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,6 +1,12 @@
-"""The folder of a simulated recording or stream: what it may replace, and the container of its sound."""
+"""The folder of a simulated recording or stream: what it may replace, and how its files are written."""
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import soundfile
 
 from worldstate.adapters.datasets.ovad_layout import TRUTH_NAME
 from worldstate.ground.errors import InputFileError
@@ -18,6 +24,26 @@ def sound_format(samples: int, channels: int) -> str:
     ('WAV', 'RF64')
     """
     return "RF64" if SAMPLE_BYTES * samples * channels > WAV_LIMIT_BYTES else "WAV"
+
+
+@contextmanager
+def sound_writer(
+    path: Path, samples: int, channels: int, sample_rate_hz: float
+) -> Iterator[soundfile.SoundFile]:
+    """Open a file for so many samples of 24 bits, which are written at once or block by block."""
+    kind = sound_format(samples, channels)
+    try:
+        with soundfile.SoundFile(path, "w", round(sample_rate_hz), channels, "PCM_24", format=kind) as file:
+            yield file
+    except soundfile.SoundFileError as error:
+        raise InputFileError(
+            path, f"expected to write {samples} samples, the disk may be full: {error}"
+        ) from error
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write an object, whose numbers are all finite, on one line."""
+    path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def refuse_foreign(target: Path) -> None:

@@ -13,14 +13,13 @@ from worldstate.adapters.simulation.scene.vehicle import Trajectory
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.late_field import add_late_field, street_field
+from worldstate.adapters.simulation.sound.late_field import add_late_sound
 from worldstate.adapters.simulation.sound.propagation import add_sources
 from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.scatter import scattering
 from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.surroundings import Surroundings
-from worldstate.adapters.simulation.sound.vehicle_sound import late_gain
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 
 from .emitter import emitted
@@ -114,18 +113,7 @@ def _add_from(
     add_sources(static, [_source(towards, track, kind, rate)], around)
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN
     add_scattered(static, _source(mean, track, kind, rate), around)
-    if site.is_open:
-        return  # nothing stands there that could send late sound
-    fed = mean * late_gain(site, preset, track.x_m, track.y_m, track.time_s, receiver)
-    dry = _until_the_end(fed, track.time_s[0], receiver)
-    add_late_field(
-        static,
-        dry,
-        preset.late_decay_s,
-        receiver.positions_m,
-        rng,
-        street_field(site, preset.late_lobe_share),
-    )
+    add_late_sound(static, mean, (track.x_m, track.y_m), track.time_s, site, preset, receiver, rng)
 
 
 def directivity(kind: SoundKind, angle_rad: FloatArray) -> FloatArray:
@@ -182,14 +170,3 @@ def _gained(signal: Float32Array, gain: FloatArray, rate_hz: float) -> Float32Ar
 
 def _source(signal: Float32Array, track: SoundTrack, kind: SoundKind, rate_hz: float) -> MovingSource:
     return MovingSource(Emission.of(signal, track.time_s[0], rate_hz), track.x_m, track.y_m, kind.height_m)
-
-
-def _until_the_end(signal: Float32Array, start_s: float, receiver: Receiver) -> Float32Array:
-    """Return a signal from its start, or the recording's if that is earlier, to the recording's end."""
-    offset = round((start_s - receiver.knots_s[0]) * receiver.sample_rate_hz)
-    before = max(-offset, 0)
-    out = np.zeros(before + receiver.samples, np.float32)
-    at = max(offset, 0)
-    piece = signal[: max(len(out) - at, 0)]
-    out[at : at + len(piece)] = piece
-    return out

@@ -24,8 +24,9 @@ def trajectories(settings: SimulationSettings, time_s: FloatArray) -> list[Traje
 
 
 def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: FloatArray) -> Trajectory:
-    lane, entry_y = _entry(settings, vehicle)
-
+    lane = settings.site.lanes_m[0 if vehicle.approach == "left" else 1]
+    ego_x = float(settings.ego.x_m(np.array([vehicle.entry_s]))[0])
+    entry_y = entry_y_m(settings.site, lane, vehicle.approach, ego_x)
     passing = partial(
         drive,
         entry_y_m=entry_y,
@@ -47,16 +48,13 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
     return passing(time_s, entry_s=vehicle.entry_s)
 
 
-def _entry(settings: SimulationSettings, vehicle: VehicleSettings) -> tuple[float, float]:
-    """Return the lane, and where in it the camera sees the vehicle when it comes into sight."""
-    near, far = settings.site.lanes_m
+def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) -> float:
+    """Return where in its lane the camera first sees a vehicle that comes from the left or the right."""
     eye_x, eye_y, _ = PinholeCamera().position_m
-    ego_x = float(settings.ego.x_m(np.array([vehicle.entry_s]))[0])
-    lane = near if vehicle.approach == "left" else far
-    right, left = settings.site.sight_m(lane, (ego_x + eye_x, eye_y))
-    ahead = lane - ego_x - eye_x
+    right, left = site.sight_m(lane_m, (ego_x_m + eye_x, eye_y))
+    ahead = lane_m - ego_x_m - eye_x
     right_edge, left_edge = (eye_y + ahead * np.tan(edge) for edge in image_edges_rad(PinholeCamera()))
-    return lane, min(left, left_edge) if vehicle.approach == "left" else max(right, right_edge)
+    return float(min(left, left_edge) if approach == "left" else max(right, right_edge))
 
 
 def comes_into_view_s(settings: SimulationSettings, vehicle: VehicleSettings) -> float | None:

@@ -7,13 +7,17 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
 from worldstate.adapters.simulation.scene.junction import Site, site_generator
+from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.ground.typing import Float32Array, FloatArray
 
+from .delay import KNOT_SAMPLES
+from .receiver import Receiver
 from .static_field import StaticSources, plane_wave_delays, unit_vectors
 
 DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
 ELEVATION_RAD = 0.3
+LATE_DISTANCE_M = 8.0  # so far from the mouth a source feeds the late field half as much
 TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
 
 
@@ -63,3 +67,51 @@ def add_late_field(
         wave[:] = irfft(spectrum * rfft(response, n), n)[len(dry) - samples : len(dry)]
     offsets = positions_m - positions_m.mean(axis=0)
     static.add(waves, plane_wave_delays(directions, offsets))
+
+
+def add_late_sound(
+    static: StaticSources,
+    signal: Float32Array,
+    place_m: tuple[FloatArray, FloatArray],
+    time_s: FloatArray,
+    site: Site,
+    preset: Preset,
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add the late sound of a source; its signal lasts from the first of its emission knots to the last.
+
+    Shapes: signal (n,), place_m (x (T,), y (T,)), time_s (T,).
+    """
+    if site.is_open:
+        return  # nothing stands there that could send late sound
+    dry = _until_the_end(signal * _late_gain(site, preset, *place_m, time_s, receiver), time_s[0], receiver)
+    field = street_field(site, preset.late_lobe_share)
+    add_late_field(static, dry, preset.late_decay_s, receiver.positions_m, rng, field)
+
+
+def late_level_db(site: Site, preset: Preset) -> float:
+    """Late field of a source at the mouth against its pressure at 1 m."""
+    return preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
+
+
+def _late_gain(
+    site: Site, preset: Preset, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray, receiver: Receiver
+) -> Float32Array:
+    """How strongly a source feeds the late field: less the farther it, or the ego, is from the mouth."""
+    away = np.hypot(x_m - site.corner_ahead_m, y_m) - receiver.ego.x_m(time_s)
+    gain = 10.0 ** (late_level_db(site, preset) / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
+    knots = np.arange(len(gain)) * KNOT_SAMPLES
+    samples = np.arange((len(gain) - 1) * KNOT_SAMPLES)
+    return np.asarray(np.interp(samples, knots, gain), np.float32)
+
+
+def _until_the_end(signal: Float32Array, start_s: float, receiver: Receiver) -> Float32Array:
+    """Return a signal from its start, or the recording's if that is earlier, to the recording's end."""
+    offset = round((start_s - receiver.knots_s[0]) * receiver.sample_rate_hz)
+    before = max(-offset, 0)
+    out = np.zeros(before + receiver.samples, np.float32)
+    at = max(offset, 0)
+    piece = signal[: max(len(out) - at, 0)]
+    out[at : at + len(piece)] = piece
+    return out

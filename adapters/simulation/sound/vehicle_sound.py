@@ -5,11 +5,11 @@ import numpy as np
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array
 
 from .delay import KNOT_SAMPLES
 from .emission import Emission, MovingSource
-from .late_field import add_late_field, street_field
+from .late_field import add_late_sound
 from .propagation import ANY_ORDER, add_sources
 from .receiver import Receiver
 from .scatter import scattering
@@ -17,7 +17,6 @@ from .scattered_sound import add_scattered
 from .static_field import StaticSources
 from .surroundings import Surroundings
 
-LATE_DISTANCE_M = 8.0
 # From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
 # whether the second image is lit, on the vehicle's own side, hangs on a metre.
 POINT_REFLECTIONS = 3
@@ -44,30 +43,10 @@ def add_vehicle(
     add_sources(static, sources, around, ANY_ORDER[:POINT_REFLECTIONS])
     add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
     add_scattered(static, far, around)
-    if site.is_open:
-        return  # nothing stands there that could send late sound
-    dry = whole * late_gain(site, preset, *path.behind(0.0), path.time_s, receiver)
-    heard = dry[: round((receiver.knots_s[0] - path.time_s[0]) * rate) + receiver.samples]
-    field = street_field(site, preset.late_lobe_share)
-    add_late_field(static, heard, preset.late_decay_s, receiver.positions_m, rng, field)
+    add_late_sound(static, whole, path.behind(0.0), path.time_s, site, preset, receiver, rng)
 
 
 def _moving(
     path: Trajectory, signal: Float32Array, behind_m: float, height_m: float, rate: float
 ) -> MovingSource:
     return MovingSource(Emission.of(signal, path.time_s[0], rate), *path.behind(behind_m), height_m)
-
-
-def late_gain(
-    site: Site, preset: Preset, x_m: FloatArray, y_m: FloatArray, time_s: FloatArray, receiver: Receiver
-) -> Float32Array:
-    """How strongly a source feeds the late field: less the farther it, or the ego, is from the mouth.
-
-    Shapes: x_m, y_m, time_s (T,), at emission knots.
-    """
-    away = np.hypot(x_m - site.corner_ahead_m, y_m) - receiver.ego.x_m(time_s)
-    late_db = preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
-    gain = 10.0 ** (late_db / 20.0) * LATE_DISTANCE_M / (LATE_DISTANCE_M + away)
-    knots = np.arange(len(gain)) * KNOT_SAMPLES
-    samples = np.arange((len(gain) - 1) * KNOT_SAMPLES)
-    return np.asarray(np.interp(samples, knots, gain), np.float32)

@@ -78,7 +78,7 @@ def _envelope(event: Event, site: Site, receiver: Receiver) -> Float32Array:
     return np.interp(samples, knots, ends).astype(np.float32)
 
 
-def levels_db(sound: EventSound, rows_s: FloatArray, sample_rate_hz: float) -> FloatArray:
+def loudness_db(sound: EventSound, rows_s: FloatArray, sample_rate_hz: float) -> FloatArray:
     """Sound pressure level over the tenth of a second round each time, mean over the microphones.
 
     Shapes: rows_s (R,).

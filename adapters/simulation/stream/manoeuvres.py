@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.simulation.scene.driving import entry_y_m
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import VehicleKind
 from worldstate.adapters.simulation.scene.presets import Preset
-from worldstate.adapters.simulation.scene.route import Route, along
+from worldstate.adapters.simulation.scene.route import TURN_RADIUS_M, Route, along
 from worldstate.adapters.simulation.scene.settings import (
     BRAKING_MPS2,
     BRAKING_SHARE,
@@ -21,12 +21,12 @@ from worldstate.adapters.simulation.scene.vehicle import (
     propulsion_level_db,
     rolling_level_db,
 )
-from worldstate.adapters.simulation.sound.vehicle_sound import LATE_DISTANCE_M
+from worldstate.adapters.simulation.sound.late_field import LATE_DISTANCE_M, late_level_db
 from worldstate.ground.typing import FloatArray
 
 from .motion import Motion, SpeedLimit, confined, drive_along
 
-TURN_MPS, TURN_RADIUS_M, ARC_STEPS = 4.0, 3.5, 16
+TURN_MPS, ARC_STEPS = 4.0, 16
 OWN_LANE_M = 1.8  # beside the ego, whose half width is .9 m, with what a side wall leaves
 KERB_M = 0.95  # half a vehicle and a hand's breadth
 BESIDE_M, SHORTEST_M = 30.0, 10.0  # how far into another street a vehicle is followed
@@ -75,9 +75,7 @@ class Driver:
 
     def entry_y_m(self) -> float:
         """Where on its lane it comes into the camera's line of sight."""
-        eye_x, eye_y, _ = PinholeCamera().position_m
-        right, left = self.site.sight_m(self.lane_m(), (eye_x, eye_y))
-        return left if self.arm == LEFT else right
+        return entry_y_m(self.site, self.lane_m(), self.arm)
 
 
 def draw_driver(
@@ -97,8 +95,7 @@ def earshot_m(site: Site, kind: VehicleKind, speed_mps: float, preset: Preset) -
     level = 10.0 * np.log10(np.sum(power, axis=0)) + POWER_TO_1M_DB + preset.vehicle_level_db
     above = level - preset.ambient_octaves_db
     bent = 10.0 ** ((above - SHADOW_DB + INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)
-    late_db = preset.late_open_db if site.opposite_wall_m is None else preset.late_walled_db
-    late = 10.0 ** ((above + late_db + LATE_INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)
+    late = 10.0 ** ((above + late_level_db(site, preset) + LATE_INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)
     return float(np.clip(max(bent, LATE_DISTANCE_M * (late - 1.0)), *EARSHOT_M))
 
 

@@ -15,7 +15,7 @@ from worldstate.ground.typing import Float32Array, FloatArray
 
 from .ambience import ambience_piece, overlap_samples
 from .arrivals import Event
-from .event_sound import ROW_S, event_blocks, event_sound, levels_db
+from .event_sound import ROW_S, event_blocks, event_sound, loudness_db
 from .microphones import Microphones
 from .settings import StreamSettings
 
@@ -49,10 +49,10 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Sound from one sample on, and the levels of the events that are in it from their beginning."""
+    """Sound from one sample on, and the loudness of the events that are in it from their beginning."""
 
     pressure_pa: Float32Array  # shape (M, n)
-    levels_db: dict[int, FloatArray]  # At the rows of every event
+    loudness_db: dict[int, FloatArray]  # At the rows of every event
 
 
 def row_times(event: Event, settings: StreamSettings) -> FloatArray:
@@ -71,7 +71,7 @@ def render_blocks(scene: StreamScene, events: Sequence[Event], jobs: int = 1) ->
             # An event may last beyond the next piece: either of the two may be the longer one.
             shorter, sound = sorted((pending, piece.pressure_pa), key=lambda one: one.shape[1])
             sound[:, : shorter.shape[1]] += shorter
-            yield Block(sound[:, : min(length, left)], piece.levels_db)
+            yield Block(sound[:, : min(length, left)], piece.loudness_db)
             pending, left = sound[:, length:].copy(), left - length
 
 
@@ -94,17 +94,17 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
     ]
     samples = max([end - begin for end in ends] + [scene.piece + overlap_samples(settings)])
     sound = np.zeros((len(scene.microphones.positions_m), samples), np.float32)
-    levels = {}
+    loudness = {}
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
         _add_ambience(sound, scene, piece.number)
         for number, event in piece.events.items():
             rng = settings.generator(EVENT, number)
             alone = event_sound(event, settings.site, settings.preset, scene.microphones, rng)
-            levels[number] = levels_db(alone, row_times(event, settings), rate)
+            loudness[number] = loudness_db(alone, row_times(event, settings), rate)
             heard = alone.pressure_pa[:, max(-alone.first, 0) :]
             at = max(alone.first, 0) - begin
             sound[:, at : at + heard.shape[1]] += heard
-    return Block(sound, levels)
+    return Block(sound, loudness)
 
 
 def _add_ambience(sound: Float32Array, scene: StreamScene, number: int) -> None:

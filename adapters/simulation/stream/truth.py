@@ -78,7 +78,7 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
 
 
 def describe_events(
-    vehicles: Sequence[VehicleTruth], sounds: Sequence[SoundEvent], levels_db: Mapping[int, FloatArray]
+    vehicles: Sequence[VehicleTruth], sounds: Sequence[SoundEvent], loudness_db: Mapping[int, FloatArray]
 ) -> dict[str, list[dict[str, Any]]]:
     """Return `events.json`: one entry a vehicle, and one a sound that is none."""
     told = [
@@ -101,7 +101,7 @@ def describe_events(
             "place_m": list(one.sound.place_m) if one.sound.has_place else None,
             "first_s": round(one.start_s + one.sound.start_s, 3),
             "last_s": round(one.start_s + one.sound.end_s, 3),
-            "loudness_db": round(float(levels_db[number].max()), 1) if levels_db[number].size else None,
+            "loudness_db": round(float(loudness_db[number].max()), 1) if loudness_db[number].size else None,
         }
         for number, one in enumerate(sounds, start=len(vehicles))
     ]
@@ -153,15 +153,15 @@ def _frames(one: VehicleTruth) -> list[dict[str, Any]]:
     ]
 
 
-def rows_csv(vehicles: Sequence[VehicleTruth], levels_db: Mapping[int, FloatArray]) -> str:
+def rows_csv(vehicles: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> str:
     """Return `vehicles.csv`: one row a vehicle and tenth of a second; no time to visible is an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for one in vehicles:
         places = np.column_stack([one.x_m, one.y_m, one.speed_mps]).round(2).tolist()
-        levels, seen = levels_db[one.number].round(1).tolist(), one.in_view.astype(int).tolist()
+        loudness, seen = loudness_db[one.number].round(1).tolist(), one.in_view.astype(int).tolist()
         left = ["" if value is None else value for value in one.time_to_visible_s()]
-        for row in zip(one.time_s.tolist(), places, seen, left, levels, strict=True):
+        for row in zip(one.time_s.tolist(), places, seen, left, loudness, strict=True):
             writer.writerow([row[0], one.number, *row[1], *row[2:]])
     return text.getvalue()

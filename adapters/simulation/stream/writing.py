@@ -1,15 +1,12 @@
 """A stream on disk: sound block by block, array, detections and truth in one folder."""
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
-import soundfile
 
 from worldstate.adapters.datasets.ovad_layout import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
@@ -18,12 +15,12 @@ from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.dataset.recording_folder import (
     put_in_place,
     refuse_foreign,
-    sound_format,
+    sound_writer,
+    write_json,
 )
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import FloatArray
 
 from .ambience import stream_ambience
@@ -129,9 +126,9 @@ def write_stream(
         temporary = Path(hidden) / target.name
         temporary.mkdir()
         with closing(render_blocks(scene, [*events, *sounds], jobs)) as blocks:
-            levels = _write_sound(temporary / AUDIO_NAME, scene, blocks, heard, progress)
+            loudness = _write_sound(temporary / AUDIO_NAME, scene, blocks, heard, progress)
         write_array_xml(temporary / ARRAY_NAME, listening)
-        _write_beside(temporary, settings, vehicles, sounds, levels)
+        _write_beside(temporary, settings, vehicles, sounds, loudness)
         put_in_place(target, temporary)
     return WrittenStream(target, settings, vehicles, tuple(sounds), heard)
 
@@ -143,7 +140,7 @@ def _write_sound(
     heard: Spectrogram,
     progress: Callable[[float], None] | None,
 ) -> dict[int, FloatArray]:
-    """Write the blocks as they come; return the levels of all events."""
+    """Write the blocks as they come; return the loudness of all events."""
     microphones, rate = scene.microphones, scene.settings.sample_rate_hz
     channels = len(microphones.positions_m)
     # Gains are the converters': they come after everything that sounds, and are in no level of the truth.
@@ -151,22 +148,15 @@ def _write_sound(
     middle = int(
         np.linalg.norm(microphones.positions_m - microphones.positions_m.mean(axis=0), axis=1).argmin()
     )
-    kind = sound_format(scene.settings.samples, channels)
-    levels: dict[int, FloatArray] = {}
-    try:
-        with soundfile.SoundFile(path, "w", round(rate), channels, "PCM_24", format=kind) as file:
-            for block in blocks:
-                file.write(np.clip(block.pressure_pa * gains, -1.0, 1.0).T)
-                heard.add(block.pressure_pa[middle])
-                levels |= block.levels_db
-                if progress is not None:
-                    progress(block.pressure_pa.shape[1] / rate)
-    except soundfile.SoundFileError as error:
-        samples = scene.settings.samples
-        raise InputFileError(
-            path, f"expected to write {samples} samples, the disk may be full: {error}"
-        ) from error
-    return levels
+    loudness: dict[int, FloatArray] = {}
+    with sound_writer(path, scene.settings.samples, channels, rate) as file:
+        for block in blocks:
+            file.write(np.clip(block.pressure_pa * gains, -1.0, 1.0).T)
+            heard.add(block.pressure_pa[middle])
+            loudness |= block.loudness_db
+            if progress is not None:
+                progress(block.pressure_pa.shape[1] / rate)
+    return loudness
 
 
 def _write_beside(
@@ -174,15 +164,11 @@ def _write_beside(
     settings: StreamSettings,
     vehicles: tuple[VehicleTruth, ...],
     sounds: list[SoundEvent],
-    levels: dict[int, FloatArray],
+    loudness: dict[int, FloatArray],
 ) -> None:
     events = [one.event for one in vehicles]
     frames = detected_frames(settings, events, sounds, settings.generator(CAMERA))
-    _write_json(folder / DETECTION_NAMES[0], to_json(frames))
-    _write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
-    _write_json(folder / EVENTS_NAME, describe_events(vehicles, sounds, levels))
-    (folder / ROWS_NAME).write_text(rows_csv(vehicles, levels), encoding="utf-8", newline="\n")
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    path.write_text(json.dumps(value, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(folder / DETECTION_NAMES[0], to_json(frames))
+    write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
+    write_json(folder / EVENTS_NAME, describe_events(vehicles, sounds, loudness))
+    (folder / ROWS_NAME).write_text(rows_csv(vehicles, loudness), encoding="utf-8", newline="\n")

@@ -323,6 +323,7 @@ def test_reports_do_not_depend_on_the_block_size(cuts: list[int]) -> None:
     assert whole[-1].n_dropouts == 1
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_while_masks_change() -> None:
     array = MicrophoneArray(ROOF.positions_m[::8])
     sound = street(array, 13, seconds=1.0)

@@ -26,8 +26,9 @@ from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.array.steering import cross_spectra
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
-    FEATURE_NFFT,
+    FEATURE_RATE_HZ,
     FEATURE_SEGMENTS,
+    feature_nfft,
     feature_steering,
     pair_sum_of,
     segment_feature,
@@ -40,8 +41,8 @@ from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 DECIMATION = 4
-RATE_HZ = 47_998.0 / DECIMATION
-NFFT = FEATURE_NFFT // DECIMATION
+RATE_HZ = FEATURE_RATE_HZ / DECIMATION
+NFFT = feature_nfft(RATE_HZ)
 # Changes whenever a window of the same seed would be another one.
 LAYOUT = 3
 # The first window is a second long and ends at T0 at the earliest; the last ends a frame (.1 s), a moving
