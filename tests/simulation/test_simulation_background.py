@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.special
-from worldstate.adapters.simulation.scene.occlusions import occluded_scene
 
 from worldstate.adapters.simulation import preset, site
 from worldstate.adapters.simulation.scene.ambience import site_ambience
 from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.places import place
 from worldstate.adapters.simulation.scene.vehicle import Trajectory, load_db
 from worldstate.adapters.simulation.sound.background import add_background, opening_images
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
@@ -101,7 +101,7 @@ def test_arms_of_a_symmetric_street_mirror_each_other_and_none_has_a_corner_in_t
     order, other = np.argsort(left), np.argsort(-right)
     assert np.allclose(left[order], -right[other])
     assert np.allclose(loud[order], as_loud[other])
-    assert np.degrees(opening_images(occluded_scene("merge").site)[0][0]).tolist() == [90.0]
+    assert np.degrees(opening_images(place("merge").site)[0][0]).tolist() == [90.0]
 
 
 def test_a_wall_opposite_keeps_out_what_comes_from_ahead():
@@ -134,7 +134,7 @@ def test_walls_give_back_the_own_sound_from_the_sides_and_louder_when_they_are_n
 
 @pytest.mark.parametrize("where", ["street", "open"])
 def test_an_ego_in_the_open_has_no_echo_and_one_that_stops_falls_silent(where):
-    plan = site("DB1") if where == "street" else occluded_scene("merge").site
+    plan = site("DB1") if where == "street" else place("merge").site
     knots = np.arange(251) * KNOT_SAMPLES / FS
     receiver = Receiver(np.zeros((1, 3)), np.zeros(1), knots, EgoMotion(6.0, knots[-1] - 1.0))
     out = np.zeros((1, receiver.samples), np.float32)
