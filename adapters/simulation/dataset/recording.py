@@ -33,6 +33,7 @@ from .truth import describe
 
 FULL_SCALE_PA = 20.0  # 120 dB, where measurement microphones of this kind end
 HEAD_START_S = 2.0  # emission begins this long before the recording: travel time and late field
+SAMPLES_AT_ONCE = 1024
 NO_VEHICLE_T0 = 0.7  # OVAD gives recordings without a vehicle frame 70 of 100
 
 
@@ -192,8 +193,11 @@ def _knots(settings: SimulationSettings) -> FloatArray:
 def _to_samples(sound: Float32Array, settings: SimulationSettings, rng: np.random.Generator) -> Float32Array:
     """From Pa (M, n) to full scale (n, M), with the channels' gains."""
     gain = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(sound)) / 20.0) / FULL_SCALE_PA
-    samples = (sound[:, : _samples(settings)] * gain[:, None].astype(np.float32)).T
-    return np.ascontiguousarray(np.clip(samples, -1.0, 1.0))
+    samples = np.empty((_samples(settings), len(sound)), np.float32)
+    for at in range(0, len(samples), SAMPLES_AT_ONCE):  # a transposition at once would not fit any cache
+        some = slice(at, min(at + SAMPLES_AT_ONCE, len(samples)))
+        samples[some] = np.clip(sound[:, some] * gain[:, None].astype(np.float32), -1.0, 1.0).T
+    return samples
 
 
 def _t0_frame(frames: int, sights: list[BoolArray]) -> int:

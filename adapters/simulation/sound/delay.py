@@ -1,20 +1,22 @@
 """Signals that arrive late, and later every moment: retarded time with fractional delays.
 
-A source is a table, oversampled so that linear interpolation between its values is exact enough (for factor
-4 at 48 kHz the error is below -50 dB up to 4 kHz). Emission times are known at knots and linear in between,
-which is smooth enough for anything on wheels and makes Doppler a consequence, not a factor.
+A source is a table, oversampled so that a cubic through four of its values is exact enough (for factor 2 at
+48 kHz the error is below -70 dB up to 4 kHz, -35 dB at 12 kHz). Emission times are known at knots and linear
+in between, which is smooth enough for anything on wheels and makes Doppler a consequence, not a factor. What
+an array's centre hears is spread over its microphones, whose delays against it are short and change little.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
 
 KNOT_SAMPLES = 128
-OVERSAMPLING = 4
-ROWS_AT_ONCE = 256
-RAMP = np.arange(KNOT_SAMPLES, dtype=np.float32) / np.float32(KNOT_SAMPLES)
+OVERSAMPLING = 2
+PHASES = 4  # of what is spread: linear between them, with an error below -50 dB up to 4 kHz
+ROWS_AT_ONCE = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,53 +41,110 @@ def emission_times(
 def add_delayed(out: Float32Array, table: Table, emit_s: FloatArray, gain: FloatArray) -> None:
     """Add a delayed signal to `out`, block by block between knots.
 
-    Shapes: out (K * KNOT_SAMPLES,), emit_s (K + 1,), gain (K + 1,).
+    Shapes: out (K * N,), emit_s (K + 1,), gain (K + 1,).
     """
     at = (emit_s - table.start_s) * table.rate_hz
-    low, high = at[:-1], at[1:]
-    with np.errstate(invalid="ignore"):
-        heard = np.flatnonzero((low >= 0.0) & (high < len(table.values) - 2))
-    if not len(heard):
+    span = _inside(at, len(table.values) - 2)
+    if span is None:
         return
-    span = slice(int(heard[0]), int(heard[-1]) + 1)  # one span: emission times increase
-    base = np.floor(low[span])
-    lines = _Lines(low[span] - base, high[span] - base), _Lines(gain[:-1][span], gain[1:][span])
-    _add_between_knots(out.reshape(-1, KNOT_SAMPLES)[span], table, base.astype(np.intp)[:, None], *lines)
+    low, high = at[:-1][span], at[1:][span]
+    base = np.floor(low)
+    lines = _Lines(low - base, high - base), _Lines(gain[:-1][span], gain[1:][span])
+    rows = out.reshape(len(at) - 1, -1)[span]
+    _add_between_knots(rows, table, base.astype(np.intp)[:, None], *lines)
+
+
+def _inside(at: FloatArray, end: int) -> slice | None:
+    """Intervals between knots that lie within a signal: one span, as times increase."""
+    with np.errstate(invalid="ignore"):
+        heard = np.flatnonzero((at[:-1] >= 0.0) & (at[1:] < end))
+    return slice(int(heard[0]), int(heard[-1]) + 1) if len(heard) else None
 
 
 class _Lines:
     """Straight lines over knot intervals, each from `low` (K,) to `high` (K,)."""
 
     def __init__(self, low: FloatArray, high: FloatArray) -> None:
-        self._start = low.astype(np.float32)[:, None]
-        self._rise = (high - low).astype(np.float32)[:, None]
+        self._ends = np.stack([low, high - low], axis=1).astype(np.float32)
 
     def into(self, out: Float32Array, rows: slice) -> None:
-        """Write the samples of some intervals, shape (rows, KNOT_SAMPLES)."""
-        np.multiply(self._rise[rows], RAMP, out=out)
-        out += self._start[rows]
+        """Write the samples of some intervals, shape (rows, N)."""
+        ramp = np.arange(out.shape[1], dtype=np.float32) / np.float32(out.shape[1])
+        np.matmul(self._ends[rows], np.stack([np.ones_like(ramp), ramp]), out=out)
 
 
 def _add_between_knots(
     rows: Float32Array, table: Table, base: IndexArray, places: _Lines, gains: _Lines
 ) -> None:
     """Interpolate the table; a few intervals at a time, so that everything stays in the cache."""
-    left, right, fraction = np.empty((3, ROWS_AT_ONCE, KNOT_SAMPLES), np.float32)
-    index, later = np.empty((ROWS_AT_ONCE, KNOT_SAMPLES), np.intp), table.values[1:]
+    shape = min(ROWS_AT_ONCE, len(rows)), rows.shape[1]
+    room, index = np.empty((6, *shape), np.float32), np.empty(shape, np.intp)
     for first in range(0, len(rows), ROWS_AT_ONCE):
         some = slice(first, min(first + ROWS_AT_ONCE, len(rows)))
-        count = some.stop - first
-        low, high, part, at = left[:count], right[:count], fraction[:count], index[:count]
+        part, line, *values = room[:, : some.stop - first]
+        at = index[: some.stop - first]
         places.into(part, some)
-        np.floor(part, out=low)
-        np.copyto(at, low, casting="unsafe")
-        part -= low
-        at += base[some]
-        table.values.take(at, out=low, mode="clip")
-        later.take(at, out=high, mode="clip")
-        high -= low
-        high *= part
-        high += low
-        gains.into(low, some)
-        high *= low
-        rows[some] += high
+        np.floor(part, out=line)
+        np.copyto(at, line, casting="unsafe")
+        part -= line
+        at += base[some] - 1
+        for later, value in enumerate(values):
+            table.values[later:].take(at, out=value, mode="clip")
+        rows[some] += _cubic(part, values, gains, some, line)
+
+
+def _cubic(
+    part: Float32Array, values: list[Float32Array], gains: _Lines, some: slice, line: Float32Array
+) -> Float32Array:
+    """Newton's polynomial through four values, `part` beyond the second, times the gains; all overwritten."""
+    for stop in (0, 1, 2):
+        for i in (3, 2, 1):
+            if i > stop:
+                values[i] -= values[i - 1]
+    total = values[3]
+    part -= 1.0  # q - 2, counted from the first value
+    for difference, over in ((values[2], 1.0 / 3.0), (values[1], 0.5), (values[0], 1.0)):
+        np.multiply(part, np.float32(over), out=line)
+        total *= line
+        total += difference
+        part += 1.0
+    gains.into(line, some)
+    total *= line
+    return total
+
+
+class Phases:
+    """A signal, `PHASES` times oversampled, to be read at nearly its own speed."""
+
+    def __init__(self, values: Float32Array) -> None:
+        step = np.diff(values, append=values[-1:])
+        self._length = len(values) // PHASES
+        self._rows, self._steps = (
+            sliding_window_view(np.ascontiguousarray(one.reshape(-1, PHASES).T).ravel(), KNOT_SAMPLES)
+            for one in (values, step)
+        )
+
+    def add_to(self, out: Float32Array, at: FloatArray, gain: FloatArray) -> None:
+        """Add the signal as it is at positions `at`, in oversampled values, and scaled between them.
+
+        Shapes: out (K * KNOT_SAMPLES,), at (K + 1,), gain (K,).
+        """
+        span = _inside(at, PHASES * (self._length - 1))
+        if span is None:
+            return
+        low, high = at[:-1][span], at[1:][span]
+        base = np.minimum(np.floor(low).astype(np.intp), PHASES * (self._length - KNOT_SAMPLES))
+        # Within an interval the delay changes by a fraction of a value: the two values that are read lie a
+        # fixed way behind, so that whole rows are copied and none looked up.
+        lines = _Lines(low - base, high - base - (PHASES * KNOT_SAMPLES))
+        start = base % PHASES * self._length + base // PHASES
+        rows, scale = out.reshape(-1, KNOT_SAMPLES)[span], gain[span, None].astype(np.float32)
+        room = np.empty((ROWS_AT_ONCE, KNOT_SAMPLES), np.float32)
+        for first in range(0, len(rows), ROWS_AT_ONCE):
+            some = slice(first, min(first + ROWS_AT_ONCE, len(rows)))
+            part = room[: some.stop - first]
+            lines.into(part, some)
+            part *= self._steps[start[some]]
+            part += self._rows[start[some]]
+            part *= scale[some]
+            rows[some] += part

@@ -10,11 +10,10 @@ from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .air import air_gain, ground_gain
-from .delay import Table, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import MovingSource
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls, trace_paths
-from .receiver import NEAREST_M, Receiver, add_turning
+from .receiver import Receiver, add_along, add_to_all, add_turning
 from .screened import ScreenedLeg, open_images, screened_legs
 from .static_field import StaticSources
 from .surroundings import Surroundings, in_own_street
@@ -118,7 +117,7 @@ def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, ar
     across = path.edge_y_m[span] - float(path.receiver.mirror(np.zeros(1))[0])
     knots = source.emission.knots_s[span]
     travel, _ = receiver.arrivals(knots, partial(_round, before, mouth, across, above))
-    _add_along(out, table, knots, travel, receiver.knots_s)
+    add_along(out, table, knots, travel, receiver.knots_s)
 
 
 def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Receiver) -> None:
@@ -129,12 +128,13 @@ def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Rece
     table, span = made
     knots = source.emission.knots_s[span]
     ahead = (path.source.x_m + np.zeros_like(source.y_m))[span]
-    for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
+
+    def travel(position: FloatArray) -> FloatArray:
         across = source.y_m[span] - path.receiver.mirror(position[1:2])
         flat = across**2 + (position[2] - source.height_m) ** 2
-        along = ahead - position[0]
-        travel, _ = receiver.arrivals(knots, partial(_slant, along, flat))
-        _add_along(microphone, table, knots, travel, receiver.knots_s - skew)
+        return receiver.arrivals(knots, partial(_slant, ahead - position[0], flat))[0]
+
+    add_to_all(out, table, knots, travel, receiver)
 
 
 def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray) -> FloatArray:
@@ -161,19 +161,12 @@ def _add_leg(out: Float32Array, source: MovingSource, leg: ScreenedLeg, receiver
     table, span = made
     knots = source.emission.knots_s[span]
     before, via_x, via_y = leg.before_m[span], leg.via_x_m[span], leg.via_y_m[span]
-    for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
+
+    def travel(position: FloatArray) -> FloatArray:
         rise, across = position[2] - source.height_m, via_y - position[1]
-        travel, _ = receiver.arrivals(knots, partial(_round, before, via_x - position[0], across, rise))
-        _add_along(microphone, table, knots, travel, receiver.knots_s - skew)
+        return receiver.arrivals(knots, partial(_round, before, via_x - position[0], across, rise))[0]
 
-
-def _add_along(
-    out: Float32Array, table: Table, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
-) -> None:
-    """Add what was emitted at the knots `emit_s` and has gone `travel_m`, weaker the longer the way."""
-    emit = emission_times(receive_s, emit_s, travel_m, SPEED_OF_SOUND_MPS)
-    length = np.interp(np.nan_to_num(emit), emit_s, travel_m)
-    add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
+    add_to_all(out, table, knots, travel, receiver)
 
 
 def _round(
