@@ -23,6 +23,7 @@ from worldstate.adapters.simulation import (
 from worldstate.adapters.simulation.scene.driving import trajectories
 from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.sound import scattered_sound
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
@@ -102,6 +103,22 @@ def test_a_place_that_stands_still_is_heard_from_where_it_is():
     for ours, expected in zip(out, wanted, strict=True):
         error_db = 20 * np.log10(np.std((ours - expected)[4800:-4800]) / np.std(expected))
         assert error_db < -50.0
+
+
+def test_patches_that_are_left_out_are_not_missed(monkeypatch):
+    """Below the threshold lies less than 2 % of what rough walls send on while the ego drives past them."""
+    ego = EgoMotion(6.0, 2.0)
+    receiver = listener(2.5, ego, ((0.0, 0.2, 1.7), (0.0, -0.2, 1.7)))
+    sound = emission(receiver, noise)
+    around = Surroundings(site("DA1"), receiver, 24.0, np.full(8, 0.3))
+    source = MovingSource(sound, 12.0, np.linspace(18.0, -5.0, len(sound.knots_s)))
+    heard = []
+    for faintest in (scattered_sound.FAINTEST, 0.0):
+        monkeypatch.setattr(scattered_sound, "FAINTEST", faintest)
+        heard.append(np.zeros((2, receiver.samples), np.float32))
+        add_scattered(StaticSources(heard[-1], FS), source, around)
+    some, every = heard
+    assert 0.0 < np.mean((some - every) ** 2) < 0.02 * np.mean(every**2)
 
 
 HIDDEN_IN_THE_OPEN = ("SL1", "SP1", "SM1")  # behind a van, a pier, a wall

@@ -24,9 +24,9 @@ from .scatter import (
 from .static_field import StaticSources
 from .surroundings import Surroundings
 
-# Left out where it is 40 dB below all that rough walls send on together: four fifths of all patches and
-# images while the ego moves, for 1 % of the power of what is scattered at most.
-FAINTEST = 1e-4
+# Left out where it is 30 dB below all that rough walls send on together: while the ego moves most patches and
+# images are, at any moment. Features change by 1e-4 rms.
+FAINTEST = 1e-3
 STRETCH_KNOTS = 64  # a sixth of a second, in which it is decided
 
 
@@ -140,4 +140,4 @@ def _within(loud: BoolArray, knots: int) -> FloatArray:
     """1 from a stretch before the first loud one to one after the last, shape (K + 1,)."""
     first, last = np.flatnonzero(loud)[[0, -1]]
     at = np.arange(knots) // STRETCH_KNOTS
-    return ((at >= first - 1) & (at <= last + 1)).astype(float)
+    return np.asarray((at >= first - 1) & (at <= last + 1), np.float64)
