@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.junction import SITES, Site, site
 from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
@@ -127,3 +127,17 @@ def test_a_hidden_vehicle_is_lit_by_one_image_after_another(aside, ahead, lane, 
         inside = min(tangent - (2 * order - 1) * aside / ahead, (2 * order + 1) * aside / ahead - tangent)
         if abs(inside) * ahead > 0.25:  # not in the transition
             assert path.lit[0] == float(inside > 0.0), order
+
+
+@pytest.mark.parametrize("name", SITES)
+def test_no_side_wall_stands_before_its_corner(name):
+    """What reflects is seen: a wall that reached into the line of sight to its corner would hide the street."""
+    plan = site(name)
+    for wall, corner, openings in (
+        (plan.side_wall_left_m, plan.corner_left_m, plan.left_openings_m),
+        (plan.side_wall_right_m, plan.corner_right_m, plan.right_openings_m),
+    ):
+        x = np.linspace(0.0, plan.corner_ahead_m, 1001)
+        stands = np.all([(x < begin) | (x > end) for begin, end in openings], axis=0)
+        assert stands.any()
+        assert np.all(corner / plan.corner_ahead_m * x[stands] <= wall + 0.01)

@@ -76,7 +76,7 @@ def patches(site: Site) -> list[Patches]:
     --------
     >>> from worldstate.adapters.simulation.scene.junction import site
     >>> [(len(group.strengths_m), group.beyond_mouth) for group in patches(site("SA1"))]
-    [(12, False), (19, True)]
+    [(12, False), (15, True)]
     """
     rng = site_generator(site.name, "facades")
     groups = [_side_walls(site, rng)]
