@@ -131,7 +131,7 @@ def test_a_hidden_vehicle_is_lit_by_one_image_after_another(aside, ahead, lane, 
 
 @pytest.mark.parametrize("name", SITES)
 def test_no_side_wall_stands_before_its_corner(name):
-    """What reflects is seen: a wall that reached into the line of sight to its corner would hide the street."""
+    """What reflects is seen: a wall in the line of sight to its corner would hide the street."""
     plan = site(name)
     for wall, corner, openings in (
         (plan.side_wall_left_m, plan.corner_left_m, plan.left_openings_m),

@@ -134,7 +134,7 @@ def opening_images(site: Site) -> list[tuple[FloatArray, FloatArray]]:
     Examples
     --------
     >>> from worldstate.adapters.simulation.scene.junction import site
-    >>> left, right, ahead, behind = opening_images(site("SB1"))
+    >>> left, right, ahead, behind = opening_images(site("SA1"))
     >>> bool(left[0][left[1].argmax()] < 0.0)  # the far side wall sees deepest into an arm
     True
     """
