@@ -21,7 +21,8 @@ from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.static_field import plane_wave_delays, unit_vectors
 from worldstate.adapters.simulation.sound.wave_field import BlockGrid, WaveField
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.studies.streets.simulated_windows import RATE_HZ, window_feature
+from worldstate.frontend.direction.feature import published_feature
+from worldstate.studies.streets.simulated_windows import RATE_HZ
 
 FS = 8000.0
 
@@ -74,7 +75,7 @@ def empty_window(name: str, seed: int, levels=None) -> np.ndarray:
     out = np.zeros((len(positions), round(RATE_HZ)), np.float32)
     receiver = Receiver(positions, np.zeros(len(positions)), np.array([0.0, KNOT_SAMPLES]) / RATE_HZ)
     add_background(out, receiver, site(name), levels or preset(), rng)
-    return window_feature(out.T)
+    return published_feature(out.T, ovad_array(), RATE_HZ)
 
 
 def test_a_site_keeps_its_face_from_recording_to_recording():

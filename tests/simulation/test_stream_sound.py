@@ -76,7 +76,7 @@ def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -
     expected = np.zeros((2, 36 * 3000))
     for number, event in enumerate(events):
         rng = scene.settings.generator(EVENT, number)
-        alone = event_sound(event, scene.settings.site, scene.preset, scene.microphones, rng)
+        alone = event_sound(event, scene.settings.site, scene.settings.preset, scene.microphones, rng)
         begin, end = max(alone.first, 0), min(alone.first + alone.pressure_pa.shape[1], expected.shape[1])
         expected[:, begin:end] += alone.pressure_pa[:, begin - alone.first : end - alone.first]
     assert np.abs(expected).max() > 0.05
@@ -85,7 +85,9 @@ def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -
 
 def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() -> None:
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=42.0)
-    alone = event_sound(event, site("SB1"), scene.preset, scene.microphones, np.random.default_rng(2))
+    alone = event_sound(
+        event, site("SB1"), scene.settings.preset, scene.microphones, np.random.default_rng(2)
+    )
     rows = row_times(event, scene.settings)
     levels, t0_s = loudness_db(alone, rows, 3000.0), visible_s(event, site("SB1"))
     assert t0_s is not None
@@ -104,7 +106,9 @@ def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() 
 def test_a_signal_is_heard_over_its_vehicle_and_leaves_it_as_it_is() -> None:
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=20.0)
     plain, warning = (
-        event_sound(one, site("SB1"), scene.preset, scene.microphones, np.random.default_rng(2)).pressure_pa
+        event_sound(
+            one, site("SB1"), scene.settings.preset, scene.microphones, np.random.default_rng(2)
+        ).pressure_pa
         for one in (event, replace(event, signal="siren"))
     )
     frequency, power = welch((warning - plain)[0], 3000.0, nperseg=1024)
@@ -154,7 +158,7 @@ def test_memory_does_not_grow_with_the_length_of_a_stream() -> None:
         tracemalloc.stop()
         return reached
 
-    assert peak(2.0) < 1.05 * peak(1.0)
+    assert peak(3.0) < 1.05 * peak(1.5)
 
 
 def test_a_stream_on_disk_is_read_like_a_recording(

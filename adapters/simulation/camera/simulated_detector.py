@@ -62,7 +62,7 @@ def detect(
     for x, low, high, sight in zip(trajectory.behind(0.0)[0], right, left, seen, strict=True):
         share = (high - low) / min(kind.length_m, LENGTH_M)
         clear = share > LEAST_VISIBLE and (sight or not site.is_open)
-        box = _project(camera, x, low, high, kind) if clear else None
+        box = _project(camera, site, x, (low, high), kind) if clear else None
         missed = rng.random() < _miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)
         if box is None or missed:
@@ -79,7 +79,7 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
     right, left = site.sight_m(x, camera.position_m[:2])
     middle = rng.uniform(0.6 * right, 0.6 * left)
     low, high = max(middle - LENGTH_M / 2.0, right), min(middle + LENGTH_M / 2.0, left)
-    box = _project(camera, x, low, high)
+    box = _project(camera, site, x, (low, high))
     if box is None:
         return [()] * frames
     noise = rng.normal(0.0, PARKED_NOISE_PX, (frames, 4))
@@ -119,12 +119,17 @@ def _miss_rate(ahead_m: float, lateral_m: float) -> float:
 
 
 def _project(
-    camera: PinholeCamera, middle_x: float, right_y: float, left_y: float, kind: VehicleKind = LIGHT
+    camera: PinholeCamera, site: Site, middle_x: float, ends_y: tuple[float, float], kind: VehicleKind = LIGHT
 ) -> FloatArray | None:
     """Box (left, top, right, bottom) around the visible cuboid; None where it is outside the image."""
     x = middle_x + kind.width_m * np.array([-0.5, 0.5])
     z = np.array([0.0, kind.height_m]) - ARRAY_HEIGHT_M
-    corners = np.array(np.meshgrid(x, [right_y, left_y], z)).reshape(3, -1).T - camera.position_m
+    # A corner hides more of the near face than of the far one.
+    right, left = site.sights_m(x, camera.position_m[:2])
+    y = np.clip(np.array(ends_y)[:, None], np.minimum(right, left), left)
+    corners = (
+        np.stack([*map(np.ravel, np.broadcast_arrays(x, y, z[:, None, None]))], axis=1) - camera.position_m
+    )
     pitch = camera.pitch_rad
     depth = corners[:, 0] * math.cos(pitch) + corners[:, 2] * math.sin(pitch)
     up = corners[:, 2] * math.cos(pitch) - corners[:, 0] * math.sin(pitch)

@@ -102,20 +102,19 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
     still = boxes[(np.abs(boxes - boxes[:1]) < STILL_PX).all(axis=1)] if len(boxes) else boxes
     if not len(still):
         return None
-    camera, lane = PinholeCamera(), parked_lane_m(site)
-    right, left = site.sight_m(lane, camera.position_m[:2])
-    middles = np.arange(right, left, STEP_M)
-    ends = np.clip(middles[:, None] + LENGTH_M * np.array([-0.5, 0.5]), right, left)
+    camera, faces = PinholeCamera(), parked_lane_m(site) + WIDTH_M * np.array([-0.5, 0.5])
+    right, left = site.sights_m(faces, camera.position_m[:2])
+    middles = np.arange(right[0], left[0], STEP_M)
+    ends = np.clip(middles[:, None, None] + LENGTH_M * np.array([[-0.5], [0.5]]), right, left)
     wanted = np.median(still, axis=0)[[0, 2]]
-    missed = np.abs(_columns_px(camera, lane, ends) - wanted).sum(axis=1)
+    missed = np.abs(_columns_px(camera, faces, ends) - wanted).sum(axis=1)
     return float(middles[missed.argmin()])
 
 
-def _columns_px(camera: PinholeCamera, lane_m: float, ends_m: FloatArray) -> FloatArray:
-    """First and last column of cuboids between lateral ends (n, 2) (right, left), shape (n, 2)."""
-    ahead = lane_m + WIDTH_M * np.array([-0.5, 0.5]) - camera.position_m[0]
+def _columns_px(camera: PinholeCamera, ahead_m: FloatArray, ends_m: FloatArray) -> FloatArray:
+    """First and last column of cuboids whose faces (2,) end at (n, 2, 2) (right, left), shape (n, 2)."""
     # At the camera's own height, where the pitch shortens the depth and nothing else.
-    slope = (ends_m[:, :, None] - camera.position_m[1]) / (ahead * np.cos(camera.pitch_rad))
+    slope = (ends_m - camera.position_m[1]) / ((ahead_m - camera.position_m[0]) * np.cos(camera.pitch_rad))
     focal = 0.5 * camera.width_px / np.tan(camera.half_angle_rad)
     columns = np.clip(0.5 * camera.width_px - focal * slope, 0.0, camera.width_px - 1.0).reshape(-1, 4)
     return np.stack([columns.min(axis=1), columns.max(axis=1)], axis=1)
