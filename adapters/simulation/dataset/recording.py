@@ -146,7 +146,8 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     if not settings.ego.stands:
         time, engine_db = np.arange(receiver.samples) / rate, settings.preset.ego_engine_db
         to_ego, to_echo = to_channels.spawn(2)
-        sound += ego_noise(positions, settings.ego.at_mps(time), rate, to_ego, engine_db).T
+        speed, tyre_db = settings.ego.at_mps(time), settings.site.surface_db
+        sound += ego_noise(positions, speed, rate, to_ego, engine_db, tyre_db).T
         add_ego_echo(sound, receiver, settings.site, engine_db, to_echo)
     return _to_samples(sound, settings, to_channels)
 

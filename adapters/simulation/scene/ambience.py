@@ -20,8 +20,8 @@ OVER_THE_WALL_DB = (
     -8.0
 )  # a facade opposite, two or three floors high, leaves so much of what comes from ahead
 # Between walls hardly, on an open corner much: levels of the released windows of SB1, hidden and in front
-# alike, spread three times as far as those of SA1 and SB2.
-GUSTINESS = (0.4, 2.0)
+# alike, spread three times as far as those of SA1 and SB2. The logarithm is drawn evenly.
+GUSTINESS = (0.13, 2.5)
 TURNED_RAD = 0.12  # no street is exactly in line with another
 
 
@@ -55,7 +55,7 @@ def site_ambience(site: Site, preset: Preset) -> Ambience:
         openings[OPENINGS.index("ahead")] += OVER_THE_WALL_DB
     wind_db = preset.site_wind_db * fixed.standard_normal()
     turned = TURNED_RAD * fixed.standard_normal(len(OPENINGS))
-    return Ambience(octaves, wind_db, fixed.uniform(*GUSTINESS), openings, turned)
+    return Ambience(octaves, wind_db, float(np.exp(fixed.uniform(*np.log(GUSTINESS)))), openings, turned)
 
 
 def recording_ambience(of_site: Ambience, preset: Preset, rng: np.random.Generator) -> Ambience:

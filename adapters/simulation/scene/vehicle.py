@@ -162,9 +162,9 @@ def emit(
     sample_rate_hz: float,
     level_offset_db: float,
     rng: np.random.Generator,
-    engine_offset_db: float = 0.0,
+    engine_offset_db: float | FloatArray = 0.0,
 ) -> list[SourceSignal]:
-    """Draw what every axle's tyres and the engine emit."""
+    """Draw what every axle's tyres and the engine emit; the engine's offset may differ by octave, (8, 1)."""
     # The tyres of the axles share the rolling noise and know nothing of each other, which makes a vehicle in
     # view a wide source; engine noise, broadband and harmonics, comes from the first axle and from higher up.
     kind = trajectory.kind

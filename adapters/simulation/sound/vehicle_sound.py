@@ -3,9 +3,10 @@
 import numpy as np
 
 from worldstate.adapters.simulation.scene.junction import Site
+from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import KNOT_SAMPLES
 from .emission import Emission, MovingSource
@@ -20,6 +21,7 @@ from .surroundings import Surroundings
 # From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
 # whether the second image is lit, on the vehicle's own side, hangs on a metre.
 POINT_REFLECTIONS = 3
+BASS_BELOW_HZ = 177.0  # between the octaves of 125 and 250 Hz
 
 
 def add_vehicle(
@@ -33,7 +35,8 @@ def add_vehicle(
     """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
     rate = receiver.sample_rate_hz
     level = preset.vehicle_level_db + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
-    engine_db = preset.engine_spread_db * rng.standard_normal()
+    # What the road adds is heard of the tyres alone.
+    engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     sources = [_moving(path, one.signal, one.behind_m, one.height_m, rate) for one in parts]
     around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
@@ -44,6 +47,17 @@ def add_vehicle(
     add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
     add_scattered(static, far, around)
     add_late_sound(static, whole, path.behind(0.0), path.time_s, site, preset, receiver, rng)
+
+
+def engine_bass_db(preset: Preset) -> FloatArray:
+    """Level of an engine per octave against CNOSSOS, shape (8, 1).
+
+    Examples
+    --------
+    >>> engine_bass_db(Preset("deep", engine_bass_db=3.0))[:3, 0].tolist()
+    [3.0, 3.0, 0.0]
+    """
+    return np.where(OCTAVES_HZ < BASS_BELOW_HZ, preset.engine_bass_db, 0.0)[:, None]
 
 
 def _moving(
