@@ -70,7 +70,9 @@ class HopSpectra:
         whitened = whiten(spectra, powers)
         energies = self._frame_energies(powers)
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
-        health = self._unmonitored if self.monitor is None else self.monitor.push(samples, energies, matrices)
+        health = self._unmonitored
+        if self.monitor is not None:
+            health = self.monitor.push(samples, energies, powers, matrices)
         prewhitened = self._whitened(spectra, health.mask)
         if self.music is not None:
             self._push_music(self.music, spectra, powers, prewhitened)

@@ -19,7 +19,7 @@ class Fault(StrEnum):
     Examples
     --------
     >>> Fault("dead").name, len(Fault)
-    ('DEAD', 8)
+    ('DEAD', 11)
     """
 
     DEAD = "dead"
@@ -37,10 +37,21 @@ class Fault(StrEnum):
     OFFSET = "offset"
     """A mean that is not small against the sound."""
     LEVEL = "level"
-    """Far louder or quieter than the median channel."""
+    """Louder or quieter than the median channel by more than microphones differ."""
+    GUSTS = "gusts"
+    """Much louder than the others for half a second to seconds, now and then: wind at this microphone."""
+    DELAY = "delayed"
+    """Later or earlier than sound from any direction, by an amount that stays the same."""
+    DRIFT = "drifting"
+    """Later and later, or earlier and earlier: a card with a clock of its own."""
 
 
-MASKED_FAULTS = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.SWAPPED})
+MASKED_FAULTS = frozenset(
+    {
+        *(Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.SWAPPED),
+        *(Fault.DELAY, Fault.DRIFT),
+    }
+)
 """Faults for which a channel is left out. The others leave its phase intact, which is all that PHAT uses."""
 
 
@@ -58,9 +69,12 @@ class ChannelFault:
         Size of the fault. Dead and intermittent: share of the last five seconds. Noisy and inverted:
         coherence with the prediction from the other channels, over the median channel's. Swapped: gain in
         that coherence at the other position, -2 to 2. Clipped: share of samples. Offset: mean over the
-        peak-to-peak value. Level: dB relative to the median channel.
+        peak-to-peak value. Level: dB relative to the median channel. Gusts: share of the last ten seconds.
+        Delayed: seconds. Drifting: seconds a second. Swapped, up to 16 channels: gain in sharpness, nats.
     looks_like : int or None
         Swapped: the channel whose position it fits.
+    std : float or None
+        Delayed and drifting: standard deviation of `value`.
 
     Examples
     --------
@@ -72,6 +86,7 @@ class ChannelFault:
     fault: Fault
     value: float
     looks_like: int | None = None
+    std: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,9 +8,11 @@ from worldstate.ground.typing import BoolArray, Complex64Array, Float32Array, Fl
 
 from .channel_activity import ChannelActivity
 from .channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Fault, faults_where
+from .channel_levels import ChannelLevels
 from .clipping import ClippingCounter
 from .dropouts import Dropout, DropoutFinder
 from .geometry_check import GeometryCheck
+from .plane_wave_check import PlaneWaveCheck
 from .running_mean import RunningMean
 from .sample_clock import SampleClock
 
@@ -25,8 +27,6 @@ _CRACKLE = 4.0
 # A mean above a tenth of the peak-to-peak sound (0.7 of its standard deviation), judged after two seconds.
 _OFFSET = 0.1
 _SETTLED_HOPS = 20
-# Gains within one array differ by a few dB; 10 dB is a wrong setting or a covered capsule.
-_LEVEL_DB = 10.0
 # One sample in ten thousand; a lone peak is less.
 _CLIPPED_SHARE = 1e-4
 # Enough for a report; the count goes on beyond them.
@@ -51,7 +51,8 @@ class ChannelMonitor:
         n = array.n_microphones
         self.clock = SampleClock(sample_rate_hz)
         self._activity = ChannelActivity(n)
-        self._means = RunningMean((3, n))
+        self._means = RunningMean((2, n))
+        self._levels = ChannelLevels(n)
         self._single_channel: list[ChannelFault] = []
         self._n_hops = 0
         self._clipping = ClippingCounter(n)
@@ -59,11 +60,13 @@ class ChannelMonitor:
         self._dropouts: tuple[Dropout, ...] = ()
         self._n_dropouts = 0
         self._geometry_check = GeometryCheck(array, frequencies_hz, speed_of_sound_m_s)
+        self._plane_waves = PlaneWaveCheck(array, frequencies_hz, speed_of_sound_m_s)
 
     def push(
         self,
         samples: Float32Array,
         energies: FloatArray,
+        powers: Float32Array,
         matrices: Complex64Array,
     ) -> ArrayHealth:
         r"""Take one hop; return the channels to keep and the faults.
@@ -72,7 +75,7 @@ class ChannelMonitor:
                   \min_t E_{tm} / \tilde E_t < 10^{-5}, \qquad
                   s_m / \bar s_m > 4\, \mathrm{median}_j\, (s_j / \bar s_j).
 
-        Shapes: samples (n, M), energies (frames, M), matrices (K, M, M).
+        Shapes: samples (n, M), energies (frames, M), powers (frames, bins, M), matrices (K, M, M).
         """
         # E is the mean square of a frame and channel, E~ that of the median channel, s the peak-to-peak value
         # and s-bar its running mean: a channel is left out of the hop if it is silent, breaks off or crackles
@@ -85,7 +88,11 @@ class ChannelMonitor:
         self._n_dropouts += len(dropouts)
         self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
         bad = self._judge_hop(samples, energies, span)
-        self._geometry_check.push(matrices, len(energies), ~self._activity.suspects)
+        self._levels.push(powers.mean(axis=0, dtype=np.float64), ~bad)
+        active = ~self._activity.suspects
+        self._geometry_check.push(matrices, len(energies), active)
+        proposed = [one for one in self._geometry_check.faults() if one.fault is Fault.SWAPPED]
+        self._plane_waves.push(matrices, len(energies), active, proposed)
         return self._report(bad)
 
     def _judge_hop(self, samples: Float32Array, energies: FloatArray, span: Float32Array) -> BoolArray:
@@ -102,14 +109,14 @@ class ChannelMonitor:
             growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
             bad |= growth > _CRACKLE * np.median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)
-        self._means.add(np.stack([span, np.log(np.maximum(level, _SILENT)), share @ samples]), ~bad)
+        self._means.add(np.stack([span, share @ samples]), ~bad)
         return self._activity.push(bad)
 
     def _report(self, bad: BoolArray) -> ArrayHealth:
         if self._n_hops % _EVERY_HOPS == 0:
             self._single_channel = self._single_channel_faults()
         self._n_hops += 1
-        faults = [*self._activity.faults(), *self._geometry_check.faults(), *self._single_channel]
+        faults = [*self._activity.faults(), *self._positional_faults(), *self._single_channel]
         faults.sort(key=lambda fault: (fault.channel, fault.fault))
         keep = ~bad
         for fault in faults:
@@ -124,18 +131,32 @@ class ChannelMonitor:
             rate,
         )
 
+    def _positional_faults(self) -> list[ChannelFault]:
+        """Faults seen in the phases between channels, one a channel, the more specific one."""
+        waves, geometry = self._plane_waves.faults(), self._geometry_check.faults()
+        # Microphones half a metre apart hardly predict each other: noisy is what no wave agrees with, either.
+        incoherent = self._plane_waves.incoherent
+        geometry = [
+            one
+            for one in geometry
+            if one.fault is Fault.INVERTED or (one.fault is Fault.NOISY and incoherent[one.channel])
+        ]
+        inverted = {one.channel for one in geometry if one.fault is Fault.INVERTED}
+        found = [one for one in waves if one.channel not in inverted]
+        elsewhere = {one.channel for one in found}
+        return found + [one for one in geometry if one.channel not in elsewhere]
+
     def _single_channel_faults(self) -> list[ChannelFault]:
-        """Faults seen on a channel by itself: clipping, offset, level."""
+        """Faults seen on a channel by itself: clipping, offset, level, gusts."""
         usable = ~self._activity.suspects
         clipped = self._clipping.clipped_share()
-        span, level, mean = self._means.mean
+        span, mean = self._means.mean
         offset = np.abs(mean) / np.maximum(span, np.finfo(np.float32).tiny)
         settled = self._means.count >= _SETTLED_HOPS
-        level_db = 10.0 / np.log(10.0) * level
         return [
             *faults_where(Fault.CLIPPED, clipped > _CLIPPED_SHARE, clipped),
             *faults_where(Fault.OFFSET, usable & settled & (offset > _OFFSET), offset),
-            *faults_where(Fault.LEVEL, usable & settled & (np.abs(level_db) > _LEVEL_DB), level_db),
+            *self._levels.faults(usable),
         ]
 
 

@@ -1,10 +1,12 @@
 """`worldstate doctor`: which microphones of a recording misbehave, and what to do about it.
 
 Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
-or clipped ones, offsets, levels, missing or repeated samples, the sample rate. Channels are counted from 1.
+or clipped ones, offsets, levels, gusts, cards that are late or have a clock of their own, missing or repeated
+samples, the sample rate. Channels are counted from 1.
 
-Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted and noisy
-microphones show only in sound that all of them hear: two seconds of traffic do.
+Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
+and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
+ten for small ones; levels and gusts take six seconds, drifts twenty.
 """
 
 import argparse

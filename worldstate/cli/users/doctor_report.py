@@ -54,14 +54,33 @@ def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray) -> It
 
 def _table(verdicts: tuple[ChannelVerdict, ...]) -> Iterator[str]:
     yield f"{'channel':>7}  {'fault':<12}  {'since':>6}  {'hops':>5}  what and what to do"
-    for verdict in verdicts:
+    for card in _cards(verdicts):
+        first, last, verdict = card[0].channel + 1, card[-1].channel + 1, card[0]
+        channels = str(first) if first == last else f"{first}-{last}"
         when = f"{verdict.first_s:5.1f}s  {100 * verdict.share:4.0f}%"
-        yield f"{verdict.channel + 1:>7}  {verdict.fault.value:<12}  {when}  {_advice(verdict)}"
+        yield f"{channels:>7}  {verdict.fault.value:<12}  {when}  {_advice(verdict)}"
+
+
+def _cards(verdicts: tuple[ChannelVerdict, ...]) -> list[list[ChannelVerdict]]:
+    """Put consecutive channels with one delay or drift together: they are one card."""
+    cards: list[list[ChannelVerdict]] = []
+    for verdict in verdicts:
+        last = cards[-1][-1] if cards else None
+        same = last and verdict.std is not None and (last.fault, last.value) == (verdict.fault, verdict.value)
+        if same and last and last.channel + 1 == verdict.channel:
+            cards[-1].append(verdict)
+        else:
+            cards.append([verdict])
+    return cards
 
 
 def _advice(verdict: ChannelVerdict) -> str:
-    value = verdict.value
+    value, std = verdict.value, verdict.std or 0.0
     other = (verdict.looks_like or 0) + 1
+    late, drift = (
+        f"{1e3 * abs(value):.2f} +- {1e3 * std:.2f} ms",
+        f"{1e6 * abs(value):.0f} +- {1e6 * std:.0f}",
+    )
     return {
         Fault.DEAD: "silent: check plug, cable, phantom power",
         Fault.INTERMITTENT: f"out or crackling in {100 * value:.0f} % of the time: check plug and cable",
@@ -71,7 +90,14 @@ def _advice(verdict: ChannelVerdict) -> str:
         Fault.CLIPPED: f"{100 * value:.2g} % of samples at its limit: lower the gain",
         Fault.OFFSET: f"mean is {100 * value:.0f} % of the peak-to-peak sound: check bias and coupling",
         Fault.LEVEL: f"{value:+.0f} dB against the median channel: check gain and sensitivity",
+        Fault.GUSTS: f"loud by itself in {100 * value:.0f} % of ten seconds, wind: fit a windscreen",
+        Fault.DELAY: f"{late} {_when(value)} than the others: start the cards together, by one trigger",
+        Fault.DRIFT: f"{drift} us a second {_when(value)}: a clock of its own, connect the word clocks",
     }[verdict.fault]
+
+
+def _when(value: float) -> str:
+    return "later" if value > 0.0 else "earlier"
 
 
 def _other_lines(health: RecordingHealth) -> Iterator[str]:
@@ -86,7 +112,7 @@ def _other_lines(health: RecordingHealth) -> Iterator[str]:
         wrong = ": the header is wrong, or samples are missing" if rate.is_wrong else ""
         yield f"sample rate by the other clock: {ppm}{wrong}"
     if isinstance(health.coherence, NotUsable):
-        yield f"swapped, inverted and noisy microphones not judged: {health.coherence.reason}"
+        yield f"inverted and noisy microphones, swapped ones of many not judged: {health.coherence.reason}"
 
 
 def _conclusion(health: RecordingHealth) -> str:

@@ -126,4 +126,4 @@ class _Stages:
         self._music.read(self._mask)
 
     def _watch(self, samples: Float32Array) -> None:
-        self._monitor.push(samples, self._energies[-1], self._matrices)
+        self._monitor.push(samples, self._energies[-1], self._power, self._matrices)

@@ -8,6 +8,16 @@ from worldstate.frontend.health.dropouts import Dropout
 from worldstate.frontend.health.sample_clock import RateEstimate
 from worldstate.ground.values import NotUsable, seconds
 
+# What a fault also looks like, before it is known or now and then.
+_EXPLAINS = {
+    Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD},
+    Fault.SWAPPED: {Fault.NOISY},
+    Fault.DELAY: {Fault.NOISY},
+    Fault.DRIFT: {Fault.NOISY},
+}
+# Each of them misplaces the others' waves, too: what was seen in most hops is the cause, and what is left
+# shows when that is mended.
+_MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
 # Dropouts beyond these are counted, not listed.
 _LISTED_DROPOUTS = 100
 
@@ -28,6 +38,7 @@ class ChannelVerdict:
     first_s: float  # End of the first of these hops, seconds
     value: float  # How wrong, when last seen: see `worldstate.frontend.health.channel_health.ChannelFault`
     looks_like: int | None = None  # Swapped: the channel whose place it fits
+    std: float | None = None  # Delayed and drifting: standard deviation of the value
 
     @property
     def masked(self) -> bool:
@@ -109,6 +120,7 @@ class HealthLog:
                 first_s=before.first_s if before else seconds(frame.stamp_ns),
                 value=fault.value,
                 looks_like=fault.looks_like,
+                std=fault.std,
             )
 
     def summary(self) -> RecordingHealth:
@@ -126,7 +138,19 @@ class HealthLog:
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
-        kept = [verdict for verdict in ordered if not self._is_other_half(verdict)]
+        explained = {(channel, other) for channel, fault in self._seen for other in _EXPLAINS.get(fault, ())}
+        misplaced = [verdict for verdict in ordered if verdict.fault in _MISPLACED]
+        if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
+            # It begins as a delay.
+            misplaced = [verdict for verdict in misplaced if verdict.fault is not Fault.DELAY]
+        cause = max(misplaced, key=lambda verdict: verdict.share, default=None)
+        kept = [
+            verdict
+            for verdict in ordered
+            if (verdict.channel, verdict.fault) not in explained
+            and not self._is_other_half(verdict)
+            and (cause is None or verdict.fault not in _MISPLACED - {cause.fault})
+        ]
         return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in kept)
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:

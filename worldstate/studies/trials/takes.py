@@ -72,9 +72,8 @@ class TakeList:
     @property
     def origin(self) -> str:
         """What was evaluated, for the first line of the report."""
-        kind = "simulated streets" if self.simulated else "recordings"
         split = ", official test recordings" if self.official else ""
-        return f"{kind} in {self.root.name}{split}"
+        return f"folder {self.root.name}{split}"
 
 
 def find_takes(

@@ -1,0 +1,171 @@
+"""Gains, gusts, late cards, clocks and exchanged microphones: found in a large and in a small array."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
+
+from worldstate.adapters.simulation import draw_settings, simulate_recording
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.health.card_search import best_card, runs, untilted
+from worldstate.frontend.health.channel_health import ArrayHealth, ChannelFault
+from worldstate.frontend.health.order_check import sharpness_gains
+from worldstate.frontend.stream import FrontEnd
+from worldstate.operations.recordings.channel_report import HealthLog
+
+RATE = 6000
+ARRAYS = {56 // step: MicrophoneArray(ovad_array().positions_m[::step]) for step in (2, 7)}
+CARD = {28: slice(8, 16), 8: slice(4, 8)}
+# A second clock shows in ten seconds among many channels, in fifteen to thirty among 8.
+SECONDS = {28: 11.0, 8: 20.0}
+
+Spoil = Callable[[np.ndarray, int, np.random.Generator], dict[str, set[int]]]
+
+
+@cache
+def street(n_channels: int) -> np.ndarray:
+    """Noise of changing level from eight directions, every channel 0.3 dB and 0.02 ms off, (n, M)."""
+    rng, array, n = np.random.default_rng(7), ARRAYS[n_channels], round(SECONDS[n_channels] * RATE)
+    frequencies = np.fft.rfftfreq(n, 1 / RATE)
+    colour = (1.0 + frequencies / 300.0) ** -1.0 * (frequencies < 0.45 * RATE)
+    own_delay = 2e-5 * rng.standard_normal(n_channels)
+    sound = np.zeros((len(frequencies), n_channels), np.complex64)
+    for azimuth in rng.uniform(-np.pi, np.pi, 8):
+        level = np.exp(
+            np.interp(np.arange(n), np.arange(0, n + RATE, RATE), rng.normal(0, 0.5, n // RATE + 1))
+        )
+        wave = np.fft.rfft(rng.standard_normal(n) * level) * colour
+        late = array.delays_s(azimuth, abs(rng.normal(0, 0.1))) + own_delay
+        sound += wave[:, None] * np.exp(-2j * np.pi * frequencies[:, None] * late)
+    heard = np.fft.irfft(sound, n, axis=0) * 10.0 ** (0.3 * rng.standard_normal(n_channels) / 20.0)
+    heard += 0.1 * heard.std() * rng.standard_normal(heard.shape)
+    return np.asarray(heard / heard.std(), np.float32)
+
+
+def gain(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    x[:, m - 2] *= 2.0
+    return {"level": {m - 2}}
+
+
+def gusts(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    hit = rng.choice(m, 3, replace=False)
+    for channel in hit:
+        for start in rng.integers(0, len(x) - RATE, 3):
+            x[start : start + RATE, channel] += 4.0 * rng.standard_normal(RATE)
+    return {"gusts": set(hit.tolist())}
+
+
+def offset(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    late_samples = 3e-4 * RATE * np.ones(len(x))
+    return {"delayed": resampled(x, m, late_samples)}
+
+
+def drift(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    return {"drifting": resampled(x, m, 5e-5 * np.arange(len(x)))}
+
+
+def resampled(x: np.ndarray, m: int, late_samples: np.ndarray) -> set[int]:
+    channels = range(m)[CARD[m]]
+    for channel in channels:
+        x[:, channel] = map_coordinates(
+            x[:, channel].astype(float), [np.arange(len(x)) - late_samples], order=5, mode="nearest"
+        )
+    return set(channels)
+
+
+def exchange(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    pair = [1, m // 2]
+    x[:, pair] = x[:, pair[::-1]]
+    return {"swapped": set(pair)}
+
+
+def heard(array: MicrophoneArray, sound: np.ndarray) -> tuple[dict[str, set[int]], list[ChannelFault]]:
+    """What `doctor` says in the end, and what the monitor says in the last hop."""
+    log, kinds = HealthLog(), {}
+    frames = FrontEnd(array, RATE).process(sound)
+    for frame in frames:
+        log.add(frame)
+    for verdict in log.summary().verdicts:
+        kinds.setdefault(verdict.fault.value, set()).add(verdict.channel)
+    assert isinstance(frames[-1].health, ArrayHealth)
+    return kinds, list(frames[-1].health.faults)
+
+
+@pytest.mark.parametrize("n_channels", ARRAYS)
+def test_a_healthy_array_is_silent(n_channels: int) -> None:
+    assert heard(ARRAYS[n_channels], street(n_channels)) == ({}, [])
+
+
+@pytest.mark.parametrize("n_channels", ARRAYS)
+@pytest.mark.parametrize("spoil", [gain, gusts, offset, drift, exchange])
+def test_each_fault_is_named_and_nothing_else(spoil: Spoil, n_channels: int) -> None:
+    sound = street(n_channels).copy()
+    expected = spoil(sound, n_channels, np.random.default_rng(3))
+    kinds, latest = heard(ARRAYS[n_channels], sound)
+    assert kinds == expected
+    if spoil is gusts:
+        return
+    assert {fault.channel for fault in latest} == next(iter(expected.values()))
+    size = {"level": 6.0, "delayed": 3e-4, "drifting": 5e-5}.get(latest[0].fault.value)
+    if size is not None:
+        assert latest[0].value == pytest.approx(size, rel=0.25)
+    # The least of the five faults must be known well enough to be believed.
+    assert latest[0].std is None or latest[0].std < 0.2 * abs(latest[0].value)
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 99))
+def test_the_gain_of_an_exchange_is_that_of_exchanged_channels(seed: int) -> None:
+    rng, (k, m, d) = np.random.default_rng(seed), (3, 5, 30)
+    sound = rng.standard_normal((k, m, 20)) + 1j * rng.standard_normal((k, m, 20))
+    coherence = (sound @ sound.conj().transpose(0, 2, 1)) * (1.0 - np.eye(m))
+    beams = np.exp(2j * np.pi * rng.random((k, m, d)))
+
+    def sharpness(matrix: np.ndarray) -> float:
+        power = np.einsum("kmd,kmj,kjd->d", beams.conj(), matrix, beams).real
+        return float(np.square(np.maximum(power, 0.0)).sum())
+
+    pairs = np.array(list(combinations(range(m), 2)))
+    for (a, b), gain in zip(pairs, sharpness_gains(coherence, beams, pairs), strict=True):
+        order = np.arange(m)
+        order[[a, b]] = b, a
+        expected = sharpness(coherence[:, order][:, :, order]) / sharpness(coherence)
+        assert np.exp(gain) == pytest.approx(expected, rel=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 999), amount=st.floats(-1.0, 1.0).filter(lambda a: abs(a) > 0.1))
+def test_a_card_is_found_under_any_tilt(seed: int, amount: float) -> None:
+    rng = np.random.default_rng(seed)
+    positions, candidates = rng.standard_normal((12, 3)), runs(12)
+    card = candidates[rng.integers(len(candidates))]
+    free = untilted(positions, np.ones(12, bool))
+    values = amount * card + 3.0 * positions @ rng.standard_normal(3) + 5.0
+    found = best_card(free @ values, free, candidates)
+    assert found.channels.tolist() == (card > 0.0).tolist()
+    assert found.amount == pytest.approx(amount, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("approach", ["left", "none"])
+@pytest.mark.parametrize("site", ["SA2", "SB3"])
+def test_simulated_streets_are_healthy_and_show_each_fault(site: str, approach: str) -> None:
+    rng = np.random.default_rng(21)
+    plan = replace(draw_settings(site, approach, rng, duration_s=12.0), sample_rate_hz=float(RATE))
+    whole = simulate_recording(plan, rng, ARRAYS[28]).audio
+    for n_channels, sound in ((28, whole), (7, whole[:, ::4])):
+        ARRAYS.setdefault(n_channels, MicrophoneArray(ARRAYS[28].positions_m[::4]))
+        CARD.setdefault(n_channels, slice(4, 7))
+        assert heard(ARRAYS[n_channels], sound)[0] == {}
+        # Among few channels twelve seconds show no clock.
+        for spoil in (gain, gusts, offset, exchange, *((drift,) if n_channels == 28 else ())):
+            spoilt = sound / sound.std()
+            ((kind, channels),) = spoil(spoilt, n_channels, rng).items()
+            assert heard(ARRAYS[n_channels], spoilt)[0].get(kind, set()) >= channels
