@@ -52,8 +52,8 @@ SCREEN_CAP_DB = 24.0
 EXHAUST_SHARE = 0.3  # of the propulsion power; the rest leaves through the engine bay
 FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # at 1 m, per octave and pillar
 FLOW_EXPONENT = 60.0  # dB per decade of speed: a dipole's power grows with the sixth power of the flow
-# Octave of 100 Hz at 10 m/s behind a windscreen, set on the level of windows of DA1 and DB1: with 71 dB it is a
-# quarter too high there, with 77 dB single seconds are too uneven.
+# Octave of 100 Hz at 10 m/s behind a windscreen, set on the level of windows of DA1 and DB1: with 71 dB it is
+# a quarter too high there, with 77 dB single seconds are too uneven.
 WIND_AT_10_DB = 74.0
 WIND_EXPONENT = 40.0  # dB per decade: pseudo-sound is dynamic pressure
 
