@@ -99,7 +99,7 @@ def test_the_engine_s_sound_arrives_when_geometry_says(monkeypatch: pytest.Monke
     monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._add_wind", lambda *_: None)
     monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound.ROAD_REFLECTION", 0.0)
     monkeypatch.setattr(
-        "worldstate.adapters.simulation.sound.ego_sound._levels_db", lambda speed, _: [np.full((8, 9), 94.0)]
+        "worldstate.adapters.simulation.sound.ego_sound._levels_db", lambda *_: [np.full((8, 9), 94.0)]
     )
     monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._line_shares", lambda: (0.0,))
     pair = np.array([[0.0, 0.4, 1.4], [0.0, -0.1, 2.2]])
