@@ -70,7 +70,7 @@ class PlaneWaveCheck:
         if float(np.abs(coherence).max(initial=0.0)) < _TINY:
             return
         self._delay.push(coherence, active)
-        self._order.push(coherence, proposed)
+        self._order.push(coherence, proposed, self._delay.log_sharpness)
         late = self._delay.faults()
         confirmed = [fault for fault in late if (fault.channel, fault.fault) in self._before]
         self._before = {(fault.channel, fault.fault) for fault in late}
