@@ -54,10 +54,6 @@ class OrderCheck:
             self._gains[pair] = before.get(pair, deque(maxlen=_MEMORY_S))
             self._gains[pair].append((gain, rival))
 
-    def forget(self) -> None:
-        """Begin anew."""
-        self._gains.clear()
-
     def faults(self) -> list[ChannelFault]:
         """Return the channels whose exchange makes the waves sharper, of a small array the sharpest pair."""
         least_s, least, share = (_MIN_S, _GAIN, _SHARE_OF_DELAYS) if self._all else (1, _GAIN_OF_MANY, 0.0)

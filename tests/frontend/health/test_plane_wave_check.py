@@ -1,5 +1,6 @@
 """Gains, gusts, late cards, clocks and exchanged microphones: found in a large and in a small array."""
 
+import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,10 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
+from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.simulation import draw_settings, simulate_recording, site
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.adapters.simulation.stream.traffic import traffic_named
 from worldstate.adapters.simulation.stream.writing import write_stream
+from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.health.card_search import best_card, runs, untilted
@@ -126,6 +129,21 @@ def test_each_fault_is_named_and_nothing_else(spoil: Spoil, n_channels: int) -> 
         assert latest[0].value == pytest.approx(size, rel=0.25)
     # The least of the five faults must be known well enough to be believed.
     assert latest[0].std is None or latest[0].std < 0.2 * abs(latest[0].value)
+
+
+def test_doctor_says_which_card_is_late_by_how_much(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sound = street(8)[: 12 * RATE].copy()
+    offset(sound, 8, np.random.default_rng(0))
+    soundfile.write(tmp_path / "some.wav", 0.1 * sound, RATE, subtype="FLOAT")
+    write_array_xml(tmp_path / "mics.xml", ARRAYS[8])
+    assert main(["doctor", str(tmp_path / "some.wav"), "--array", str(tmp_path / "mics.xml")]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (row,) = (line for line in lines if "delayed" in line and "%" in line)
+    assert row.split()[:2] == ["5-8", "delayed"]
+    assert re.search(r"0\.(2[5-9]|3[0-5]) \+- 0\.0\d ms later than the others", row)
+    assert lines[-1] == "not healthy: delayed 5, 6, 7, 8; 4 left out by the front-end"
 
 
 @settings(deadline=None, max_examples=10)
