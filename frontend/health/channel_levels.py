@@ -1,6 +1,7 @@
 """Levels of channels against each other over ten seconds: wrong gains, and gusts at single microphones."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from worldstate.ground.typing import BoolArray, FloatArray
 
@@ -8,7 +9,7 @@ from .channel_health import ChannelFault, Fault, faults_where
 
 # Ten seconds; gusts last half a second to three, with lulls of as much between them.
 _MEMORY_HOPS = 100
-# Half a second: single hops of sound scatter by 2 dB between microphones.
+# Median of half a second: single hops of sound scatter by 2 dB between microphones, and a crackle is one hop.
 _SMOOTHED = 5
 # Six seconds: after two, the first gust is taken for a gain.
 _FEWEST_HOPS = 60
@@ -37,17 +38,17 @@ class ChannelLevels:
         self._n_hops = 0
 
     def push(self, powers: FloatArray, good: BoolArray) -> None:
-        """Take the mean power (K, M) of one hop per bin and channel, and the usable channels (M,)."""
+        """Take the mean power of one hop per bin and channel, (K, M), and the channels that sound, (M,)."""
         if good.any():
             level = 10.0 * np.log10(np.maximum(powers, _TINY))
             level -= np.median(level[:, good], axis=1, keepdims=True)
-            # A hop in which a channel breaks off or crackles is neither its level nor a gust.
+            # A hop in which a channel breaks off says nothing of its level.
             self._latest = np.where(good, level.mean(axis=0), self._latest)
         self._hops[self._n_hops % _MEMORY_HOPS] = self._latest
         self._n_hops += 1
         self._count += good
 
-    def faults(self, usable: BoolArray) -> list[ChannelFault]:
+    def faults(self) -> list[ChannelFault]:
         r"""Return wrong gains in dB, and gusts with their share of the last ten seconds.
 
         .. math:: g_m = q_{20\%}(L) > 4 \;\text{or}\; q_{80\%}(L) < -4, \qquad
@@ -59,17 +60,12 @@ class ChannelLevels:
         if n < _FEWEST_HOPS:
             return []
         newest = self._n_hops % _MEMORY_HOPS if self._n_hops >= _MEMORY_HOPS else 0
-        smooth = _sliding_mean(np.roll(self._hops, -newest, axis=0)[:n])
+        ordered = np.roll(self._hops, -newest, axis=0)[:n]
+        smooth = np.median(sliding_window_view(ordered, _SMOOTHED, axis=0), axis=2)
         low, high = np.quantile(smooth, (_QUIET, 1.0 - _QUIET), axis=0)
         level = np.clip(0.0, low, high)
-        usable = usable & (self._count >= _FEWEST_HOPS // 2)
+        usable = self._count >= _FEWEST_HOPS // 2
         gusty = (smooth - low > _GUST_DB).sum(axis=0)
         gusts = usable & (gusty >= _FEWEST_GUSTY)
         wrong = usable & ~gusts & (np.abs(level) > _LEVEL_DB)
         return faults_where(Fault.LEVEL, wrong, level) + faults_where(Fault.GUSTS, gusts, gusty / len(smooth))
-
-
-def _sliding_mean(rows: FloatArray) -> FloatArray:
-    """Mean of every five rows in turn, (n, M) to (n - 4, M)."""
-    sums = np.concatenate([np.zeros((1, rows.shape[1])), rows.cumsum(axis=0)])
-    return np.asarray((sums[_SMOOTHED:] - sums[:-_SMOOTHED]) / _SMOOTHED)

@@ -87,22 +87,29 @@ class ChannelMonitor:
         dropouts = self._dropout_finder.push(samples, alive)
         self._n_dropouts += len(dropouts)
         self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
-        bad = self._judge_hop(samples, energies, span)
-        self._levels.push(powers.mean(axis=0, dtype=np.float64), ~bad)
+        silent = self._silent(energies, alive)
+        self._levels.push(powers.mean(axis=0, dtype=np.float64), ~silent)
+        bad = self._judge_hop(samples, span, silent)
         active = ~self._activity.suspects
         self._geometry_check.push(matrices, len(energies), active)
         proposed = [one for one in self._geometry_check.faults() if one.fault is Fault.SWAPPED]
         self._plane_waves.push(matrices, len(energies), active, proposed)
         return self._report(bad)
 
-    def _judge_hop(self, samples: Float32Array, energies: FloatArray, span: Float32Array) -> BoolArray:
+    def _silent(self, energies: FloatArray, alive: BoolArray) -> BoolArray:
+        """Flag the channels that are silent in this hop or break off in it."""
+        if not alive.any():
+            return ~alive
+        typical = np.maximum(np.median(energies[:, alive], axis=1, keepdims=True), _TINY)
+        level = (energies / typical).mean(axis=0)
+        return np.asarray(~alive | (level < _SILENT) | (energies < _DROPPED * typical).any(axis=0))
+
+    def _judge_hop(self, samples: Float32Array, span: Float32Array, silent: BoolArray) -> BoolArray:
         """Flag the channels that are silent or crackle in this hop."""
         alive = span > 0.0
         if not alive.any():
             return self._activity.all_silent()
-        typical = np.maximum(np.median(energies[:, alive], axis=1, keepdims=True), _TINY)
-        level = (energies / typical).mean(axis=0)
-        bad = ~alive | (level < _SILENT) | (energies < _DROPPED * typical).any(axis=0)
+        bad = silent.copy()
         mean_span = self._means.mean[0]
         known = alive & (mean_span > 0.0)
         if known.any():
@@ -156,7 +163,7 @@ class ChannelMonitor:
         return [
             *faults_where(Fault.CLIPPED, clipped > _CLIPPED_SHARE, clipped),
             *faults_where(Fault.OFFSET, usable & settled & (offset > _OFFSET), offset),
-            *self._levels.faults(usable),
+            *self._levels.faults(),
         ]
 
 

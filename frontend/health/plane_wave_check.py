@@ -5,7 +5,7 @@ import numpy as np
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import BoolArray, Complex64Array, FloatArray
 
-from .channel_health import ChannelFault, Fault
+from .channel_health import ChannelFault
 from .delay_check import DelayCheck
 from .order_check import MAX_CHANNELS, OrderCheck
 from .plane_waves import PlaneWaves
@@ -70,12 +70,9 @@ class PlaneWaveCheck:
         if float(np.abs(coherence).max(initial=0.0)) < _TINY:
             return
         self._delay.push(coherence, active)
-        self._order.push(coherence, proposed)
+        self._order.push(coherence, proposed, self._delay.log_sharpness)
         late = self._delay.faults()
         confirmed = [fault for fault in late if (fault.channel, fault.fault) in self._before]
         self._before = {(fault.channel, fault.fault) for fault in late}
-        if any(fault.fault is Fault.DRIFT for fault in confirmed):
-            # The channels of another clock soon fit nowhere, and some exchange would fit by chance.
-            self._order.forget()
         # Exchanged channels are late, too.
         self._faults = self._order.faults() or confirmed

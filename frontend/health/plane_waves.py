@@ -15,6 +15,8 @@ _STEP_DEG = 7.5
 _STEEP = np.radians(30.0)
 # Directions whose delays agree to this are one to the array: front and back, or a whole cone.
 _SAME_S = 2e-6
+# Sharpness of no agreement at all, far below that of one pair in one bin; keeps the logarithm finite.
+SILENCE = 1e-12
 
 
 class PlaneWaves:
@@ -50,6 +52,15 @@ def direction_weights(agreement: Complex64Array) -> Float32Array:
     """
     power = np.square(np.maximum(agreement.real.sum(axis=(0, 1)), 0.0))
     return np.asarray(power / max(float(power.sum()), np.finfo(np.float32).tiny))
+
+
+def log_sharpness(agreement: Complex64Array) -> float:
+    r"""Return how much the sound is concentrated in few directions, nats.
+
+    .. math:: \ln \sum_d \max\Big(\frac12 \sum_{km} \mathrm{Re}\, g_{kmd},\; 0\Big)^2
+    """
+    power = 0.5 * np.maximum(agreement.real.sum(axis=(0, 1)), 0.0)
+    return float(np.log(max(float(np.square(power).sum(dtype=np.float64)), SILENCE)))
 
 
 def _directions() -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ from worldstate.ground.values import NotUsable, seconds
 
 # What a fault also looks like, before it is known or now and then.
 _EXPLAINS = {
-    Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD},
+    Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD, Fault.DELAY, Fault.DRIFT},
     Fault.SWAPPED: {Fault.NOISY},
     Fault.DELAY: {Fault.NOISY},
     Fault.DRIFT: {Fault.NOISY},
@@ -139,22 +139,30 @@ class HealthLog:
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
         explained = {(channel, other) for channel, fault in self._seen for other in _EXPLAINS.get(fault, ())}
-        misplaced = [verdict for verdict in ordered if verdict.fault in _MISPLACED]
-        if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
-            # It begins as a delay.
-            misplaced = [verdict for verdict in misplaced if verdict.fault is not Fault.DELAY]
-        cause = max(misplaced, key=lambda verdict: verdict.share, default=None)
         kept = [
             verdict
             for verdict in ordered
-            if (verdict.channel, verdict.fault) not in explained
-            and not self._is_other_half(verdict)
-            and (cause is None or verdict.fault not in _MISPLACED - {cause.fault})
+            if (verdict.channel, verdict.fault) not in explained and not self._is_other_half(verdict)
         ]
-        return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in kept)
+        return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
         """Tell a channel that was called dead while it came and went, or the other way round, mostly that."""
         others = {Fault.DEAD: Fault.INTERMITTENT, Fault.INTERMITTENT: Fault.DEAD}
         other = self._seen.get((verdict.channel, others.get(verdict.fault, verdict.fault)))
         return other is not None and other.fault != verdict.fault and other.share > verdict.share
+
+
+def _one_cause(verdicts: list[ChannelVerdict]) -> list[ChannelVerdict]:
+    """Of misplaced channels, keep those of the fault seen in most hops that were seen in half of these."""
+    misplaced = [verdict for verdict in verdicts if verdict.fault in _MISPLACED]
+    if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
+        # It begins as a delay.
+        misplaced = [verdict for verdict in misplaced if verdict.fault is not Fault.DELAY]
+    cause = max(misplaced, key=lambda verdict: verdict.share, default=None)
+    return [
+        verdict
+        for verdict in verdicts
+        if verdict.fault not in _MISPLACED
+        or (cause and verdict.fault is cause.fault and 2.0 * verdict.share >= cause.share)
+    ]
