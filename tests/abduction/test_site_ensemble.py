@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import log_softmax
 
@@ -18,7 +18,11 @@ from worldstate.abduction.signature.site_reference import SiteReference, log_lev
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.operations.training.site_references import with_site_references
+from worldstate.operations.training.site_references import (
+    inputs_under,
+    learned_while_listening,
+    with_site_references,
+)
 
 
 def windows(rng, n=200, spread=0.8):
@@ -130,6 +134,48 @@ def test_a_reference_never_holds_the_recording_that_is_scored_nor_another_site_n
         other_site = np.array([sites[j] != sites[i] for j in range(n)])
         np.testing.assert_array_equal(after[same_recording | other_site], before[same_recording | other_site])
         assert (np.abs(after - before).max(axis=1) > 0)[~(same_recording | other_site)].all()
+
+
+def made_up_junctions():
+    rng, n = np.random.default_rng(6), 90
+    labels = np.repeat(["none", "left", "front"], n // 3).tolist()
+    return labels, ["SA1"] * n, (np.arange(n) // 2).astype(str).tolist(), rng.uniform(0.1, 1.0, (n, 60))
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 44), st.sampled_from(["none", "left", "right"]))
+def test_what_a_stream_taught_holds_nothing_of_the_recording_that_is_scored(recording, label):
+    labels, sites, recordings, features = made_up_junctions()
+    before = learned_while_listening(
+        table(labels, sites, recordings, features), np.random.default_rng(recording)
+    )
+    mine = [row for row, name in enumerate(recordings) if name == str(recording)]
+    for row in mine:
+        labels[row], features[row] = label, 3.0
+    after = learned_while_listening(
+        table(labels, sites, recordings, features), np.random.default_rng(recording)
+    )
+    for row in mine:
+        np.testing.assert_array_equal(before[row].level, after[row].level)
+
+
+def test_a_stream_is_ten_windows_of_mostly_empty_street():
+    labels, sites, recordings, features = made_up_junctions()
+    features[:] = np.where(np.array(labels) == "left", np.e, 1.0)[:, None]
+    # Nobody has heard a car in view: a stream that is half front would show here.
+    features[np.array(labels) == "front"] = np.nan
+    learned = learned_while_listening(table(labels, sites, recordings, features), np.random.default_rng(0))
+    assert learned[0].heard_s == pytest.approx(10.0, rel=0.05)
+    assert np.mean([one.level.mean() for one in learned]) == pytest.approx(0.05, abs=0.03)
+
+
+def test_cold_is_the_mean_of_the_training_sites(trained):
+    X, _, model = trained
+    labels, sites, recordings, _ = made_up_junctions()
+    windows = table(labels, sites, recordings, X[:90, :60])
+    cold = inputs_under("cold", windows, np.random.default_rng(0))(model, np.arange(90) < 4)
+    behind = np.hstack([X[:4, :60], np.tile(model.home.row, (4, 1))])
+    np.testing.assert_allclose(model.predict_proba(cold), model.predict_proba(behind), rtol=1e-12)
 
 
 def test_a_site_with_one_recording_has_no_reference():

@@ -22,8 +22,8 @@ TABLE = FOLDER and FOLDER / NAME
 pytestmark = needs_released_windows
 
 
-def compared(group, protocol, others=(), seeds=1):
-    row = row_of("worldstate", protocol)
+def compared(group, protocol, others=(), seeds=1, reference="curated"):
+    row = row_of("worldstate", protocol, reference)
     whole = read_features(TABLE)
     table = whole.group(group)
     train = whole.group("static") if protocol == "transfer" else None
@@ -53,6 +53,16 @@ def test_a_moving_ego_at_a_junction_never_seen():
     assert figures["tpr"] >= 0.42
     assert figures["fpr_p_value"] >= 0.05
     assert figures["ece"] <= figures["ece_floor"] + 2 * figures["ece_floor_std"]
+
+
+@pytest.mark.slow
+def test_what_a_stream_brings_lies_between_nothing_and_the_curated_windows():
+    # A moving ego's level says little at a junction unless the junction is known; three passes, one table.
+    table = read_features(TABLE).group("dynamic")
+    rows = [row_of("worldstate", "lojo", reference) for reference in ("cold", "run", "curated")]
+    passes = run_passes(rows, table, "lojo", seeds=1, alpha=0.02)
+    cold, run, curated = (comparison(table, passes, row, 0.02, draws=2)["auroc_pooled"] for row in rows)
+    assert cold + 0.02 < run < curated - 0.02
 
 
 @pytest.mark.slow
@@ -92,7 +102,8 @@ def test_the_command_prints_every_row_and_writes_what_it_scored(tmp_path, capsys
     assert command(*words, "--json", "--predictions", out) == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures["rows"]) == {
-        "baseline", "baseline_absent", "loudest_direction", "commissioning_drive", "ensemble",
+        "baseline", "baseline_absent", "loudest_direction", "distant_site_cold", "distant_site_curated",
+        "ensemble_run",
     }  # fmt: skip
     for row in (figures, *figures["rows"].values()):
         for key, (low, high) in row["intervals"].items():
@@ -115,7 +126,9 @@ def test_no_row_of_the_data_ships_and_the_official_test_recordings_hold():
     ids = read_ids(TABLE.parent / "timeHorizonStaticTestset.csv")
     settings = TrainingSettings(repeats=1, method="worldstate")
     model = train_model(table.without(ids), settings, dataset="OVAD", group="static")
-    figures = report(table.only(ids), [predict_held_out(model, table.only(ids), alpha=0.02)])
+    figures = report(
+        table.only(ids), [predict_held_out(model, table.only(ids), 0.02, "curated", np.random.default_rng(0))]
+    )
     assert figures["accuracy"] >= 0.88
     assert figures["auroc_pooled_absent"] >= 0.975
     written = {f"{value:.6f}" for value in leaves(encode(model.signature))}

@@ -8,14 +8,19 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
 
   --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
                        Keys that end in _absent are of eq. (6) with the visible explanation removed
-  --method worldstate  windows compared with the unlabelled reference of their site, taken from its other
-                       recordings; mirror-symmetric ensemble; eq. (6) with the visible explanation removed.
-                       "rows" and "gains" compare it with the baseline, with the untrained loudest direction,
-                       and with itself given hazard-free windows of the site (a commissioning drive);
+  --method worldstate  windows compared with what their site sounds like; mirror-symmetric ensemble; eq. (6)
+                       with the visible explanation removed. "rows" and "gains" compare it with the baseline,
+                       with the untrained loudest direction, and with itself under the other references.
                        Under transfer it is one expert of the pattern above the site's quiet windows, its
-                       risks shifted until hazards are as frequent as in training, and "ensemble" a row
+                       risks shifted until hazards are as frequent as in training, and the ensemble a row
 
-Thresholds and risk maps are set on inner out-of-fold scores. Figures are means over the seeds; intervals are
+  --reference run      as `run` has it: learned from the ten windows of a second that came before, drawn from
+                       other recordings of the junction, one in twenty of them a hazard; no label is read
+  --reference cold     the mean of the training sites: a car in its first second
+  --reference curated  all windows of the junction's other recordings, half of them hazards: no car has it
+
+Thresholds and risk maps are set on inner out-of-fold scores, compared with curated windows as in `train`.
+Figures are means over the seeds; intervals are
 the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
 
 With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
@@ -51,6 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_table_options(parser)
     add_choice(parser, "--protocol", "who is held out", "cv", "lojo", "transfer")
+    add_choice(parser, "--reference", "what windows are compared with", "run", "cold", "curated")
     add("--model", type=Path, help="evaluate this model file; no cross-validation")
     only = "CSV file with a column ID: only recordings of these windows"
     add("--only", type=Path, metavar="IDS", help=only)
@@ -84,7 +90,7 @@ def _evaluate_method(
     from worldstate.studies.features.comparison import comparison, row_predictions
     from worldstate.studies.features.feature_report import report
 
-    row = row_of(arguments.method, arguments.protocol)
+    row = row_of(arguments.method, arguments.protocol, arguments.reference)
     passes = _passes(arguments, whole, table, row)
     detail = report(table, passes[row]) if row == "baseline" else {}
     compared = comparison(table, passes, row, arguments.alpha)
@@ -97,13 +103,13 @@ def _passes(
 ) -> "dict[str, Passes]":
     """Run every seed of the method and of those that it is compared with."""
     from worldstate.ground.checks import in_range
-    from worldstate.operations.training.methods import ROWS
-    from worldstate.studies.features.comparison import COMPARED, COMPARED_AFAR, run_passes
+    from worldstate.operations.training.methods import ROWS, rows_beside
+    from worldstate.studies.features.comparison import run_passes
 
     in_range("--seeds", arguments.seeds, 1, 10_000)
     in_range("--jobs", arguments.jobs, 1, 256)
     afar = arguments.protocol == "transfer"
-    names = (row,) if row == "baseline" else (row, *(COMPARED_AFAR if afar else COMPARED))
+    names = (row, *rows_beside(row, arguments.protocol, arguments.reference))
     methods = list(dict.fromkeys(ROWS[name].method for name in names))
     with progress_bar("evaluating", arguments.seeds * len(methods)) as bar:
         return run_passes(
@@ -121,11 +127,15 @@ def _passes(
 def _evaluate_model(
     arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
 ) -> tuple[Figures, "list[Predictions]"]:
+    import numpy as np
+
     from worldstate.adapters.files.model_file import read_model
     from worldstate.studies.features.feature_report import report
     from worldstate.studies.features.held_out import predict_held_out
 
-    predictions = predict_held_out(read_model(arguments.model), table, arguments.alpha)
+    predictions = predict_held_out(
+        read_model(arguments.model), table, arguments.alpha, arguments.reference, np.random.default_rng(0)
+    )
     figures = _origin(arguments, "model", "held-out", 1) | report(table, [predictions])
     return figures, [predictions[1.0]]
 
@@ -143,6 +153,7 @@ def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: in
         "method": method,
         "protocol": protocol,
         "group": arguments.group,
+        "reference": arguments.reference,
         "seeds": seeds,
         "alpha": arguments.alpha,
     }

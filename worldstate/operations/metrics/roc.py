@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray
 
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
@@ -77,6 +77,23 @@ def rate(decisions: BoolArray, among: BoolArray) -> float | None:
     0.5
     """
     return float(decisions[among].mean()) if among.any() else None
+
+
+def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> float:
+    r"""Return the share of hazard-free windows that are in alarm at the junction where it is largest.
+
+    .. math:: \max_s \frac{\sum_i a_i f_i [s_i = s]}{\sum_i f_i [s_i = s]}
+
+    Shapes: alarms, hazard_free, sites (n,).
+
+    Examples
+    --------
+    >>> free = np.ones(4, dtype=bool)
+    >>> worst_rate(np.array([True, False, False, False]), free, np.array([0, 0, 1, 1]))
+    0.5
+    """
+    rates = [rate(alarms, hazard_free & (sites == site)) for site in np.unique(sites[hazard_free])]
+    return max(one for one in rates if one is not None)
 
 
 def rank_wins(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) -> FloatArray:

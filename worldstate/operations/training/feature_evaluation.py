@@ -22,6 +22,8 @@ from .splits import Split
 from .window_calibration import MISS_RATES, FitMap, WindowCalibration, between, calibrate_windows
 
 MakeClassifier = Callable[[np.random.Generator], Classifier]
+# Posteriors of the chosen rows of the table that is evaluated, shape (rows, 4).
+Ask = Callable[[Classifier, BoolArray], FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,7 @@ def cross_validate(
     alpha: float,
     inner_splits: Sequence[Split] = (),
     fit_map: FitMap = fit_isotonic,
+    ask: Ask | None = None,
     on_fold: Callable[[], None] = lambda: None,
 ) -> dict[float, Predictions]:
     """Predict every window once, by classifier, threshold and map that never saw its fold.
@@ -82,6 +85,9 @@ def cross_validate(
         with several, from the most careful to the boldest, the calibration is that `between` them.
     fit_map : callable
         Fits the risk map.
+    ask : callable, optional
+        Asks the classifier about held-out rows, where those are asked otherwise than the inner folds: with
+        another reference.
     on_fold : callable
         Called after each outer fold, for progress.
 
@@ -105,12 +111,12 @@ def cross_validate(
     >>> bool(alarms[table.hazards].mean() > alarms[table.hazard_free].mean())
     True
     """
-    folds = split(table, rng)
+    folds, ask = split(table, rng), ask or _plainly(table)
     predictions = {beta: Predictions.blank(folds) for beta in MISS_RATES}
     for fold in np.unique(folds):
         held_out = folds == fold
         train = table.select(~held_out)
-        probabilities = _trained(make, train, rng).predict_proba(table.features[held_out])
+        probabilities = ask(_trained(make, train, rng), held_out)
         inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits or (split,)]
         for beta, prediction in predictions.items():
             prediction.fill(held_out, probabilities, _calibration(train, inner, alpha, beta, fit_map))
@@ -127,6 +133,7 @@ def transfer(
     *,
     alpha: float,
     fit_map: FitMap = fit_isotonic,
+    ask: Ask | None = None,
     match_prevalence: bool = False,
 ) -> dict[float, Predictions]:
     """Predict every window of one table by what was learned on another."""
@@ -134,7 +141,8 @@ def transfer(
     if shared.size:
         raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")
     inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits]
-    probabilities = _trained(make, train, rng).predict_proba(test.features)
+    everything = np.ones(len(test), dtype=np.bool_)
+    probabilities = (ask or _plainly(test))(_trained(make, train, rng), everything)
     predictions = {}
     for beta in MISS_RATES:
         calibration = _calibration(train, inner, alpha, beta, fit_map)
@@ -165,6 +173,10 @@ def predict_with(
     predictions = Predictions.blank(np.full(len(table), fold))
     predictions.fill(np.ones(len(table), dtype=np.bool_), probabilities, calibration)
     return predictions
+
+
+def _plainly(table: FeatureTable) -> Ask:
+    return lambda classifier, rows: classifier.predict_proba(table.features[rows])
 
 
 def _trained(make: MakeClassifier, table: FeatureTable, rng: np.random.Generator) -> Classifier:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -9,10 +10,11 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
 from worldstate.abduction.signature.ensemble_training import Recipe, SiteEnsembleClassifier
 from worldstate.abduction.signature.published_training import Classifier, PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.typing import BoolArray, FloatArray
 
-from .feature_evaluation import MakeClassifier, Predictions, cross_validate, transfer
+from .feature_evaluation import Ask, MakeClassifier, Predictions, cross_validate, transfer
 from .loudness import LoudestDirection
-from .site_references import with_site_references
+from .site_references import REFERENCES, Reference, inputs_under, with_site_references
 from .splits import Protocol, Split, folds_by_recording, junction_folds, split_for
 from .window_calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, FitMap
 
@@ -32,6 +34,9 @@ class WindowMethod:
     two_levels: bool
     # Whether risks are shifted, under `transfer`, until hazards are as frequent as in training.
     match_prevalence: bool = False
+    # What the scored windows are compared with, None where the method compares with nothing. Training and
+    # threshold have the curated windows in any case, as in `train`.
+    reference: Reference | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +60,17 @@ def evaluate_pass(
     rng, split = np.random.default_rng(seed), split_for(protocol)
     prepared = method.prepare(table)
     inner = _inner_splits(method, protocol)
+    ask = None if method.reference is None else _ask_under(method.reference, table, seed)
     if train is None:
         return cross_validate(
-            prepared, split, method.make, rng, alpha=alpha, inner_splits=inner, fit_map=method.fit_map
+            prepared,
+            split,
+            method.make,
+            rng,
+            alpha=alpha,
+            inner_splits=inner,
+            fit_map=method.fit_map,
+            ask=ask,
         )
     learned = method.prepare(train)
     return transfer(
@@ -68,8 +81,20 @@ def evaluate_pass(
         rng,
         alpha=alpha,
         fit_map=method.fit_map,
+        ask=ask,
         match_prevalence=method.match_prevalence,
     )
+
+
+def _ask_under(reference: Reference, table: FeatureTable, seed: int) -> Ask:
+    # A generator of its own: the folds of a seed are the same under every reference.
+    inputs = inputs_under(reference, table, np.random.default_rng([seed, 1]))
+
+    def ask(classifier: Classifier, rows: BoolArray) -> FloatArray:
+        model = cast(SiteEnsembleClassifier, classifier).model_
+        return model.predict_proba(inputs(model, rows))
+
+    return ask
 
 
 def _inner_splits(method: WindowMethod, protocol: Protocol) -> tuple[Split, ...]:
@@ -80,11 +105,6 @@ def _inner_splits(method: WindowMethod, protocol: Protocol) -> tuple[Split, ...]
 def as_read(table: FeatureTable) -> FeatureTable:
     """Return the table as it is."""
     return table
-
-
-def with_commissioning_drive(table: FeatureTable) -> FeatureTable:
-    """Append references that come from hazard-free windows of the site only."""
-    return with_site_references(table, table.hazard_free)
 
 
 def site_ensemble(rng: np.random.Generator) -> Classifier:
@@ -107,21 +127,30 @@ def distant_site(rng: np.random.Generator) -> Classifier:
 METHODS = {
     "baseline": WindowMethod(as_read, PublishedClassifier, fit_isotonic, two_levels=False),
     "loudest_direction": WindowMethod(as_read, loudest_direction, fit_isotonic, two_levels=False),
-    "ensemble": WindowMethod(with_site_references, site_ensemble, fit_platt, two_levels=True),
-    "commissioning_drive": WindowMethod(with_commissioning_drive, site_ensemble, fit_platt, two_levels=True),
-    "distant_site": WindowMethod(
-        with_site_references, distant_site, fit_platt, two_levels=False, match_prevalence=True
-    ),
+    **{
+        f"ensemble_{reference}": WindowMethod(
+            with_site_references, site_ensemble, fit_platt, two_levels=True, reference=reference
+        )
+        for reference in REFERENCES
+    },
+    **{
+        f"distant_site_{reference}": WindowMethod(
+            with_site_references,
+            distant_site,
+            fit_platt,
+            two_levels=False,
+            match_prevalence=True,
+            reference=reference,
+        )
+        for reference in REFERENCES
+    },
 }
 
 # What is read from each method, by the name of its row.
 ROWS = {
     "baseline": Row("baseline", PUBLISHED_MISS_RATE),
     "baseline_absent": Row("baseline", ABSENT_MISS_RATE),
-    "loudest_direction": Row("loudest_direction", ABSENT_MISS_RATE),
-    "ensemble": Row("ensemble", ABSENT_MISS_RATE),
-    "commissioning_drive": Row("commissioning_drive", ABSENT_MISS_RATE),
-    "distant_site": Row("distant_site", ABSENT_MISS_RATE),
+    **{name: Row(name, ABSENT_MISS_RATE) for name in METHODS if name != "baseline"},
 }
 
 # What `worldstate` is: the ensemble where the ego drives as it did in training, one expert where it does not.
@@ -129,11 +158,21 @@ ROWS = {
 OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "distant_site"}
 
 
-def row_of(method: str, protocol: Protocol) -> str:
-    """Return the name in `ROWS` of what a method is under a protocol."""
-    return OURS[protocol] if method == "worldstate" else method
+def row_of(method: str, protocol: Protocol, reference: Reference) -> str:
+    """Return the name in `ROWS` of what a method is under a protocol and a reference."""
+    return f"{OURS[protocol]}_{reference}" if method == "worldstate" else method
+
+
+def rows_beside(row: str, protocol: Protocol, reference: Reference) -> tuple[str, ...]:
+    """Return the rows beside one: those to beat, and itself under the other references."""
+    if row == "baseline":
+        return ()
+    others = tuple(row_of("worldstate", protocol, other) for other in REFERENCES if other != reference)
+    # Where the ego drives and did not in training, the ensemble is one of those to beat.
+    afar = (f"ensemble_{reference}",) if protocol == "transfer" else ()
+    return ("baseline", "baseline_absent", "loudest_direction", *others, *afar)
 
 
 def method_of(method: str) -> WindowMethod:
-    """Return what a method is where the ego drives as it did in training."""
-    return METHODS[row_of(method, "cv")]
+    """Return what a method is in training: compared with curated windows."""
+    return METHODS[row_of(method, "cv", "curated")]

@@ -1,33 +1,103 @@
-"""Feature windows with the reference of their site, taken from other recordings than the scored one."""
+"""What windows are compared with: curated windows of their site, a stream heard before, or nothing."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+
+Reference = Literal["run", "cold", "curated"]
+REFERENCES: tuple[Reference, ...] = ("run", "cold", "curated")
+# What a car has heard of a street when its first ten seconds are over: nearly always nobody comes.
+STREAM_WINDOWS = 10
+STREAM_HAZARDS = 0.05
+_WINDOW_S = 1.0
+
+# From a trained model and the rows that are asked for to windows with a reference behind them, or without.
+Inputs = Callable[[EnsembleModel, BoolArray], FloatArray]
 
 
-def with_site_references(table: FeatureTable, chosen: BoolArray | None = None) -> FeatureTable:
-    """Append to each window the reference of its junction.
+def with_site_references(table: FeatureTable) -> FeatureTable:
+    """Append to each window the reference of its junction, from its other recordings; no label is looked at.
 
-    Shapes: table (n, 60), chosen (n,), returns (n, 240).
+    Shapes: table (n, 60), returns (n, 240).
     """
-    # No label is looked at, unless the caller chooses windows by their label: a commissioning drive is
-    # `chosen=table.hazard_free`.
     levels = log_levels(table.features)
-    allowed = np.ones(len(table), dtype=np.bool_) if chosen is None else chosen
-    keys = table.recording_keys
     references = np.empty((len(table), 3 * levels.shape[1]))
+    for mine, others in _recordings(table):
+        references[mine] = site_reference(levels[others]).row
+    return replace(table, features=np.hstack([table.features, references]))
+
+
+def inputs_under(reference: Reference, table: FeatureTable, rng: np.random.Generator) -> Inputs:
+    """Return what a model is asked under a reference.
+
+    Shapes: table (n, 60).
+    """
+    if reference == "cold":
+        return lambda model, rows: table.features[rows]
+    if reference == "curated":
+        curated = with_site_references(table).features
+        return lambda model, rows: curated[rows]
+    learned = learned_while_listening(table, rng)
+    settings = SiteEstimateSettings()
+
+    def behind(model: EnsembleModel, rows: BoolArray) -> FloatArray:
+        references = [learned[row].reference(model, settings).row for row in np.flatnonzero(rows)]
+        return np.hstack([table.features[rows], references])
+
+    return behind
+
+
+def learned_while_listening(table: FeatureTable, rng: np.random.Generator) -> list[SiteEstimate]:
+    """Return for each window what `run` has learned of its junction from a stream before it.
+
+    Shapes: table (n, 60).
+    """
+    # Labels compose the street, a twentieth of it hazards; the estimate sees none, and nothing of the
+    # recording that is scored: neither its windows nor its label move what is drawn for it.
+    settings, start = SiteEstimateSettings(), SiteEstimate.start(table.features.shape[1])
+    learned = [start] * len(table)
+    for mine, others in _recordings(table):
+        estimate = start
+        for row in _stream(table, others, rng):
+            estimate = estimate.updated(table.features[row], _WINDOW_S, settings)
+        for row in np.flatnonzero(mine):
+            learned[row] = estimate
+    return learned
+
+
+def _stream(table: FeatureTable, others: BoolArray, rng: np.random.Generator) -> IndexArray:
+    hazards, empty = (np.flatnonzero(others & flags) for flags in (table.hazards, table.hazard_free))
+    if not empty.size:
+        raise InvalidArgumentError(
+            f"{table.environments[others][0]}: expected hazard-free windows to compose a stream of, got none"
+        )
+    kind, which = rng.random((2, STREAM_WINDOWS))
+    comes = (kind < STREAM_HAZARDS) & bool(hazards.size)
+    # Hazards first, so that a number in [0, 1) picks one of either.
+    rows = np.concatenate([hazards, empty])
+    picked = np.where(comes, which * hazards.size, hazards.size + which * empty.size)
+    return np.asarray(rows[picked.astype(np.intp)])
+
+
+def _recordings(table: FeatureTable) -> list[tuple[BoolArray, BoolArray]]:
+    """Windows of each recording, and those of the other recordings of its junction."""
+    keys, parts = table.recording_keys, []
     for key in np.unique(keys):
         mine = keys == key
-        others = (table.environments == table.environments[mine][0]) & ~mine & allowed
+        others = (table.environments == table.environments[mine][0]) & ~mine
         if not others.any():
             raise InvalidArgumentError(
                 f"recording {key}: expected another recording of its junction, to compare it with; "
                 "method baseline compares with none"
             )
-        references[mine] = site_reference(levels[others]).row
-    return replace(table, features=np.hstack([table.features, references]))
+        parts.append((mine, others))
+    return parts

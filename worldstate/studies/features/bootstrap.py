@@ -9,11 +9,21 @@ from worldstate.abduction.cueing.calibration_error import brier_score, expected_
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.recording_draws import DRAWS, FigureDraws, stratified_draws
-from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.roc import auroc, worst_rate
 from worldstate.operations.training.feature_evaluation import Predictions
 from worldstate.operations.training.splits import recording_labels
 
-FIGURES = ("accuracy", "auroc_macro", "auroc_pooled", "worst_group_auroc", "tpr", "fpr", "ece", "brier")
+FIGURES = (
+    "accuracy",
+    "auroc_macro",
+    "auroc_pooled",
+    "worst_group_auroc",
+    "tpr",
+    "fpr",
+    "worst_group_fpr",
+    "ece",
+    "brier",
+)
 
 
 def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = DRAWS) -> list[IndexArray]:
@@ -66,6 +76,7 @@ class _Outcome:
             min(known),
             float(decision[hazards].mean()),
             float(decision[hazard_free].mean()),
+            worst_rate(decision, hazard_free, self.sites[rows]),
             expected_calibration_error(risk, labels),
             brier_score(risk, labels),
         ]

@@ -20,9 +20,6 @@ from .feature_report import count_windows, mean_figures, report_groups, window_f
 
 # The same samples for every method and run: the differences between methods are paired.
 BOOTSTRAP_SEED = 0
-COMPARED = ("baseline", "baseline_absent", "loudest_direction", "commissioning_drive")
-# Where the ego drives and did not in training, the ensemble is one of those to beat.
-COMPARED_AFAR = (*COMPARED, "ensemble")
 
 
 def run_passes(

@@ -16,7 +16,7 @@ from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.typing import BoolArray
-from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate
+from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate, worst_rate
 from worldstate.operations.training.feature_evaluation import Predictions
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.
@@ -40,6 +40,7 @@ def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
         "worst_group_auroc": min(by_group.values()),
         "tpr": rate(predictions.decision, table.hazards),
         "fpr": rate(predictions.decision, table.hazard_free),
+        "worst_group_fpr": worst_rate(predictions.decision, table.hazard_free, table.environments),
         "ece_raw": expected_calibration_error(score, hazards),
         "ece": expected_calibration_error(risk, hazards),
         "ece_floor": floor,

@@ -8,20 +8,22 @@ from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.training.feature_evaluation import Predictions, predict_with
-from worldstate.operations.training.site_references import with_site_references
+from worldstate.operations.training.site_references import Reference, inputs_under
 from worldstate.operations.training.window_calibration import MISS_RATES, WindowCalibration
 
 
-def predict_held_out(model: Model, table: FeatureTable, alpha: float) -> dict[float, Predictions]:
+def predict_held_out(
+    model: Model, table: FeatureTable, alpha: float, reference: Reference, rng: np.random.Generator
+) -> dict[float, Predictions]:
     """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does."""
-    # A model that compares windows with their site is given the reference from the site's other recordings.
     if model.domain is not None:
         # A table that does not say, as the released one, is OVAD's.
         check_tables(model.domain, table.domain or ovad_domain(table.environments.tolist()))
     check_unseen(model, table)
-    compares = isinstance(model.signature, EnsembleModel)
-    inputs = with_site_references(table).features if compares else table.features
-    probabilities = model.signature.predict_proba(inputs)
+    signature, inputs = model.signature, table.features
+    if isinstance(signature, EnsembleModel):
+        inputs = inputs_under(reference, table, rng)(signature, np.ones(len(table), dtype=np.bool_))
+    probabilities = signature.predict_proba(inputs)
     predictions = {}
     for miss_rate in MISS_RATES:
         policy = model.policies.for_alpha(alpha, miss_rate)
