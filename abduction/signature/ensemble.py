@@ -9,6 +9,7 @@ over experts and over the window and its mirror image, sides exchanged:
 so that mirroring the world exchanges left and right to the bit.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Annotated, ClassVar
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import finite_array, freeze_arrays
+from worldstate.ground.checks import finite_array, freeze_arrays, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via
 from worldstate.ground.typing import FloatArray
@@ -38,6 +39,8 @@ from .published_signature import (
 from .site_reference import KINDS, SiteReference, log_levels
 
 MOST_EXPERTS = 32
+# Where the training sites do not say.
+PRIOR_S = 10.0
 MIRRORED_CLASSES = [{LEFT: RIGHT, RIGHT: LEFT}.get(column, column) for column in range(len(CLASSES))]
 
 
@@ -56,6 +59,8 @@ class EnsembleModel:
     empty : ndarray, shape (features,)
         Mean log-levels of the training windows without any source: what a stream that is mostly empty is
         compared with, see `SiteEstimate`.
+    prior_s : float
+        Seconds of listening that weigh as much as the training sites: see `SiteEstimate`.
     domain : ModelDomain, optional
         What it was made for; `AcousticAdapter` refuses another array, rate or feature.
 
@@ -79,6 +84,7 @@ class EnsembleModel:
     home: Annotated[SiteReference, Via(FloatArray, attrgetter("row"), SiteReference.from_row)]
     empty: FloatArray
     domain: ModelDomain | None = field(default=None, metadata=ADDED)
+    prior_s: float = field(default=PRIOR_S, metadata=ADDED)
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
@@ -88,6 +94,7 @@ class EnsembleModel:
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
             raise InvalidArgumentError(f"home: expected {SEGMENTS} segments of 3 or more directions")
+        in_range("prior_s", self.prior_s, 0.0, math.inf, open_high=True)
         finite_array("home", self.home.row, (len(KINDS) * self.n_features,))
         views = expert_views(VIEWS, self.home.mean[None], self.home.row[None])
         for expert in self.experts:

@@ -10,9 +10,9 @@ from sklearn.linear_model import LogisticRegression
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.ground.typing import FloatArray, IndexArray, TextArray
 
-from .ensemble import MIRRORED_CLASSES, EnsembleModel
+from .ensemble import MIRRORED_CLASSES, PRIOR_S, EnsembleModel
 from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
 from .mirror import SEGMENTS, mirror_features
 from .published_signature import CLASSES, NONE
@@ -21,6 +21,8 @@ from .site_reference import KINDS, SiteReference
 from .standardisation import standardisation
 
 _ITERATIONS = 1000
+_WINDOW_S = 1.0
+_LONGEST = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ class SiteEnsembleClassifier:
     def __init__(self, recipes: Sequence[Recipe] = RECIPES) -> None:
         self.recipes = recipes
 
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         r"""Fit on windows with the references of their sites behind them, and class names.
 
         .. math:: \hat W_e, \hat b_e = \arg\min_{W, b} \Big[ \frac{\lambda_e}{2} \|W\|^2
@@ -81,6 +83,8 @@ class SiteEnsembleClassifier:
             Levels of each window, then mean, median and quiet reference of its site.
         y : array_like of str, shape (n,)
             front, left, none or right.
+        groups : array_like of str, shape (n,), optional
+            Names of sites, from which the model knows how fast a new one is to be learned.
 
         Returns
         -------
@@ -101,6 +105,7 @@ class SiteEnsembleClassifier:
         if inputs.shape[1] % (SEGMENTS * (1 + len(KINDS))):
             raise InvalidArgumentError(f"X: expected windows with a reference, got shape {inputs.shape}")
         codes = np.searchsorted(CLASSES, checked_labels(y, len(inputs)))
+        empty = codes == NONE
         levels, reference, codes = _with_mirror_images(*split_reference(inputs), codes)
         views = expert_views({recipe.view for recipe in self.recipes}, levels, reference)
         self.model_ = EnsembleModel(
@@ -108,6 +113,7 @@ class SiteEnsembleClassifier:
             np.bincount(codes) / codes.size,
             SiteReference.from_row(reference.mean(axis=0)),
             levels[codes == NONE].mean(axis=0),
+            prior_s=PRIOR_S if groups is None else _prior_s(inputs[empty], np.asarray(groups)[empty]),
         )
         return self
 
@@ -132,6 +138,28 @@ def _with_mirror_images(
         np.concatenate([reference, mirrored_reference]),
         np.concatenate([codes, np.array(MIRRORED_CLASSES)[codes]]),
     )
+
+
+def _prior_s(empty: FloatArray, sites: TextArray) -> float:
+    r"""Return the seconds of listening at which a site's own mean is as good as that of the training sites.
+
+    .. math:: h_0 = \Delta t\, \frac{\sigma_{within}^2}{\sigma_{between}^2}, \qquad
+              \sigma_{between}^2 = \mathrm{var}_s\, \bar x_s - \sigma_{within}^2 \langle 1 / n_s \rangle
+
+    for the patterns of empty windows, their mean level taken away, and windows of a second.
+
+    Shapes: empty (n, 4 * features), sites (n,).
+    """
+    levels = split_reference(empty)[0]
+    patterns = levels - levels.mean(axis=1, keepdims=True)
+    parts = [patterns[sites == site] for site in np.unique(sites)]
+    if len(parts) < 2 or min(map(len, parts)) < 2:
+        return PRIOR_S
+    within = float(np.mean([part.var(axis=0, ddof=1).mean() for part in parts]))
+    scatter = float(np.var([part.mean(axis=0) for part in parts], axis=0, ddof=1).mean())
+    between = scatter - within * float(np.mean([1.0 / len(part) for part in parts]))
+    # Sites that chance alone tells apart have nothing of their own to be learned.
+    return _WINDOW_S * within / max(between, within / _LONGEST)
 
 
 def _fit_expert(recipe: Recipe, seen: FloatArray, codes: IndexArray) -> Expert:

@@ -27,10 +27,10 @@ PLATT_FOLDS = 5
 class Classifier(Protocol):
     """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
 
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Learn from features (n, features) and class names (n,).
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Learn from features, class names and, where it takes notice of them, names of sites.
 
-        Shapes: X (n, features), y (n,).
+        Shapes: X (n, features), y, groups (n,).
         """
         ...
 
@@ -72,7 +72,7 @@ class PublishedClassifier:
         self.rng = rng
         self.penalty = penalty
 
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         r"""Fit on features, shape (n, features), and class names, shape (n,).
 
         .. math:: \min_{w, b} \tfrac12 \|w\|^2 + C \sum_n \max\big(0,\; 1 - y_n (w^T z_n + b)\big), \qquad
@@ -86,6 +86,8 @@ class PublishedClassifier:
             One row a window.
         y : array_like of str, shape (n,)
             Class names.
+        groups : array_like of str, shape (n,), optional
+            Names of sites; takes no notice of them.
 
         Returns
         -------

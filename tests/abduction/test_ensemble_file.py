@@ -74,7 +74,7 @@ def test_it_predicts_other_recordings_of_its_sites(model):
         table.features, table.labels, table.ids, table.environments,
         np.char.add("x", table.recordings), table.t0_frames,
     )  # fmt: skip
-    predictions = predict_held_out(model, other, alpha=0.05)[0.0]
+    predictions = predict_held_out(model, other, 0.05, "run", np.random.default_rng(0))[0.0]
     assert (predictions.classes == other.labels).mean() > 0.8
 
 

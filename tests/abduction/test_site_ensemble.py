@@ -71,6 +71,18 @@ def test_a_louder_site_with_its_own_reference_changes_nothing(seed, offset):
     np.testing.assert_allclose(model.predict_proba([louder]), model.predict_proba([x]), rtol=1e-9)
 
 
+@pytest.mark.parametrize(("between", "expected_s"), [(0.2, 25.0), (0.5, 4.0), (1.0, 1.0), (0.0, 60.0)])
+def test_the_more_sites_differ_the_faster_a_new_one_is_learned(between, expected_s):
+    # Scatter of 1 within a site: the pattern of n windows has 1 / n, that of the site `between` squared.
+    rng, sites = np.random.default_rng(7), np.repeat(np.arange(40), 24)
+    patterns = between * rng.normal(size=(40, 60))[sites] + rng.normal(size=(960, 60))
+    louder = 3.0 * rng.normal(size=(960, 1))
+    X = np.hstack([np.exp(patterns + louder), np.zeros((960, 180))])
+    y = np.tile(CLASSES, 240)
+    model = SiteEnsembleClassifier((Recipe("mean", 1.0),)).fit(X, y, sites.astype(str)).model_
+    assert model.prior_s == pytest.approx(expected_s, rel=0.3)
+
+
 def test_the_reference_of_another_site_matters(trained):
     X, _, model = trained
     moved = model.at_site(model.home.shifted(np.full(60, 0.5)))

@@ -1,6 +1,7 @@
 """Learning a site while running: what the mean is, what it may not do, what it does on real windows."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,9 +66,9 @@ def test_nothing_heard_changes_nothing_and_an_empty_training_site_neither(model)
 def test_some_of_the_level_and_all_of_the_pattern_are_carried_over(model, level, seed):
     pattern = np.random.default_rng(seed).normal(size=60)
     pattern -= pattern.mean()
-    settings = SiteEstimateSettings(prior_s=0.0, level_gain=0.5)
+    settings = SiteEstimateSettings(level_gain=0.5)
     estimate = SiteEstimate(model.empty + level + pattern, heard_s=10.0)
-    shift = estimate.reference(model, settings).row - model.home.row
+    shift = estimate.reference(replace(model, prior_s=0.0), settings).row - model.home.row
     np.testing.assert_allclose(shift, np.tile(0.5 * level + pattern, 3), atol=1e-9)
 
 
@@ -123,8 +124,8 @@ def stream_of(table, here, rng, hops=600):
 
 def rates(table, prepared, train, here, rng):
     """Decisions on a stream, site learned and not, at a threshold from windows out of fold; and labels."""
-    model = SiteEnsembleClassifier().fit(prepared.features[train], prepared.labels[train]).model_
     known = prepared.select(train)
+    model = SiteEnsembleClassifier().fit(known.features, known.labels, known.environments).model_
     inner = out_of_fold(known, folds_by_recording(known, rng), site_ensemble, rng)
     gamma = neyman_pearson_threshold(list(hazard_statistic(inner, 0.0)[known.hazard_free][:, None]), 0.02)
     estimate, decisions = SiteEstimate.start(60), []

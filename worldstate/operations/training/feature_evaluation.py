@@ -180,7 +180,7 @@ def _plainly(table: FeatureTable) -> Ask:
 
 
 def _trained(make: MakeClassifier, table: FeatureTable, rng: np.random.Generator) -> Classifier:
-    return make(rng).fit(table.features, table.labels)
+    return make(rng).fit(table.features, table.labels, table.environments)
 
 
 def _calibration(

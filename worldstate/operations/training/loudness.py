@@ -19,7 +19,7 @@ class LoudestDirection:
     array([[0.  , 0.25, 0.5 , 0.25]])
     """
 
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Do nothing."""
         return self
 

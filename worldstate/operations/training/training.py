@@ -164,7 +164,7 @@ def _domain(table: FeatureTable) -> ModelDomain | None:
 def fit_signature(inputs: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> AnySignature:
     """Fit the classifier of a method."""
     if method == "worldstate":
-        return SiteEnsembleClassifier().fit(inputs.features, inputs.labels).model_
+        return SiteEnsembleClassifier().fit(inputs.features, inputs.labels, inputs.environments).model_
     return PublishedClassifier(rng).fit(inputs.features, inputs.labels).model_
 
 
