@@ -40,7 +40,7 @@ def test_every_row_of_the_table_is_there(smoke):
     assert set(TABLE_ONE) <= set(report["protocols"]["static"])
     assert set(report["protocols"]) == {"static", "junctions_fixed", "junctions_retrained"}
     assert "dynamic" in report["lacking"] and "moving ego" in report["lacking"]["dynamic"]
-    assert "simulated" in report["data"]
+    assert "SIMULATED" in report["data"]
     # Two recordings of either kind say nothing, and the report says that.
     assert len(report["cautions"]["static"]) == 2
 

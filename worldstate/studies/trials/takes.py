@@ -72,8 +72,9 @@ class TakeList:
     @property
     def origin(self) -> str:
         """What was evaluated, for the first line of the report."""
+        kind = "SIMULATED streets" if self.simulated else "Recordings given"
         split = ", official test recordings" if self.official else ""
-        return f"folder {self.root.name}{split}"
+        return f"{kind}, folder {self.root.name}{split}"
 
 
 def find_takes(

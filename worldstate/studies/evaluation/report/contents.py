@@ -33,7 +33,6 @@ def evaluation_document(
         | ({} if signatures is None else study.signature_values(signatures)),
     )
     panels = () if found.degradation is None else awareness_figures(found.degradation)
-    data = "SIMULATED streets" if found.takes.simulated else "Recordings that were given"
     static = STATIC.name in found.runs
     sections = [
         _data_section(found, values),
@@ -52,8 +51,7 @@ def evaluation_document(
     ]
     return Document(
         "Evaluation of hidden-hazard warnings from sound",
-        f"{data}: {found.takes.origin}, {len(found.trials)} recordings, {_hours(found):.3f} h of them "
-        "hazard-free.",
+        f"{found.takes.origin}: {len(found.trials)} recordings, {_hours(found):.3f} h of them hazard-free.",
         tuple(sections),
         (*_facts(found), *configuration),
     )
