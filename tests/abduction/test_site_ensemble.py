@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from scipy.special import log_softmax
 
 from worldstate.abduction.signature.ensemble import MIRRORED_CLASSES, EnsembleModel
-from worldstate.abduction.signature.ensemble_training import RECIPES, Recipe, SiteEnsembleClassifier
+from worldstate.abduction.signature.ensemble_training import (
+    RECIPES,
+    Recipe,
+    SimulatedWindows,
+    SiteEnsembleClassifier,
+)
 from worldstate.abduction.signature.expert import VIEWS, expert_views
 from worldstate.abduction.signature.mirror import mirror_features
 from worldstate.abduction.signature.pattern_features import shape_features
@@ -47,8 +52,12 @@ def mirrored(X):
     return mirror_features(X, X.shape[1] // 30)
 
 
-def test_mirroring_the_world_exchanges_the_sides(trained):
+@pytest.mark.parametrize("helped", [False, True])
+def test_mirroring_the_world_exchanges_the_sides(trained, helped):
     model = trained[2]
+    if helped:
+        more = simulated(np.random.default_rng(10), ["SA1"])
+        model = SiteEnsembleClassifier(simulated=more).fit(*trained[:2], ["SA1"] * len(trained[1])).model_
     X, _ = windows(np.random.default_rng(2))
     np.testing.assert_array_equal(
         model.predict_proba(mirrored(X))[:, MIRRORED_CLASSES], model.predict_proba(X)
@@ -81,6 +90,45 @@ def test_the_more_sites_differ_the_faster_a_new_one_is_learned(between, expected
     y = np.tile(CLASSES, 240)
     model = SiteEnsembleClassifier((Recipe("mean", 1.0),)).fit(X, y, sites.astype(str)).model_
     assert model.prior_s == pytest.approx(expected_s, rel=0.3)
+
+
+def simulated(rng, sites):
+    X, y = windows(rng)
+    return SimulatedWindows(X, y, rng.choice(sites, len(y)))
+
+
+def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too():
+    rng = np.random.default_rng(8)
+    X, y = windows(rng)
+    groups, everywhere = np.tile(["SA1", "SA2"], 100), simulated(rng, ["SA1", "SA2", "SB1"])
+    chosen = np.isin(everywhere.sites, ["SA1", "SA2"])
+    here = SimulatedWindows(everywhere.X[chosen], everywhere.y[chosen], everywhere.sites[chosen])
+    with_all, with_some, without = (
+        SiteEnsembleClassifier(simulated=some).fit(X, y, groups).model_ for some in (everywhere, here, None)
+    )
+    assert encode(with_all) == encode(with_some)
+    assert np.abs(with_all.predict_proba(X) - without.predict_proba(X)).max() > 0.01
+    # What stands in for a site, and how fast one is learned, is of real windows alone.
+    np.testing.assert_array_equal(with_all.home.row, without.home.row)
+    assert with_all.prior_s == without.prior_s
+
+
+def test_a_quarter_of_a_simulated_hazard_says_the_other_side():
+    # Three windows of one pattern, of which real ones say nothing: the posterior is the share, by weight.
+    rng, n = np.random.default_rng(9), 300
+    X, y = windows(rng, n)
+    X, sites = X[y != "left"], np.repeat("SA1", n - n // 4)
+    left = np.tile(np.hstack([np.full(60, 50.0), np.zeros(180)]), (n, 1))
+    rest = np.tile(np.hstack([np.full(60, 1.0), np.zeros(180)]), (2, 1))
+    labels = np.concatenate([np.repeat("left", n), ["front", "none"]])
+    more = SimulatedWindows(np.concatenate([left, rest]), labels, np.repeat("SA1", n + 2))
+    model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
+    assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.5, 0.5], abs=0.02)
+    # Both sides are as likely since the pattern is its own mirror image; of another the share is seen.
+    left[:, :20] = 400.0
+    more = SimulatedWindows(np.concatenate([left, rest]), labels, more.sites)
+    model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
+    assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.75, 0.25], abs=0.05)
 
 
 def test_the_reference_of_another_site_matters(trained):

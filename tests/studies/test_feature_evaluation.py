@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
-from worldstate.adapters.files.model_file import load_model
+from worldstate.adapters.files.model_file import load_model, read_model
 from worldstate.cli.main import execute
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.operations.training.feature_evaluation import cross_validate
@@ -157,6 +157,13 @@ def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_
 def test_what_ships_is_what_train_makes_if_nothing_else_is_asked_for(csv_path, tmp_path):
     assert command("train", csv_path, "--out", tmp_path / "m") == 0
     assert type(load_model(tmp_path / "m")[0]) is type(load_model(None)[0])
+
+
+def test_simulated_windows_are_learned_too_and_the_card_says_so(tmp_path):
+    table = made_up_table(recordings=30)
+    real, more = (write_csv(tmp_path / name, table) for name in ("real.csv", "more.csv"))
+    assert command("train", real, "--simulated", more, more, "--out", tmp_path / "m") == 0
+    assert f"{2 * len(table)} simulated" in read_model(tmp_path / "m").provenance.classifier
 
 
 def test_a_site_with_one_recording_is_told_what_else_to_use(csv_path, tmp_path):

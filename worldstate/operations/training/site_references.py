@@ -1,12 +1,13 @@
 """What windows are compared with: curated windows of their site, a stream heard before, or nothing."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import FeatureTable
@@ -34,6 +35,13 @@ def with_site_references(table: FeatureTable) -> FeatureTable:
     for mine, others in _recordings(table):
         references[mine] = site_reference(levels[others]).row
     return replace(table, features=np.hstack([table.features, references]))
+
+
+def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
+    """Return simulated windows as the ensemble learns them: those of a table compared with its own."""
+    parts = [with_site_references(table) for table in tables]
+    columns = ("features", "labels", "environments")
+    return SimulatedWindows(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
 def inputs_under(reference: Reference, table: FeatureTable, rng: np.random.Generator) -> Inputs:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
-from worldstate.abduction.signature.ensemble_training import RECIPES, SiteEnsembleClassifier
+from worldstate.abduction.signature.ensemble_training import RECIPES, SimulatedWindows, SiteEnsembleClassifier
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
@@ -19,7 +19,7 @@ from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 
-from .feature_evaluation import out_of_fold
+from .feature_evaluation import MakeClassifier, out_of_fold
 from .methods import method_of
 from .splits import N_FOLDS, folds_by_recording, junction_folds
 from .window_calibration import (
@@ -80,6 +80,7 @@ def train_model(
     dataset: str,
     group: Group,
     excluded_lists: Sequence[str] = (),
+    simulated: SimulatedWindows | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
     """Train a classifier and calibrate its cueing.
@@ -92,6 +93,8 @@ def train_model(
         Seed, repeats, sustained rule, budgets.
     dataset, group, excluded_lists : str, str, sequence of str
         For the provenance.
+    simulated : SimulatedWindows, optional
+        Learned by the ensemble beside the table.
     on_step : callable
         Called after each cross-validation and after the last fit.
 
@@ -119,14 +122,14 @@ def train_model(
     (('front', 'left', 'none', 'right'), 'made up')
     """
     rng = np.random.default_rng(settings.seed)
-    inputs = method_of(settings.method).prepare(table)
-    levels = _out_of_fold_levels(table, inputs, settings, rng, on_step)
-    signature = replace(fit_signature(inputs, settings.method, rng), domain=_domain(table))
+    inputs, make = method_of(settings.method).prepare(table), method_of(settings.method, simulated).make
+    levels = _out_of_fold_levels(table, inputs, make, settings, rng, on_step)
+    signature = replace(fit_signature(inputs, settings.method, rng, simulated), domain=_domain(table))
     on_step()
     provenance = Provenance(
         dataset=dataset,
         group=group,
-        classifier=ENSEMBLE if settings.method == "worldstate" else CLASSIFIER,
+        classifier=_classifier(settings.method, simulated),
         scikit_learn=version("scikit-learn"),
         seed=settings.seed,
         training_recordings=tuple(np.unique(table.recording_keys).tolist()),
@@ -136,15 +139,21 @@ def train_model(
     return Model(signature, _policies(table, signature, levels, settings), provenance)
 
 
+def _classifier(method: TrainingMethod, simulated: SimulatedWindows | None) -> str:
+    if method != "worldstate":
+        return CLASSIFIER
+    return ENSEMBLE if simulated is None else f"{ENSEMBLE}; {len(simulated.y)} simulated windows too"
+
+
 def _out_of_fold_levels(
     table: FeatureTable,
     inputs: FeatureTable,
+    make: MakeClassifier,
     settings: TrainingSettings,
     rng: np.random.Generator,
     on_step: Callable[[], None],
 ) -> list[list[FloatArray]]:
     """Posteriors of windows not trained on, from the most careful folds to the boldest: see `between`."""
-    make = method_of(settings.method).make
     passes = []
     for _ in range(settings.repeats):
         passes.append(out_of_fold(inputs, folds_by_recording(table, rng), make, rng))
@@ -161,10 +170,19 @@ def _domain(table: FeatureTable) -> ModelDomain | None:
     return replace(table.domain, ego_motion=ego_motion_of(np.unique(table.environments).tolist()))
 
 
-def fit_signature(inputs: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> AnySignature:
+def fit_signature(
+    inputs: FeatureTable,
+    method: TrainingMethod,
+    rng: np.random.Generator,
+    simulated: SimulatedWindows | None = None,
+) -> AnySignature:
     """Fit the classifier of a method."""
     if method == "worldstate":
-        return SiteEnsembleClassifier().fit(inputs.features, inputs.labels, inputs.environments).model_
+        return (
+            SiteEnsembleClassifier(simulated=simulated)
+            .fit(inputs.features, inputs.labels, inputs.environments)
+            .model_
+        )
     return PublishedClassifier(rng).fit(inputs.features, inputs.labels).model_
 
 

@@ -7,11 +7,12 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy.special import bdtrc
 
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.recording_draws import DRAWS, FigureDraws
 from worldstate.operations.training.feature_evaluation import Predictions
-from worldstate.operations.training.methods import METHODS, ROWS, Passes, evaluate_pass
+from worldstate.operations.training.methods import ROWS, Passes, evaluate_pass, methods
 from worldstate.operations.training.splits import Protocol
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 
@@ -23,23 +24,25 @@ BOOTSTRAP_SEED = 0
 
 
 def run_passes(
-    methods: Sequence[str],
+    names: Sequence[str],
     table: FeatureTable,
     protocol: Protocol,
     *,
     seeds: int,
     alpha: float,
     train: FeatureTable | None = None,
+    simulated: SimulatedWindows | None = None,
     jobs: int = 1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> dict[str, Passes]:
     """Run every seed of every method; the outcome does not depend on the number of jobs."""
-    tasks = [(name, seed) for name in methods for seed in range(seeds)]
+    known = methods(simulated)
+    tasks = [(name, seed) for name in names for seed in range(seeds)]
     run = delayed(evaluate_pass)
     outcomes = Parallel(n_jobs=jobs, return_as="generator")(
-        run(METHODS[name], table, protocol, seed=seed, alpha=alpha, train=train) for name, seed in tasks
+        run(known[name], table, protocol, seed=seed, alpha=alpha, train=train) for name, seed in tasks
     )
-    passes: dict[str, Passes] = {name: [] for name in methods}
+    passes: dict[str, Passes] = {name: [] for name in names}
     for (name, _), outcome in zip(tasks, outcomes, strict=True):
         passes[name].append(outcome)
         on_pass()
