@@ -10,6 +10,7 @@ from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.adapters.simulation.sound.static_field import (
     StaticSources,
+    azimuths_all_round,
     plane_wave_delays,
     unit_vectors,
 )
@@ -42,7 +43,7 @@ def add_rain(
     to_drops, to_street = rng.spawn(2)
     for channel, draws in zip(static.out, to_drops.spawn(len(static.out)), strict=True):
         channel += swell * _drumming(samples, rate, draws) * np.float32(level * np.sqrt(1.0 - FAR_SHARE))
-    azimuth = 2.0 * np.pi * (np.arange(FAR_WAVES) + to_street.random()) / FAR_WAVES
+    azimuth = azimuths_all_round(FAR_WAVES, to_street)
     waves = np.stack([octave_noise(FAR_DB, samples, rate, to_street) for _ in azimuth]).astype(np.float32)
     waves *= swell * np.float32(level * np.sqrt(FAR_SHARE / FAR_WAVES) / _hiss_pressure())
     offsets = receiver.positions_m - receiver.centre_m

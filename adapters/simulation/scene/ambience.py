@@ -16,9 +16,8 @@ from .presets import Preset
 OPENINGS = ("left", "right", "ahead", "behind")
 # Neighbouring octaves of traffic noise rise and fall together: a tilt, and little beside it.
 TILT_DB_PER_OCTAVE, OCTAVE_SPREAD_DB = 0.7, 0.7
-OVER_THE_WALL_DB = (
-    -8.0
-)  # a facade opposite, two or three floors high, leaves so much of what comes from ahead
+# So much of what comes from ahead a facade opposite, two or three floors high, leaves.
+OVER_THE_WALL_DB = -8.0
 # Between walls hardly, on an open corner much: levels of the released windows of SB1, hidden and in front
 # alike, spread three times as far as those of SA1 and SB2. The logarithm is drawn evenly.
 GUSTINESS = (0.13, 2.5)

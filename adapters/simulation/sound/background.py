@@ -24,7 +24,7 @@ from worldstate.ground.typing import Float32Array, FloatArray
 
 from .paths import trace_paths
 from .receiver import Receiver
-from .static_field import plane_wave_delays, unit_vectors
+from .static_field import azimuths_all_round, plane_wave_delays, unit_vectors
 from .wave_field import BlockGrid, WaveField
 
 ELEVATION_RAD = 0.25  # traffic between buildings is heard from near the horizon
@@ -61,7 +61,7 @@ def add_background(
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
     if here is None:
         here = recording_ambience(site_ambience(site, preset), preset, rng)
-    azimuth = 2.0 * np.pi * (np.arange(preset.ambient_waves) + rng.random()) / preset.ambient_waves
+    azimuth = azimuths_all_round(preset.ambient_waves, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
     directions, offsets = unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m
     wind = wind_density(preset.wind_100hz_db + here.wind_db, grid.frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)

@@ -36,7 +36,7 @@ from worldstate.ground.typing import Float32Array, FloatArray
 from .background import noise_frequencies, shaped_noise, wind_density
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from .receiver import Receiver
-from .static_field import StaticSources, plane_wave_delays, unit_vectors
+from .static_field import StaticSources, azimuths_all_round, plane_wave_delays, unit_vectors
 from .wave_field import BlockGrid, WaveField
 
 # Places in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
@@ -147,7 +147,7 @@ def add_ego_echo(
     power = np.sum([_pressure_pa(level) ** 2 for level in levels], axis=0)
     loudness = power[:, :-1].sum(axis=0) / power[:, -1].sum()
     octaves_db = 10.0 * np.log10(power[:, -1] * echo_gain(site) / REFERENCE_PA**2)
-    azimuth = 2.0 * np.pi * (np.arange(ECHO_WAVES) + rng.random()) / ECHO_WAVES
+    azimuth = azimuths_all_round(ECHO_WAVES, rng)
     offsets = receiver.positions_m - receiver.centre_m
     field = WaveField(
         grid,

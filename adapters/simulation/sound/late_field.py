@@ -12,7 +12,7 @@ from worldstate.ground.typing import Float32Array, FloatArray
 
 from .delay import KNOT_SAMPLES
 from .receiver import Receiver
-from .static_field import StaticSources, plane_wave_delays, unit_vectors
+from .static_field import StaticSources, azimuths_all_round, plane_wave_delays, unit_vectors
 
 DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
@@ -34,7 +34,7 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
     # Between walls and under an open sky late sound is near the horizon; it comes in by the mouth and from
     # what stands there, so that a site has late directions of its own, ahead.
     rng = site_generator(site.name, "late")
-    azimuth = 2.0 * np.pi * (np.arange(DIRECTIONS) + rng.random()) / DIRECTIONS
+    azimuth = azimuths_all_round(DIRECTIONS, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, DIRECTIONS))
     centres, weights = rng.uniform(-LOBE_SPAN_RAD, LOBE_SPAN_RAD, LOBES), rng.dirichlet(np.full(LOBES, 3.0))
     lobes = np.exp(LOBE_CONCENTRATION * (np.cos(azimuth[:, None] - centres) - 1.0))

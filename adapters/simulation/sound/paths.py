@@ -51,9 +51,8 @@ class ReceiverImage:
     offset_m: float
     gain: float
     order: int = 0
-    walls: tuple[
-        tuple[int, float], ...
-    ] = ()  # The walls met, LEFT or RIGHT, and where, unfolded, outwards in
+    # The walls met, LEFT or RIGHT, and where each lies in the unfolded street, the nearest first.
+    walls: tuple[tuple[int, float], ...] = ()
 
     def mirror(self, y_m: FloatArray) -> FloatArray:
         """Lateral positions in the unfolded street."""

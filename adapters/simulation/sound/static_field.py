@@ -30,6 +30,11 @@ def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArr
     return -(directions @ offsets_m.T) / SPEED_OF_SOUND_MPS
 
 
+def azimuths_all_round(count: int, rng: np.random.Generator) -> FloatArray:
+    """Draw evenly spaced azimuths, the first of them anywhere within a step."""
+    return np.asarray(2.0 * np.pi * (np.arange(count) + rng.random()) / count)
+
+
 def unit_vectors(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
     """Directions in `base_link`, shape (Q, 3)."""
     flat = np.cos(elevation_rad)
