@@ -11,10 +11,11 @@ from worldstate.adapters.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.adapters.simulation.scene.presets import Preset
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
+from worldstate.ground.typing import FloatArray
 
 from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
 from .settings import StreamSettings
-from .traffic import Traffic
+from .traffic import HAZARDS, Traffic
 
 HEADWAY_S = (1.5, 4.0)
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
@@ -59,21 +60,34 @@ def draw_events(
     """Draw all vehicles of a stream, in the order in which they come into earshot."""
     # A generator a flow: another rate of one of them leaves the others as they are.
     flows = dict(zip(MANOEUVRES, rng.spawn(len(MANOEUVRES)), strict=True))
+    turns = _turns(traffic, duration_s, rng) if traffic.evenly else {}
     events: list[VehicleEvent] = []
     for flow, own in flows.items():
-        number = own.poisson(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0)
-        for arrival_s, one in zip(
-            np.sort(own.uniform(0.0, duration_s, number)), own.spawn(number), strict=True
-        ):
+        times_s = turns.get(flow)
+        if times_s is None:
+            number = own.poisson(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0)
+            times_s = np.sort(own.uniform(0.0, duration_s, number))
+        for arrival_s, one in zip(times_s, own.spawn(len(times_s)), strict=True):
             events += _arrival(flow, float(arrival_s), site, traffic, preset, one)
     inside = [event for event in events if event.start_s < duration_s and event.end_s > 0.0]
     return sorted(inside, key=lambda event: event.start_s)
 
 
+def _turns(traffic: Traffic, duration_s: float, rng: np.random.Generator) -> dict[str, FloatArray]:
+    """Deal equal stretches of time to the hazards, and draw the middle half of each to arrive in."""
+    counts = {flow: round(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0) for flow in HAZARDS}
+    order = rng.permutation(np.repeat(list(counts), list(counts.values())))
+    middle = np.arange(len(order)) + rng.uniform(0.25, 0.75, len(order))
+    return {flow: middle[order == flow] * duration_s / max(len(order), 1) for flow in counts}
+
+
 def _arrival(
     flow: str, arrival_s: float, site: Site, traffic: Traffic, preset: Preset, rng: np.random.Generator
 ) -> Iterator[VehicleEvent]:
-    for arm in {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}.get(flow, (None,)):
+    arms = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
+    if flow == "queue":
+        arms[flow] = ((LEFT,), (RIGHT,))[rng.integers(2)]
+    for arm in arms.get(flow, (None,)):
         kind = _kind(traffic, rng)
         # Nobody hears a bicycle two streets away.
         heard = vehicle_kind("light") if flow == "far" and kind.name == "bicycle" else kind
@@ -87,8 +101,9 @@ def _arrival(
         if arm is None:
             continue
         last = leader
-        for _ in range(LONGEST_QUEUE):
-            if rng.random() >= traffic.follower_share:
+        for number in range(LONGEST_QUEUE):
+            another = number == 0 if flow == "queue" else rng.random() < traffic.follower_share
+            if not another:
                 break
             # Who follows on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
             kind = leader.motion.kind if rng.random() < 0.5 else vehicle_kind("light")

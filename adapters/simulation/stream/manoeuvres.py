@@ -168,6 +168,7 @@ MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
     "far": passes_far,
     "from_behind": from_behind,
     "from_ahead": from_ahead,
+    "queue": emerges,
 }
 
 

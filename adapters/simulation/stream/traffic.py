@@ -8,8 +8,8 @@ from worldstate.adapters.simulation.scene.sound_kinds import SIGNALS, sound_kind
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 
-# What a flow is, is drawn in `manoeuvres.py`; the first four bring vehicles out of a hidden arm.
-HAZARDS = ("left", "right", "both", "waits")
+# What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
+HAZARDS = ("left", "right", "both", "waits", "queue")
 FLOWS = (*HAZARDS, "turns_away", "parks", "far", "from_behind", "from_ahead")
 MOST_PER_HOUR = 3600.0
 # Cars, delivery vans and lorries, electric cars, bicycles and kick scooters of a side street; assumed, not
@@ -22,11 +22,12 @@ TOWN_KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Arrivals an hour of every flow, each a Poisson process of its own."""
+    """Arrivals an hour of every flow, each a Poisson process of its own unless hazards are evenly spaced."""
 
     name: str
     per_hour: Mapping[str, float]  # Of each of `FLOWS`; those not named never come
     follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has another one behind it
+    evenly: bool = False  # Whether arrivals out of hidden arms take turns instead of meeting by chance
     kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normed
     sounds: Mapping[str, float] = field(default_factory=dict)  # What else sounds, by kind, an hour
     signals: Mapping[str, float] = field(default_factory=dict)  # Shares of the vehicles that warn, by signal
@@ -69,6 +70,13 @@ TRAFFICS = {
             follower_share=0.15,
         ),
         Traffic("busy", {"left": 45, "right": 45, "both": 8, "waits": 10} | _OTHERS, follower_share=0.3),
+        # One hazard after another, what an exam of approaches asks for: of 36 in 14.4 minutes twenty come
+        # alone, ten from both sides at once and six with another one behind them.
+        Traffic(
+            "approaches",
+            {"left": 125 / 3, "right": 125 / 3, "both": 125 / 3, "queue": 25} | _OTHERS,
+            evenly=True,
+        ),
         Traffic("no-hazard", _OTHERS),
         Traffic("empty", {}),
     )

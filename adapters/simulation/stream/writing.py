@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 from worldstate.adapters.datasets.ovad_layout import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
-from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.dataset.recording_folder import (
     put_in_place,
     refuse_foreign,
@@ -23,10 +20,9 @@ from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
-from .ambience import stream_ambience
-from .arrivals import SoundEvent, draw_events, draw_sounds
-from .microphones import draw_microphones
-from .rendering import Block, StreamScene, render_blocks
+from .arrivals import SoundEvent
+from .drawn_stream import DrawnStream, draw_stream
+from .rendering import Block
 from .settings import StreamSettings
 from .sight import detected_frames
 from .spectrogram import Spectrogram
@@ -37,10 +33,9 @@ from .truth import (
     describe_events,
     describe_stream,
     rows_csv,
-    vehicle_truth,
 )
 
-ARRIVALS, CHANNELS, LEVEL, CAMERA, SOUNDS = 0, 1, 2, 5, 6  # purposes of generators; 3 and 4 are the pieces'
+CAMERA = 5  # purpose of a generator; the others are the drawn stream's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,69 +101,50 @@ def write_stream(
     ('SB1-calm-1', 36007)
     """
     in_range("jobs", jobs, 1, 256)
-    folder, listening = Path(root), ovad_array() if array is None else array
+    folder = Path(root)
     target = folder / f"{settings.site.name}-{settings.traffic.name}-{settings.seed}"
     refuse_foreign(target)
     folder.mkdir(parents=True, exist_ok=True)
-    scene = StreamScene(
-        settings,
-        stream_ambience(settings, settings.generator(LEVEL)),
-        draw_microphones(settings, listening, settings.generator(CHANNELS)),
-    )
-    events = draw_events(
-        settings.site, settings.traffic, settings.preset, settings.duration_s, settings.generator(ARRIVALS)
-    )
-    vehicles = tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events))
-    sounds = draw_sounds(settings, listening.n_microphones, settings.generator(SOUNDS))
+    stream = draw_stream(settings, ovad_array() if array is None else array)
     heard = Spectrogram(settings.sample_rate_hz)
     # Beside the target, on the same disk, so that the whole stream takes its name in one step.
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
         temporary = Path(hidden) / target.name
         temporary.mkdir()
-        with closing(render_blocks(scene, [*events, *sounds], jobs)) as blocks:
-            loudness = _write_sound(temporary / AUDIO_NAME, scene, blocks, heard, progress)
-        write_array_xml(temporary / ARRAY_NAME, listening)
-        _write_beside(temporary, settings, vehicles, sounds, loudness)
+        with closing(stream.blocks(jobs)) as blocks:
+            loudness = _write_sound(temporary / AUDIO_NAME, stream, blocks, heard, progress)
+        write_array_xml(temporary / ARRAY_NAME, stream.array)
+        _write_beside(temporary, stream, loudness)
         put_in_place(target, temporary)
-    return WrittenStream(target, settings, vehicles, tuple(sounds), heard)
+    return WrittenStream(target, settings, stream.vehicles, stream.sounds, heard)
 
 
 def _write_sound(
     path: Path,
-    scene: StreamScene,
+    stream: DrawnStream,
     blocks: Iterator[Block],
     heard: Spectrogram,
     progress: Callable[[float], None] | None,
 ) -> dict[int, FloatArray]:
     """Write the blocks as they come; return the loudness of all events."""
-    microphones, rate = scene.microphones, scene.settings.sample_rate_hz
-    channels = len(microphones.positions_m)
-    # Gains are the converters': they come after everything that sounds, and are in no level of the truth.
-    gains = (microphones.gains / FULL_SCALE_PA).astype(np.float32)[:, None]
-    middle = int(
-        np.linalg.norm(microphones.positions_m - microphones.positions_m.mean(axis=0), axis=1).argmin()
-    )
+    microphones, settings = stream.scene.microphones, stream.scene.settings
+    channels, rate = len(microphones.positions_m), settings.sample_rate_hz
     loudness: dict[int, FloatArray] = {}
-    with sound_writer(path, scene.settings.samples, channels, rate) as file:
+    with sound_writer(path, settings.samples, channels, rate) as file:
         for block in blocks:
-            file.write(np.clip(block.pressure_pa * gains, -1.0, 1.0).T)
-            heard.add(block.pressure_pa[middle])
+            file.write(stream.recorded(block))
+            heard.add(block.pressure_pa[microphones.middle])
             loudness |= block.loudness_db
             if progress is not None:
                 progress(block.pressure_pa.shape[1] / rate)
     return loudness
 
 
-def _write_beside(
-    folder: Path,
-    settings: StreamSettings,
-    vehicles: tuple[VehicleTruth, ...],
-    sounds: list[SoundEvent],
-    loudness: dict[int, FloatArray],
-) -> None:
+def _write_beside(folder: Path, stream: DrawnStream, loudness: dict[int, FloatArray]) -> None:
+    settings, vehicles = stream.scene.settings, stream.vehicles
     events = [one.event for one in vehicles]
-    frames = detected_frames(settings, events, sounds, settings.generator(CAMERA))
+    frames = detected_frames(settings, events, stream.sounds, settings.generator(CAMERA))
     write_json(folder / DETECTION_NAMES[0], to_json(frames))
     write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
-    write_json(folder / EVENTS_NAME, describe_events(vehicles, sounds, loudness))
+    write_json(folder / EVENTS_NAME, describe_events(vehicles, stream.sounds, loudness))
     (folder / ROWS_NAME).write_text(rows_csv(vehicles, loudness), encoding="utf-8", newline="\n")

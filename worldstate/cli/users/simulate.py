@@ -53,7 +53,7 @@ SOUNDS = (
 )
 PRESETS = ("street-6", "street-6-calm")
 STREAM_SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")
-TRAFFICS = ("calm", "busy", "no-hazard", "empty")
+TRAFFICS = ("calm", "busy", "approaches", "no-hazard", "empty")
 FIGURE_NAME = "stream.png"
 PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
 SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds

@@ -1,0 +1,1 @@
+"""Models for an array of one's own: streets simulated, listened to, learned from and examined."""
