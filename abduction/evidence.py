@@ -9,6 +9,34 @@ from worldstate.ground.errors import InvalidArgumentError
 
 
 @dataclass(frozen=True, slots=True)
+class SideEvidence:
+    r"""What one window says of each side by itself: a vehicle on one leaves the other open.
+
+    Parameters
+    ----------
+    directions : tuple of str
+        Labels of the sides.
+    log_ratios : tuple of float
+        By side, log-likelihood of a vehicle hidden there above that of one in view or none, nats; 0 and less
+        where nothing speaks for it.
+    both : float
+        Posterior of hidden vehicles on both sides at the training prior.
+    direct : float
+        Posterior of a source in the open, whose bearing says where it is: no side is named then.
+
+    Examples
+    --------
+    >>> SideEvidence(("left", "right"), (2.5, -1.0), 0.02, 0.01).log_ratios[0]
+    2.5
+    """
+
+    directions: tuple[str, ...]
+    log_ratios: tuple[float, ...]
+    both: float
+    direct: float
+
+
+@dataclass(frozen=True, slots=True)
 class SignatureEvidence:
     r"""Log-likelihoods of one observation under every explanation, up to a common constant.
 
@@ -28,6 +56,8 @@ class SignatureEvidence:
         log l_vis, nats.
     none : float
         log l_0, nats.
+    sides : SideEvidence, optional
+        Each side by itself, where the model tells.
 
     Raises
     ------
@@ -44,6 +74,7 @@ class SignatureEvidence:
     hidden: tuple[float, ...]
     visible: float
     none: float
+    sides: SideEvidence | None = None
 
     def __post_init__(self) -> None:
         if not self.directions or len(set(self.directions)) != len(self.directions):

@@ -6,7 +6,8 @@ over experts and over the window and its mirror image, sides exchanged:
 .. math:: \log P(c \mid x) \propto \tfrac{1}{2 E} \sum_e \big[ \ell_e(c, x) + \ell_e(\bar c, \bar x) \big],
           \qquad \ell_e = \log \mathrm{softmax}\, \big( W_e (v_e(x) - \mu_e) / \sigma_e + b_e \big),
 
-so that mirroring the world exchanges left and right to the bit.
+so that mirroring the world exchanges left and right to the bit. Both and direct, where a model knows them,
+are their own mirror images: see `window_classes`.
 """
 
 import math
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.ground.checks import finite_array, freeze_arrays, in_range
+from worldstate.ground.checks import check_shape, finite_array, freeze_arrays, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Via
 from worldstate.ground.typing import FloatArray
@@ -31,17 +32,14 @@ from .published_signature import (
     CLASSES,
     DIRECTIONS,
     EXPLANATION_COLUMNS,
-    LEFT,
-    RIGHT,
-    evidence_of,
     explanation_ratios,
 )
 from .site_reference import KINDS, SiteReference, log_levels
+from .window_classes import checked_classes, explained, mirrored_classes, window_evidence
 
 MOST_EXPERTS = 32
 # Where the training sites do not say.
 PRIOR_S = 10.0
-MIRRORED_CLASSES = [{LEFT: RIGHT, RIGHT: LEFT}.get(column, column) for column in range(len(CLASSES))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,22 +50,25 @@ class EnsembleModel:
     ----------
     experts : tuple of Expert
         At least one.
-    class_prior : ndarray, shape (4,)
+    class_prior : ndarray, shape (classes,)
         Class frequencies of the training set, mirrored rows included.
     home : SiteReference
         Mean reference of the training sites, mirrored ones included: stands in where no site is known.
     empty : ndarray, shape (features,)
         Mean log-levels of the training windows without any source: what a stream that is mostly empty is
         compared with, see `SiteEstimate`.
-    prior_s : float
-        Seconds of listening that weigh as much as the training sites: see `SiteEstimate`.
     domain : ModelDomain, optional
         What it was made for; `AcousticAdapter` refuses another array, rate or feature.
+    prior_s : float
+        Seconds of listening that weigh as much as the training sites: see `SiteEstimate`.
+    classes : tuple of str
+        Of a window, the columns of `predict_proba`: front, left, none, right, then both and direct where the
+        model knows them.
 
     Raises
     ------
     InvalidArgumentError
-        If the experts do not fit the reference or the prior is none.
+        If the experts do not fit the reference or the classes, or the prior is none.
 
     Examples
     --------
@@ -77,7 +78,9 @@ class EnsembleModel:
     array([[0.25, 0.25, 0.25, 0.25]])
     """
 
-    LAYOUT: ClassVar = Layout(constants={"kind": "ensemble", "classes": list(CLASSES)})
+    LAYOUT: ClassVar = Layout(
+        constants={"kind": "ensemble"}, order="classes class_prior home empty experts domain prior_s"
+    )
 
     experts: tuple[Expert, ...]
     class_prior: FloatArray
@@ -85,11 +88,13 @@ class EnsembleModel:
     empty: FloatArray
     domain: ModelDomain | None = field(default=None, metadata=ADDED)
     prior_s: float = field(default=PRIOR_S, metadata=ADDED)
+    classes: tuple[str, ...] = CLASSES
 
     def __post_init__(self) -> None:
         if not 0 < len(self.experts) <= MOST_EXPERTS:
             raise InvalidArgumentError(f"experts: expected 1 to {MOST_EXPERTS}, got {len(self.experts)}")
-        freeze_arrays(self, class_prior=(len(CLASSES),), empty=(self.n_features,))
+        known = (len(checked_classes(self.classes)),)
+        freeze_arrays(self, class_prior=known, empty=(self.n_features,))
         if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
             raise InvalidArgumentError("class_prior: expected positive numbers that sum to one")
         if self.n_features % SEGMENTS or self.n_features < 3 * SEGMENTS:
@@ -101,11 +106,7 @@ class EnsembleModel:
             inputs = views[expert.view].shape[1]
             if expert.mean.size != inputs:
                 raise InvalidArgumentError(f"expert: expected {inputs} inputs, got {expert.mean.size}")
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the columns of `predict_proba`."""
-        return CLASSES
+            check_shape("expert: intercepts", expert.intercepts.shape, known)
 
     @property
     def directions(self) -> tuple[str, ...]:
@@ -120,7 +121,7 @@ class EnsembleModel:
     @property
     def reference_prior(self) -> tuple[float, ...]:
         """Training prior in the order of the explanations (left, right, visible, none)."""
-        return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
+        return tuple(self._explained_prior[list(EXPLANATION_COLUMNS)].tolist())
 
     def at_site(self, reference: SiteReference) -> "EnsembleModel":
         """Return the model with another reference in place of the training sites' mean.
@@ -138,7 +139,7 @@ class EnsembleModel:
         return replace(self, home=reference)
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
-        r"""Return the posteriors of front, left, none, right at the training prior, shape (n, 4).
+        r"""Return the posteriors of the model's classes at the training prior, shape (n, classes).
 
         .. math:: P(c \mid x) \propto \exp \tfrac{1}{2 E} \sum_e
                   \big[ \ell_e(c, x) + \ell_e(\bar c, \bar x) \big], \qquad \sum_c P = 1
@@ -165,6 +166,24 @@ class EnsembleModel:
         posteriors = np.maximum(np.exp(self._log_posteriors(levels, reference)), SMALLEST_PROBABILITY)
         return np.asarray(posteriors / total(posteriors))
 
+    def explain(self, X: ArrayLike) -> FloatArray:
+        r"""Return the posteriors of front, left, none and right alone, shape (n, 4).
+
+        .. math:: P'_k = P_k + \tfrac{1}{2} P_{both} [k \text{ a side}] + P_{direct}\, \pi'_k / \sum \pi'
+
+        Errors are those of `predict_proba`.
+
+        Parameters
+        ----------
+        X : array_like, shape (n, features) or (n, 4 * features)
+            As for `predict_proba`.
+
+        References
+        ----------
+        Derived here: see the head of `worldstate.abduction.signature.window_classes`.
+        """
+        return explained(self.predict_proba(X), self.classes, self.class_prior)
+
     def log_likelihoods(self, X: ArrayLike) -> FloatArray:
         r"""Return log-likelihoods of left, right, front (visible), none, shape (n, 4), nats.
 
@@ -181,7 +200,7 @@ class EnsembleModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        return explanation_ratios(self.predict_proba(X), self.class_prior)
+        return explanation_ratios(self.explain(X), self._explained_prior)
 
     def evidence(self, feature: ArrayLike) -> SignatureEvidence:
         r"""Return the log-likelihoods of one window, shape (features,) or (4 * features,).
@@ -202,7 +221,15 @@ class EnsembleModel:
         ----------
         Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
         """
-        return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
+        return self.answer(*self._split(np.atleast_2d(feature)))
+
+    def answer(self, levels: FloatArray, reference: FloatArray) -> SignatureEvidence:
+        """Return what `evidence` does for log-levels, shape (1, features), and the row of a reference."""
+        return window_evidence(self.posteriors(levels, reference), self.classes, self.class_prior)
+
+    @property
+    def _explained_prior(self) -> FloatArray:
+        return np.asarray(explained(self.class_prior[None], self.classes, self.class_prior)[0])
 
     def _split(self, X: ArrayLike) -> tuple[FloatArray, FloatArray]:
         n_features = self.n_features
@@ -223,10 +250,10 @@ class EnsembleModel:
             np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
             np.concatenate([reference, mirror_features(reference, SEGMENTS * len(KINDS))]),
         )
-        sums = np.zeros((n, len(CLASSES)))
+        sums, mirrored = np.zeros((n, len(self.classes))), mirrored_classes(len(self.classes))
         for expert in self.experts:
             seen = views[expert.view]
             # Added to each other first: the sum of two does not depend on which is the mirror image.
             there, back = expert.log_posteriors(seen[:n]), expert.log_posteriors(seen[n:])
-            sums += there + back[:, MIRRORED_CLASSES]
+            sums += there + back[:, mirrored]
         return log_softmax(sums / (2 * len(self.experts)))

@@ -1,7 +1,7 @@
 """Training of the ensemble: every window and its mirror image, one softmax regression for each view."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
@@ -12,18 +12,21 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
-from .ensemble import MIRRORED_CLASSES, PRIOR_S, EnsembleModel
+from .ensemble import PRIOR_S, EnsembleModel
 from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
 from .mirror import SEGMENTS, mirror_features
 from .published_signature import CLASSES, NONE
 from .published_training import checked_labels
 from .site_reference import KINDS, SiteReference
 from .standardisation import standardisation
+from .window_classes import WINDOW_CLASSES, mirrored_classes
 
 # Of a simulated window beside a real one, and the part of it that says the other side. At weights from .5
 # to 3 and parts from .15 to .35 the areas of real junctions left out stay within .002 and the side within
 # .03; without such a part the side is right in .85 of the windows instead of .93, with half of it in .84.
 SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
+# Stands for a site where there is no street: learned whatever sites are left out.
+OPEN_FIELD = "open field"
 _ITERATIONS = 1000
 _WINDOW_S = 1.0
 _LONGEST = 60.0
@@ -51,14 +54,20 @@ RECIPES = (
 class SimulatedWindows:
     """Simulated windows to be learned beside the real ones, each with the reference of its site behind it."""
 
-    X: FloatArray  # shape (n, 4 * features)
-    y: TextArray  # shape (n,)
+    X: FloatArray  # shape (n, 4 * features); a reference of NaN stands for that of the training sites
+    y: TextArray  # shape (n,): Of `WINDOW_CLASSES`
     sites: TextArray  # shape (n,): Names as of the real sites: one that is held out is left out of both
+    weights: FloatArray  # shape (n,): Beside a real window of weight 1
 
     def at(self, sites: AnyArray) -> "SimulatedWindows":
-        """Return those of some sites."""
-        chosen = np.isin(self.sites, sites)
-        return SimulatedWindows(self.X[chosen], self.y[chosen], self.sites[chosen])
+        """Return those of some sites, and those of no street."""
+        chosen = np.isin(self.sites, [*np.unique(sites).tolist(), OPEN_FIELD])
+        return SimulatedWindows(*(getattr(self, column.name)[chosen] for column in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence["SimulatedWindows"]) -> "SimulatedWindows":
+        """Return the windows of all parts."""
+        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
 
 class SiteEnsembleClassifier:
@@ -99,8 +108,9 @@ class SiteEnsembleClassifier:
         .. math:: \hat W_e, \hat b_e = \arg\min_{W, b} \Big[ \frac{\lambda_e}{2} \|W\|^2
                   - \frac{\sum_i w_i \ell_e(c_i, x_i)}{\sum_i w_i} \Big]
 
-        with weight 1 for real and simulated windows, a quarter of which is given to the other side of a
-        simulated hazard: streets that are simulated tell hidden from none as real ones do, sides less so.
+        with weight 1 for real windows and their own for simulated ones, a quarter of which is given to the
+        other side of a simulated hazard: streets that are simulated tell hidden from none as real ones do,
+        sides less so. The classes both and direct are known where there are simulated windows of them.
 
         Parameters
         ----------
@@ -129,37 +139,40 @@ class SiteEnsembleClassifier:
         inputs = finite_array("X", X, (None, None))
         if inputs.shape[1] % (SEGMENTS * (1 + len(KINDS))):
             raise InvalidArgumentError(f"X: expected windows with a reference, got shape {inputs.shape}")
-        codes = np.searchsorted(CLASSES, checked_labels(y, len(inputs)))
+        codes = _codes(checked_labels(y, len(inputs)))
         sites = None if groups is None else np.asarray(groups)
         windows, empty = split_reference(inputs)[0], codes == NONE
-        known = PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
+        prior_s = PRIOR_S if sites is None else _prior_s(windows[empty], sites[empty])
         levels, reference, codes = _with_mirror_images(*split_reference(inputs), codes)
         home, silence = SiteReference.from_row(reference.mean(axis=0)), levels[codes == NONE].mean(axis=0)
         weights = np.ones(len(codes))
         if self.simulated is not None and sites is not None:
-            more = _simulated_rows(self.simulated.at(sites))
+            more = _simulated_rows(self.simulated.at(sites), home)
             levels, reference, codes, weights = (
                 np.concatenate(pair) for pair in zip((levels, reference, codes, weights), more, strict=True)
             )
+        # The four of the data, and what else there are windows of; scikit-learn sorts its columns the same.
+        known = np.union1d(np.arange(len(CLASSES)), codes)
         views = expert_views({recipe.view for recipe in self.recipes}, levels, reference)
         self.model_ = EnsembleModel(
             tuple(_fit_expert(recipe, views[recipe.view], codes, weights) for recipe in self.recipes),
-            np.bincount(codes, weights) / weights.sum(),
+            np.bincount(codes, weights)[known] / weights.sum(),
             home,
             silence,
-            prior_s=known,
+            prior_s=prior_s,
+            classes=tuple(WINDOW_CLASSES[code] for code in known),
         )
         return self
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
-        """Return posteriors of front, left, none, right, shape (n, 4).
+        """Return posteriors of front, left, none, right, shape (n, 4), as `EnsembleModel.explain`.
 
         Parameters
         ----------
         X : array_like, shape (n, 4 * features)
             Windows with the references of their sites behind them.
         """
-        return self.model_.predict_proba(X)
+        return self.model_.explain(X)
 
 
 def _with_mirror_images(
@@ -170,21 +183,33 @@ def _with_mirror_images(
     return (
         np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
         np.concatenate([reference, mirrored_reference]),
-        np.concatenate([codes, np.array(MIRRORED_CLASSES)[codes]]),
+        np.concatenate([codes, _mirrored(codes)]),
     )
 
 
-def _simulated_rows(windows: SimulatedWindows) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
+def _simulated_rows(
+    windows: SimulatedWindows, home: SiteReference
+) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
     """Return log-levels, references, classes and weights, hazards of the other side behind the windows."""
     levels, reference = split_reference(windows.X)
-    codes = np.searchsorted(CLASSES, checked_labels(windows.y, len(levels)))
-    other = np.array(MIRRORED_CLASSES)[codes]
+    reference = np.where(np.isnan(reference), home.row, reference)
+    codes = _codes(windows.y)
+    other = _mirrored(codes)
     hidden = other != codes
     rows = np.concatenate([np.arange(len(codes)), np.flatnonzero(hidden)])
     shares = np.concatenate([np.where(hidden, 1.0 - OTHER_SIDE, 1.0), np.full(hidden.sum(), OTHER_SIDE)])
     sides = np.concatenate([codes, other[hidden]])
     mirrored = _with_mirror_images(levels[rows], reference[rows], sides)
-    return (*mirrored, SIMULATED_WEIGHT * np.tile(shares, 2))
+    return (*mirrored, np.tile(shares * windows.weights[rows], 2))
+
+
+def _codes(labels: TextArray) -> IndexArray:
+    """Return the place of each name among `WINDOW_CLASSES`."""
+    return np.array([WINDOW_CLASSES.index(label) for label in labels.tolist()], np.intp)
+
+
+def _mirrored(codes: IndexArray) -> IndexArray:
+    return np.array(mirrored_classes(len(WINDOW_CLASSES)))[codes]
 
 
 def _prior_s(levels: FloatArray, sites: AnyArray) -> float:

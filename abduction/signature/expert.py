@@ -32,19 +32,19 @@ class Expert:
     view: str
     mean: FloatArray  # shape (inputs,): Standardisation; scale > 0
     scale: FloatArray
-    weights: FloatArray  # shape (4, inputs): One row for each of front, left, none, right
-    intercepts: FloatArray  # shape (4,): Added to the weighted sums
+    weights: FloatArray  # shape (classes, inputs): One row for each class of the model
+    intercepts: FloatArray  # shape (classes,): Added to the weighted sums
 
     def __post_init__(self) -> None:
         if self.view not in VIEWS:
             raise InvalidArgumentError(f"view: expected one of {', '.join(VIEWS)}, got {self.view!r:.40}")
-        inputs = np.size(self.mean)
-        freeze_arrays(self, mean=(inputs,), scale=(inputs,), weights=(4, inputs), intercepts=(4,))
+        inputs, classes = np.size(self.mean), np.size(self.intercepts)
+        freeze_arrays(self, mean=(inputs,), scale=(inputs,), weights=(classes, inputs), intercepts=(classes,))
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
 
     def log_posteriors(self, seen: FloatArray) -> FloatArray:
-        r"""Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, 4).
+        r"""Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, classes).
 
         .. math:: \ell = \log \mathrm{softmax}\, \big( W (v - \mu) / \sigma + b \big)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.cueing.platt import sigmoid
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
 from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout
@@ -224,7 +224,7 @@ def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatA
     return np.asarray(ratios[:, EXPLANATION_COLUMNS])
 
 
-def evidence_of(log_likelihoods: FloatArray) -> SignatureEvidence:
+def evidence_of(log_likelihoods: FloatArray, sides: SideEvidence | None = None) -> SignatureEvidence:
     """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
 
     Shapes: log_likelihoods (4,).
@@ -235,4 +235,4 @@ def evidence_of(log_likelihoods: FloatArray) -> SignatureEvidence:
     (0.5, -1.0)
     """
     left, right, visible, none = log_likelihoods.tolist()
-    return SignatureEvidence(DIRECTIONS, (left, right), visible, none)
+    return SignatureEvidence(DIRECTIONS, (left, right), visible, none, sides)

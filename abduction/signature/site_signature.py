@@ -8,7 +8,6 @@ from worldstate.ground.checks import finite_array, in_range
 
 from .ensemble import EnsembleModel
 from .model_domain import ModelDomain
-from .published_signature import evidence_of, explanation_ratios
 from .site_estimate import SiteEstimate, SiteEstimateSettings
 from .site_reference import log_levels
 
@@ -84,6 +83,5 @@ class SiteSignature:
         """
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model, self._settings)
-        posteriors = self._model.posteriors(log_levels(window)[None], reference.row[None])
         self.estimate = self.estimate.updated(window, self._hop_s, self._settings)
-        return evidence_of(explanation_ratios(posteriors, self._model.class_prior)[0])
+        return self._model.answer(log_levels(window)[None], reference.row[None])

@@ -1,6 +1,7 @@
 """The ensemble for unseen junctions: mirror law, references from elsewhere, optimal coefficients."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import log_softmax
 
-from worldstate.abduction.signature.ensemble import MIRRORED_CLASSES, EnsembleModel
+from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import (
     RECIPES,
     Recipe,
@@ -20,6 +21,7 @@ from worldstate.abduction.signature.mirror import mirror_features
 from worldstate.abduction.signature.pattern_features import shape_features
 from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
+from worldstate.abduction.signature.window_classes import WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
@@ -52,22 +54,24 @@ def mirrored(X):
     return mirror_features(X, X.shape[1] // 30)
 
 
-@pytest.mark.parametrize("helped", [False, True])
-def test_mirroring_the_world_exchanges_the_sides(trained, helped):
+@pytest.mark.parametrize("classes", [CLASSES, (*CLASSES, "both"), WINDOW_CLASSES])
+def test_mirroring_the_world_exchanges_the_sides(trained, classes):
     model = trained[2]
-    if helped:
-        more = simulated(np.random.default_rng(10), ["SA1"])
+    if classes != CLASSES:
+        more = simulated(np.random.default_rng(10), ["SA1"], classes[len(CLASSES) :])
         model = SiteEnsembleClassifier(simulated=more).fit(*trained[:2], ["SA1"] * len(trained[1])).model_
+    assert model.classes == classes
     X, _ = windows(np.random.default_rng(2))
-    np.testing.assert_array_equal(
-        model.predict_proba(mirrored(X))[:, MIRRORED_CLASSES], model.predict_proba(X)
-    )
+    image = mirrored_classes(len(classes))
+    np.testing.assert_array_equal(model.predict_proba(mirrored(X))[:, image], model.predict_proba(X))
+    np.testing.assert_array_equal(model.explain(mirrored(X))[:, image[:4]], model.explain(X))
     there, back = model.evidence(X[0]), model.evidence(mirrored(X)[0])
     assert there.hidden == back.hidden[::-1]
+    assert there.sides.log_ratios == back.sides.log_ratios[::-1]
     # Without a reference too: that of the training sites is symmetric.
     plain = X[:, :60]
     np.testing.assert_allclose(
-        model.predict_proba(mirrored(plain))[:, MIRRORED_CLASSES], model.predict_proba(plain), atol=1e-9
+        model.predict_proba(mirrored(plain))[:, image], model.predict_proba(plain), atol=1e-9
     )
 
 
@@ -92,9 +96,12 @@ def test_the_more_sites_differ_the_faster_a_new_one_is_learned(between, expected
     assert model.prior_s == pytest.approx(expected_s, rel=0.3)
 
 
-def simulated(rng, sites):
+def simulated(rng, sites, more=()):
     X, y = windows(rng)
-    return SimulatedWindows(X, y, rng.choice(sites, len(y)))
+    y = y.astype("<U6")
+    for position, name in enumerate(more):
+        y[np.flatnonzero(y == CLASSES[position])[:20]] = name
+    return SimulatedWindows(X, y, rng.choice(sites, len(y)), np.ones(len(y)))
 
 
 def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too():
@@ -102,7 +109,9 @@ def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too(
     X, y = windows(rng)
     groups, everywhere = np.tile(["SA1", "SA2"], 100), simulated(rng, ["SA1", "SA2", "SB1"])
     chosen = np.isin(everywhere.sites, ["SA1", "SA2"])
-    here = SimulatedWindows(everywhere.X[chosen], everywhere.y[chosen], everywhere.sites[chosen])
+    here = SimulatedWindows(
+        everywhere.X[chosen], everywhere.y[chosen], everywhere.sites[chosen], everywhere.weights[chosen]
+    )
     with_all, with_some, without = (
         SiteEnsembleClassifier(simulated=some).fit(X, y, groups).model_ for some in (everywhere, here, None)
     )
@@ -121,12 +130,14 @@ def test_a_quarter_of_a_simulated_hazard_says_the_other_side():
     left = np.tile(np.hstack([np.full(60, 50.0), np.zeros(180)]), (n, 1))
     rest = np.tile(np.hstack([np.full(60, 1.0), np.zeros(180)]), (2, 1))
     labels = np.concatenate([np.repeat("left", n), ["front", "none"]])
-    more = SimulatedWindows(np.concatenate([left, rest]), labels, np.repeat("SA1", n + 2))
+    more = SimulatedWindows(
+        np.concatenate([left, rest]), labels, np.repeat("SA1", n + 2), np.full(n + 2, 1.0)
+    )
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.5, 0.5], abs=0.02)
     # Both sides are as likely since the pattern is its own mirror image; of another the share is seen.
     left[:, :20] = 400.0
-    more = SimulatedWindows(np.concatenate([left, rest]), labels, more.sites)
+    more = replace(more, X=np.concatenate([left, rest]))
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.75, 0.25], abs=0.05)
 
@@ -143,7 +154,7 @@ def test_the_coefficients_are_the_optimum_of_the_penalised_likelihood(trained):
     X, y, model = trained
     codes = np.searchsorted(CLASSES, y)
     both = np.vstack([X, mirrored(X)])
-    codes = np.concatenate([codes, np.array(MIRRORED_CLASSES)[codes]])
+    codes = np.concatenate([codes, np.array([0, 3, 2, 1])[codes]])
     for recipe, expert in zip(RECIPES, model.experts, strict=True):
         seen = expert_views([expert.view], log_levels(both[:, :60]), both[:, 60:])[expert.view]
         standard = (seen - expert.mean) / expert.scale

@@ -93,7 +93,7 @@ def _ask_under(reference: Reference, table: FeatureTable, seed: int) -> Ask:
 
     def ask(classifier: Classifier, rows: BoolArray) -> FloatArray:
         model = cast(SiteEnsembleClassifier, classifier).model_
-        return model.predict_proba(inputs(model, rows))
+        return model.explain(inputs(model, rows))
 
     return ask
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.ensemble_training import SimulatedWindows
+from worldstate.abduction.signature.ensemble_training import SIMULATED_WEIGHT, SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import FeatureTable
@@ -40,8 +40,14 @@ def with_site_references(table: FeatureTable) -> FeatureTable:
 def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
     """Return simulated windows as the ensemble learns them: those of a table compared with its own."""
     parts = [with_site_references(table) for table in tables]
-    columns = ("features", "labels", "environments")
-    return SimulatedWindows(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+    return SimulatedWindows.joined(
+        [
+            SimulatedWindows(
+                part.features, part.labels, part.environments, np.full(len(part), SIMULATED_WEIGHT)
+            )
+            for part in parts
+        ]
+    )
 
 
 def inputs_under(reference: Reference, table: FeatureTable, rng: np.random.Generator) -> Inputs:

@@ -10,7 +10,7 @@ import numpy as np
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.signature.ensemble_training import RECIPES, SimulatedWindows, SiteEnsembleClassifier
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.signature.published_signature import CLASSES, hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
@@ -217,7 +217,7 @@ def _calibrated(
 def _figures(table: FeatureTable, signature: AnySignature, passes: list[FloatArray]) -> dict[str, float]:
     """Out-of-fold figures, mean over the repeats."""
     scored = table.hazards | table.hazard_free
-    classes = np.array(signature.classes)
+    classes = np.array(CLASSES)
     correct = [np.mean(classes[one.argmax(axis=1)] == table.labels) for one in passes]
     areas = {
         miss_rate: [auroc(hazard_statistic(one[scored], miss_rate), table.hazards[scored]) for one in passes]

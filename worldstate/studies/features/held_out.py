@@ -3,6 +3,7 @@
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.signature_io import explain
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model
@@ -23,7 +24,7 @@ def predict_held_out(
     signature, inputs = model.signature, table.features
     if isinstance(signature, EnsembleModel):
         inputs = inputs_under(reference, table, rng)(signature, np.ones(len(table), dtype=np.bool_))
-    probabilities = signature.predict_proba(inputs)
+    probabilities = explain(signature, inputs)
     predictions = {}
     for miss_rate in MISS_RATES:
         policy = model.policies.for_alpha(alpha, miss_rate)

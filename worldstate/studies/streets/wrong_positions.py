@@ -6,6 +6,7 @@ A classifier that ranks as well with permuted positions takes the level for the 
 import numpy as np
 
 from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.signature.signature_io import explain
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.typing import FloatArray
@@ -27,7 +28,7 @@ def position_figures(
     scores = {
         "published, of real": trained_score(real, rng, both),
         "published, of simulated": _out_of_fold(right, permuted, rng),
-        "shipped model": hazard_statistic(read_model().signature.predict_proba(both), miss_rate=0.0),
+        "shipped model": hazard_statistic(explain(read_model().signature, both), miss_rate=0.0),
     }
     found: dict[FigureKey, float] = {}
     for name, score in scores.items():

@@ -1,0 +1,123 @@
+r"""Classes of a window beyond the four of the released data, and what they say of the explanations.
+
+A window may hold a hidden vehicle on *both* sides, or a *direct* sound: one plane wave, from a source in the
+open. The first belongs to either side by a half, the second is as likely under every explanation,
+
+.. math:: P'_{left} = P_{left} + \tfrac{1}{2} P_{both} + P_{direct}\, \frac{\pi'_{left}}{\sum_k \pi'_k},
+          \qquad \pi'_{left} = \pi_{left} + \tfrac{1}{2} \pi_{both},
+
+so that a direct sound moves no explanation against another: which side it is on, its bearing says.
+"""
+
+import numpy as np
+
+from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+
+from .published_signature import (
+    CLASSES,
+    DIRECTIONS,
+    FRONT,
+    LEFT,
+    NONE,
+    RIGHT,
+    evidence_of,
+    explanation_ratios,
+)
+
+BOTH, DIRECT = "both", "direct"
+WINDOW_CLASSES = (*CLASSES, BOTH, DIRECT)
+_MIRRORED = {LEFT: RIGHT, RIGHT: LEFT}
+
+
+def checked_classes(classes: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the classes of a model: the four of the data, then those of the others that it knows."""
+    more = tuple(name for name in WINDOW_CLASSES[len(CLASSES) :] if name in classes)
+    if classes != CLASSES + more:
+        raise InvalidArgumentError(f"classes: expected {CLASSES} and then both, direct, got {classes!r:.80}")
+    return classes
+
+
+def mirrored_classes(n_classes: int) -> list[int]:
+    """Return the column of each class in the mirrored world: all but left and right are their own image."""
+    return [_MIRRORED.get(column, column) for column in range(n_classes)]
+
+
+def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
+    r"""Return posteriors, or the prior itself, as those of front, left, none and right, shape (n, 4).
+
+    .. math:: P'_k = P_k + \tfrac{1}{2} P_{both} [k \text{ a side}] + P_{direct}\, \pi'_k / \sum \pi'
+
+    Shapes: shares (n, classes), prior (classes,).
+
+    Examples
+    --------
+    >>> window = np.array([[0.0, 0.5, 0.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    >>> explained(window, WINDOW_CLASSES, np.full(6, 1 / 6)).round(2)
+    array([[0.  , 0.75, 0.  , 0.25],
+           [0.2 , 0.3 , 0.2 , 0.3 ]])
+    """
+    four = _sides_filled(shares, classes)
+    if DIRECT not in classes:
+        return four
+    known = _sides_filled(prior[None], classes)
+    return np.asarray(four + _column(shares, classes, DIRECT) * (known / known.sum()))
+
+
+def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
+    r"""Return what a window says of a hidden vehicle on the left and on the right, shape (n, 2), nats.
+
+    .. math:: \lambda_k = \log \frac{P_k + P_{both}}{\pi_k + \pi_{both}}
+              - \log \Big( \frac{P_{front}}{\pi_{front}} + \frac{P_{none}}{\pi_{none}} \Big)
+
+    with a direct sound as likely under each: sides do not exclude each other, and share nothing.
+
+    Shapes: posteriors (n, classes), prior (classes,).
+
+    Examples
+    --------
+    >>> window = np.array([[0.05, 0.05, 0.05, 0.05, 0.8, 0.0]])
+    >>> side_ratios(window, WINDOW_CLASSES, np.full(6, 1 / 6)).round(2)
+    array([[1.45, 1.45]])
+    """
+    direct = _column(posteriors, classes, DIRECT)
+    known = 1.0 - _column(prior[None], classes, DIRECT)
+    sides = posteriors[:, [LEFT, RIGHT]] + _column(posteriors, classes, BOTH)
+    expected = prior[[LEFT, RIGHT]] + _column(prior[None], classes, BOTH)
+    # Two sums of products in place of an exponential of logarithms: this runs at every hop.
+    present = sides / expected * known + direct
+    rest = posteriors[:, [FRONT, NONE]] / prior[[FRONT, NONE]] * known + direct
+    return np.asarray(np.log(present) - np.log(rest.sum(axis=1, keepdims=True)))
+
+
+def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> SignatureEvidence:
+    """Return what one window says, from its posteriors at the training prior.
+
+    Shapes: posteriors (1, classes), prior (classes,).
+
+    Examples
+    --------
+    >>> window = np.array([[0.05, 0.6, 0.05, 0.1, 0.1, 0.1]])
+    >>> sides = window_evidence(window, WINDOW_CLASSES, np.full(6, 1 / 6)).sides
+    >>> sides.both, sides.direct, sides.log_ratios[0] > sides.log_ratios[1]
+    (0.1, 0.1, True)
+    """
+    known = explained(prior[None], classes, prior)[0]
+    ratios = explanation_ratios(explained(posteriors, classes, prior), known)[0]
+    left, right = side_ratios(posteriors, classes, prior)[0].tolist()
+    both, direct = (_column(posteriors, classes, name)[0, 0].item() for name in (BOTH, DIRECT))
+    return evidence_of(ratios, SideEvidence(DIRECTIONS, (left, right), both, direct))
+
+
+def _sides_filled(shares: FloatArray, classes: tuple[str, ...]) -> FloatArray:
+    four = shares[:, : len(CLASSES)].copy()
+    four[:, [LEFT, RIGHT]] += 0.5 * _column(shares, classes, BOTH)
+    return four
+
+
+def _column(shares: FloatArray, classes: tuple[str, ...], name: str) -> FloatArray:
+    """Return one class's share, shape (n, 1); zero where the model does not know it."""
+    if name not in classes:
+        return np.zeros((len(shares), 1))
+    return shares[:, [classes.index(name)]]
