@@ -82,7 +82,7 @@ def test_approaches_take_turns_in_the_numbers_asked_for(seed: int) -> None:
     assert counts == {"left": 10, "right": 10, "both": 20, "queue": 6, "follows": 6}
     entries = [visible_s(event, site("SB1")) for event in events if event.flow in HAZARDS]
     first = np.sort([entry for entry in entries if entry is not None])
-    # Two that come together lie within three standard deviations of .7 s, strangers half a turn of 24 s apart.
+    # Two that come together lie within some standard deviations of .7 s, strangers half a turn of 24 s apart.
     assert not ((np.diff(first) > 3.0) & (np.diff(first) < 8.0)).any()
 
 

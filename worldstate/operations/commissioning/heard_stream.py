@@ -31,7 +31,7 @@ class HeardStream:
     """What was heard of one stream, and who was there."""
 
     hops: HopTable  # One row a hop: `AcousticFrame` by columns, NaN where something was refused
-    vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 (NaN where it never comes into view)
+    vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
     rows: HopTable  # One row a vehicle and tenth of a second: time, place, in view, loudness
 
     def save(self, path: Path) -> None:
@@ -106,11 +106,13 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
 
 def _vehicles(stream: DrawnStream) -> HopTable:
     told = [
-        (one.number, one.event.flow, one.event.manoeuvre.motion.kind.name, one.event.manoeuvre.arm)
-        + (np.nan if one.t0_s is None else one.t0_s, one.hazard)
+        (
+            *(one.number, one.event.flow, one.event.manoeuvre.motion.kind.name, one.event.manoeuvre.arm),
+            *(np.nan if one.t0_s is None else one.t0_s, one.hazard),
+        )
         for one in stream.vehicles
     ]
-    return HopTable.of_rows(("vehicle", "flow", "kind", "arm", "t0_s", "hazard"), told)
+    return HopTable.of_rows(("vehicle", "flow", "kind", "arm", "entry_s", "hazard"), told)
 
 
 def _rows(stream: DrawnStream, loudness_db: dict[int, FloatArray]) -> HopTable:

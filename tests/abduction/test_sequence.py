@@ -1,0 +1,94 @@
+"""Inputs of a sequence model: causal, mirrored, cut anywhere; and what its posterior says of times."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.abduction.sequence.boosted_trees import BoostedTrees
+from worldstate.abduction.sequence.sequence_inputs import (
+    INPUTS,
+    MEMORY_HOPS,
+    HopEvidence,
+    quiet,
+    sequence_inputs,
+)
+from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S, SequencePosterior
+from worldstate.ground.errors import InvalidArgumentError
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def evidence_of(rng: np.random.Generator, hops: int) -> HopEvidence:
+    single = rng.normal(size=(7, hops)).cumsum(axis=1)
+    single[4:6][:, rng.random(hops) < 0.3] = np.nan
+    single[5] = np.abs(single[5]) + 0.01
+    return HopEvidence(rng.normal(size=(hops, 2)).cumsum(axis=0), *single)
+
+
+@given(SEEDS)
+def test_no_hop_knows_what_comes_after_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    whole = evidence_of(rng, 80)
+    cut = HopEvidence(*(getattr(whole, one.name)[:50] for one in fields(whole)))
+    np.testing.assert_array_equal(sequence_inputs(whole)[:50], sequence_inputs(cut))
+
+
+@given(SEEDS)
+def test_the_mirrored_street_exchanges_the_sides(seed: int) -> None:
+    here = evidence_of(np.random.default_rng(seed), 60)
+    there = HopEvidence(
+        here.sides[:, ::-1], *(getattr(here, one.name) for one in fields(here)[1:-1]), -here.bearing_rad
+    )
+    np.testing.assert_allclose(sequence_inputs(there), sequence_inputs(here)[:, ::-1], atol=1e-12)
+
+
+@given(SEEDS)
+def test_three_seconds_are_all_that_is_kept_but_for_the_streets_own_level(seed: int) -> None:
+    whole = evidence_of(np.random.default_rng(seed), 70)
+    levels = np.isin(INPUTS, ("level", "loudness"))
+    last, short = sequence_inputs(whole)[-1], sequence_inputs(whole.last(MEMORY_HOPS))[-1]
+    np.testing.assert_allclose(last[:, ~levels], short[:, ~levels], atol=1e-9)
+
+
+@given(SEEDS, st.integers(1, 900))
+def test_the_streets_own_level_is_the_quietest_fifth_of_a_minute(seed: int, hops: int) -> None:
+    values = np.random.default_rng(seed).normal(size=hops)
+    found = quiet(values)
+    for at in {0, hops // 2, hops - 1}:
+        heard = values[max(at - 599, 0) : at + 1]
+        assert found[at] == np.quantile(heard, 0.2, method="lower")
+
+
+@given(SEEDS)
+def test_probabilities_within_rise_with_the_horizon_and_times_stand_in_their_interval(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said = SequencePosterior(rng.dirichlet(np.full(len(GROUPS), 0.5), (20, 2)), margin_s=0.2)
+    within, times = said.within(), said.time_to_visible_s()
+    assert within.shape == (20, 2, len(HORIZONS_S)) and (np.diff(within, axis=-1) >= -1e-12).all()
+    assert (within >= 0.0).all() and (within <= 1.0 + 1e-12).all()
+    assert (times[..., 0] <= times[..., 2]).all() and (times[..., 0] >= 0.0).all()
+    sure = np.zeros((1, 2, len(GROUPS)))
+    sure[..., GROUPS.index("coming_1.5s")] = 1.0
+    low, best, high = SequencePosterior(sure, 0.0).time_to_visible_s()[0, 0]
+    assert (best, round(low, 3), round(high, 3)) == (1.25, 1.025, 1.475)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"yes": [[1, 0, 2]]}, "yes"),
+        ({"no": [[2, 2, 2]]}, "leaf"),
+        ({"split": [[900, 0, 0]]}, "split"),
+        ({"tree_class": [3]}, "tree_class"),
+    ],
+)
+def test_trees_of_a_file_that_lead_nowhere_are_refused(change: dict[str, object], told: str) -> None:
+    stump = {
+        **{"split": [[0, 0, 0]], "threshold": [[0.5, 0.0, 0.0]], "yes": [[1, 1, 2]], "no": [[2, 1, 2]]},
+        **{"value": [[0.0, -1.0, 1.0]], "tree_class": [0], "baseline": [0.0, 0.0]},
+    }
+    with pytest.raises(InvalidArgumentError, match=told):
+        BoostedTrees(**{**stump, **change})  # type: ignore[arg-type]

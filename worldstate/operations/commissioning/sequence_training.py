@@ -1,0 +1,93 @@
+"""Training of a sequence model on streams: boosted trees from scikit-learn, kept as arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.abduction.sequence.boosted_trees import BoostedTrees
+from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence, sequence_inputs
+from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S, SequenceModel
+from worldstate.ground.errors import WorldstateError
+from worldstate.ground.typing import FloatArray
+
+from .stream_labels import StreamTruth
+
+ROUNDS, LEAVES, RATE, SMALLEST_LEAF = 45, 10, 0.1, 40
+COVERAGE = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledStream:
+    """Evidence of one stream, by a window model that did not learn from it, and the truth."""
+
+    evidence: HopEvidence
+    truth: StreamTruth
+    weight: float = 1.0  # Of each of its hops
+
+
+def train_sequence(
+    streams: Sequence[LabelledStream], *, rounds: int = ROUNDS, seed: int = 0
+) -> SequenceModel:
+    """Train on the hops of streams, each weighted so that hazards are as frequent as in use."""
+    from sklearn.ensemble import HistGradientBoostingClassifier
+
+    inputs = np.concatenate([_rows(sequence_inputs(one.evidence)) for one in streams])
+    groups = np.concatenate([one.truth.groups().reshape(-1) for one in streams])
+    sizes = [len(one.evidence) * len(SIDES) for one in streams]
+    weights = np.repeat([one.weight for one in streams], sizes)
+    machine = HistGradientBoostingClassifier(
+        max_iter=rounds,
+        max_leaf_nodes=LEAVES,
+        learning_rate=RATE,
+        min_samples_leaf=SMALLEST_LEAF,
+        early_stopping=False,
+        random_state=seed,
+    )
+    machine.fit(inputs, groups, sample_weight=weights)
+    share = np.bincount(groups, weights, len(GROUPS)) / weights.sum()
+    trees = exported(machine, inputs[:: max(len(inputs) // 100, 1)])
+    return SequenceModel(trees, np.maximum(share, 1e-6))
+
+
+def _rows(inputs: FloatArray) -> FloatArray:
+    return inputs.reshape(-1, inputs.shape[-1])
+
+
+def exported(machine: object, check: FloatArray) -> BoostedTrees:
+    """Return the trees of a trained classifier, held against its own scores on some rows."""
+    # scikit-learn has no public way to its histogram trees: whatever changes there must be noticed here.
+    found = [(k, one.nodes) for round_ in machine._predictors for k, one in enumerate(round_)]  # type: ignore[attr-defined]
+    classes = machine.classes_.astype(np.intp)  # type: ignore[attr-defined]
+    grid = len(found), max(len(nodes) for _, nodes in found)
+    here = np.broadcast_to(np.arange(grid[1]), grid)
+    split, yes, no = np.zeros(grid, np.intp), here.copy(), here.copy()
+    threshold, value = np.zeros(grid), np.zeros(grid)
+    for row, (_, nodes) in enumerate(found):
+        inner = ~nodes["is_leaf"].astype(bool)
+        at = np.flatnonzero(inner)
+        split[row, at], threshold[row, at] = nodes["feature_idx"][at], nodes["num_threshold"][at]
+        yes[row, at], no[row, at] = nodes["left"][at], nodes["right"][at]
+        value[row, : len(nodes)] = np.where(inner, 0.0, nodes["value"])
+    # Groups that no hop belonged to keep no chance.
+    baseline = np.full(len(GROUPS), -30.0)
+    baseline[classes] = np.ravel(machine._baseline_prediction)  # type: ignore[attr-defined]
+    trees = BoostedTrees(split, threshold, yes, no, value, classes[[k for k, _ in found]], baseline)
+    if not np.allclose(trees.scores(check)[:, classes], machine.decision_function(check), atol=1e-6):  # type: ignore[attr-defined]
+        raise WorldstateError("scikit-learn keeps its trees in another way than 1.5 to 1.9 did: not exported")
+    return trees
+
+
+def calibrated_margin_s(model: SequenceModel, streams: Sequence[LabelledStream]) -> float:
+    """Return what the interval of the time to visible must be widened by, on streams not trained on.
+
+    Source: Y. Romano, E. Patterson and E. Candes, "Conformalized quantile regression", NeurIPS 2019.
+    """
+    misses = []
+    for one in streams:
+        times = model.posterior(one.evidence).time_to_visible_s()
+        coming = one.truth.coming_s <= LONGEST_S
+        true = one.truth.coming_s[coming]
+        misses.append(np.maximum(times[coming][:, 0] - true, true - times[coming][:, 2]))
+    every = np.concatenate(misses)
+    return float(np.quantile(every, min(COVERAGE * (1.0 + 1.0 / every.size), 1.0)))
