@@ -1,7 +1,6 @@
 """Options of the commands that take a table of feature windows, declared once."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +8,7 @@ from .command import add_choice
 
 if TYPE_CHECKING:
     from worldstate.abduction.signature.ensemble_training import SimulatedWindows
-    from worldstate.adapters.datasets.feature_table import Group
+    from worldstate.adapters.datasets.feature_table import FeatureTable
 
 
 def add_table_options(parser: argparse.ArgumentParser) -> None:
@@ -18,14 +17,25 @@ def add_table_options(parser: argparse.ArgumentParser) -> None:
     add_which_windows(parser, "standing ego, moving ego or both")
     simulated = "simulated windows of the same sites, learned too: what `realism --out` writes"
     parser.add_argument("--simulated", type=Path, nargs="+", metavar="CSV", help=simulated)
+    streams = "simulated streams that were listened to: windows of them, and of sources in the open, too"
+    parser.add_argument("--streams", type=Path, nargs="+", metavar="NPZ", help=streams)
 
 
-def read_simulated(paths: Sequence[Path] | None, group: "Group") -> "SimulatedWindows | None":
+def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "SimulatedWindows | None":
     """Return the simulated windows that are to be learned beside a table, None without any."""
-    from worldstate.adapters.datasets.feature_table import read_features
-    from worldstate.operations.training.site_references import simulated_beside
+    import numpy as np
 
-    return simulated_beside([read_features(path).group(group) for path in paths]) if paths else None
+    from worldstate.adapters.datasets.feature_table import read_features
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.operations.commissioning.heard_stream import HeardStream
+    from worldstate.operations.commissioning.window_model import learned_beside
+
+    tables = [read_features(path).group(arguments.group) for path in arguments.simulated or ()]
+    streams = [HeardStream.load(path) for path in arguments.streams or ()]
+    # A table that does not say, as the released one, is OVAD's.
+    array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
+    return learned_beside(tables, streams, array, np.random.default_rng(0))
 
 
 def add_which_windows(parser: argparse.ArgumentParser, of: str) -> None:

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.feature_options import add_table_options, read_simulated
+from worldstate.cli.common.feature_options import add_table_options, read_beside
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
@@ -119,7 +119,7 @@ def _passes(
             seeds=arguments.seeds,
             alpha=arguments.alpha,
             train=_standing(whole, arguments) if afar else None,
-            simulated=read_simulated(arguments.simulated, arguments.group),
+            simulated=read_beside(arguments, table),
             jobs=arguments.jobs,
             on_pass=bar.advance,
         )

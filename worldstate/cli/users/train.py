@@ -8,14 +8,15 @@ released one, counts as OVAD's unless --array and --sample-rate say otherwise.
   --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
   --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
                        thresholds half-way between recordings left out and junctions left out;
-                       with --simulated it learns simulated windows too: for a standing ego
+                       with --simulated it learns simulated windows too, with --streams the classes both and
+                       direct as well: for a standing ego
 """
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.feature_options import add_table_options, read_simulated
+from worldstate.cli.common.feature_options import add_table_options, read_beside
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             dataset=arguments.source or arguments.table.name,
             group=arguments.group,
             excluded_lists=[path.name for path in arguments.exclude],
-            simulated=read_simulated(arguments.simulated, arguments.group),
+            simulated=read_beside(arguments, kept),
             on_step=bar.advance,
         )
     save_model(arguments.out, model)

@@ -142,7 +142,11 @@ def train_model(
 def _classifier(method: TrainingMethod, simulated: SimulatedWindows | None) -> str:
     if method != "worldstate":
         return CLASSIFIER
-    return ENSEMBLE if simulated is None else f"{ENSEMBLE}; {len(simulated.y)} simulated windows too"
+    if simulated is None:
+        return ENSEMBLE
+    names, counts = np.unique(simulated.y, return_counts=True)
+    told = ", ".join(f"{count} {name}" for name, count in zip(names.tolist(), counts.tolist(), strict=True))
+    return f"{ENSEMBLE}; {len(simulated.y)} simulated windows too: {told}"
 
 
 def _out_of_fold_levels(

@@ -1,0 +1,121 @@
+"""Windows cut from streams that were listened to, labelled by who drove there.
+
+A stream holds what single recordings do not: vehicles from both sides at once, one behind another, and hours
+of distant ones and of those in plain view, which are no hazards.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows
+from worldstate.abduction.signature.site_reference import log_levels, site_reference
+from worldstate.abduction.signature.site_signature import HOP_S
+from worldstate.abduction.signature.window_classes import BOTH
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
+
+from .heard_stream import HeardStream
+
+UNUSED = ""
+# Hidden: a second or less before it comes into view. Of two, the later one is as loud as that within 2.5 s.
+HIDDEN_S, SECOND_S = 1.0, 2.5
+# In view: from half a second after it came, the released front windows end 1.5 s after; farther than this a
+# vehicle is hardly heard. Windows that hold its sound, to a second after it has gone, are of no other class.
+FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
+# Empty: nobody comes for so long, as nobody does in the second before.
+CALM_S = 5.0
+# Hardly heard before they are seen: as hidden windows they would be wrong labels, as empty ones too.
+QUIET_KINDS = ("bicycle", "scooter")
+
+
+@dataclass(frozen=True, slots=True)
+class CuttingSettings:
+    """Which hops become windows."""
+
+    every_s: float = 0.5  # Apart at least, while somebody is hidden; windows overlap
+    rest_every_s: float = 4.0  # Apart at least otherwise: most of a stream is empty
+    # Of a hidden window, beside a real one of weight 1; all in view, and all empty, weigh as all hidden.
+    weight: float = 0.3
+
+
+def hop_labels(stream: HeardStream) -> TextArray:
+    """Return the class of the second that ends at each hop, shape (n,); empty where it is in between."""
+    left, right = (_comes_within(stream, HIDDEN_S, side) for side in SIDES)
+    left_soon, right_soon = (_comes_within(stream, SECOND_S, side) for side in SIDES)
+    both = (left & right_soon) | (right & left_soon)
+    near, lately = _in_view(stream, *FRONT_S), _in_view(stream, 0.0, WINDOW_S)
+    # The hop at which it comes into view is still the last of the hidden ones.
+    covered = _in_view(stream, 0.5 * HOP_S, WINDOW_S)
+    anyone = _comes_within(stream, CALM_S) | _comes_within(stream, CALM_S, quiet=True)
+    calm = ~anyone & ~lately
+    # A vehicle in view covers one behind it: what is heard then is no clean window of either.
+    clean = ~covered & ~_comes_within(stream, SECOND_S, quiet=True)
+    one = (left & ~right_soon & clean, right & ~left_soon & clean)
+    known = (both & clean, *one, near & ~anyone, calm)
+    return np.select(known, (BOTH, "left", "right", "front", "none"), UNUSED)
+
+
+def stream_windows(
+    streams: Sequence[HeardStream], settings: CuttingSettings | None = None
+) -> SimulatedWindows:
+    """Cut windows from streams, each compared with all that were cut at its site."""
+    chosen = settings or CuttingSettings()
+    cut = [_cut(stream, chosen) for stream in streams]
+    features = np.concatenate([stream.hops.feature[rows] for stream, rows, _ in cut]).astype(np.float64)
+    sites = np.concatenate([np.full(len(rows), stream.hops.about["site"]) for stream, rows, _ in cut])
+    labels = np.concatenate([names for _, _, names in cut])
+    references = np.empty((len(sites), 3 * features.shape[1]))
+    for site in np.unique(sites):
+        references[sites == site] = site_reference(log_levels(features[sites == site])).row
+    weights = chosen.weight * _balance(labels)
+    return SimulatedWindows(np.hstack([features, references]), labels, sites, weights)
+
+
+def _cut(stream: HeardStream, settings: CuttingSettings) -> tuple[HeardStream, IndexArray, TextArray]:
+    labels, time = hop_labels(stream), stream.hops.time_s
+    rows = []
+    for name in np.unique(labels[labels != UNUSED]):
+        apart = settings.rest_every_s if name in ("none", "front") else settings.every_s
+        rows.append(_thinned(np.flatnonzero(labels == name), time, apart))
+    kept = np.sort(np.concatenate(rows)) if rows else np.zeros(0, np.intp)
+    return stream, kept, labels[kept]
+
+
+def _balance(labels: TextArray) -> FloatArray:
+    """Return weights under which hidden, in view and empty weigh the same, as in the released windows."""
+    weights, hidden = np.ones(len(labels)), np.isin(labels, (*SIDES, BOTH))
+    for name in ("front", "none"):
+        here = labels == name
+        weights[here] = hidden.sum() / max(here.sum(), 1)
+    return weights
+
+
+def _thinned(rows: IndexArray, time_s: FloatArray, apart_s: float) -> IndexArray:
+    """Return rows so far apart, counted from the last: that before a vehicle comes into view is kept."""
+    kept: list[int] = []
+    for row in rows[::-1].tolist():
+        if not kept or time_s[kept[-1]] - time_s[row] >= apart_s - 1e-6:
+            kept.append(row)
+    return np.array(kept[::-1], np.intp)
+
+
+def _comes_within(stream: HeardStream, seconds: float, side: str = "", *, quiet: bool = False) -> BoolArray:
+    """Tell when a vehicle, or a quiet one, out of a hidden arm comes into view so soon, shape (n,)."""
+    vehicles = stream.vehicles
+    asked = vehicles.hazard & (np.isin(vehicles.kind, QUIET_KINDS) == quiet)
+    entries = vehicles.entry_s[asked & ((vehicles.arm == side) | (side == ""))]
+    left_s = entries[None, :] - stream.hops.time_s[:, None]
+    return np.asarray(((left_s >= 0.0) & (left_s <= seconds)).any(axis=1))
+
+
+def _in_view(stream: HeardStream, after_s: float, stays_s: float) -> BoolArray:
+    """Tell from how long after a vehicle near by came into view to how long after it left, shape (n,)."""
+    rows, time = stream.rows, stream.hops.time_s
+    near = np.zeros(len(time), np.bool_)
+    seen = rows.in_view & (np.hypot(rows.x_m, rows.y_m) <= NEAR_M)
+    for number in np.unique(rows.vehicle[seen]):
+        mine = rows.time_s[seen & (rows.vehicle == number)]
+        near |= (time >= mine[0] + after_s) & (time <= mine[-1] + stays_s)
+    return near
