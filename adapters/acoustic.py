@@ -45,8 +45,8 @@ class AcousticSettings:
     Parameters
     ----------
     min_prominence : float
-        A spatial spectrum whose peak-to-median ratio is not above this gives no bearing, >= 1; silence has 1.
-        Recordings without a vehicle have 1.18 in the median, those with one in sight 1.60.
+        A spatial spectrum whose peak-to-median ratio is not above this, >= 1, or not above what noise reaches
+        with this array (`AcousticFrame.least_prominence`), gives no bearing.
     coarse_std_rad : float
         With a larger standard deviation the whole side is searched for co-evidence instead of a sector.
 
@@ -62,7 +62,8 @@ class AcousticSettings:
     """
 
     min_prominence: float = 1.0
-    coarse_std_rad: float = math.radians(10.0)
+    # Up to there nine of ten simulated vehicles in view lie in the sector that the camera is asked about.
+    coarse_std_rad: float = math.radians(20.0)
 
     def __post_init__(self) -> None:
         in_range("min_prominence", self.min_prominence, 1.0, math.inf)
@@ -224,8 +225,9 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
 def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotUsable:
     if not math.isfinite(frame.bearing_rad):
         return NotUsable("no peak in the spatial spectrum")
-    if frame.prominence <= settings.min_prominence:
-        ratio = f"{frame.prominence:.2f}, not above {settings.min_prominence:.2f}"
+    least = max(settings.min_prominence, frame.least_prominence)
+    if frame.prominence <= least:
+        ratio = f"{frame.prominence:.2f}, not above {least:.2f}"
         return NotUsable(f"peak-to-median ratio {ratio}")
     return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence)
 

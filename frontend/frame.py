@@ -41,6 +41,8 @@ class AcousticFrame:
         Azimuth of the highest peak over the last `bearing_hops` hops and its standard deviation, radians.
     prominence : float
         Peak-to-median ratio of the spectrum that the bearing was read from.
+    least_prominence : float
+        Ratio that noise reaches with this array; a peak not above it says nothing of any direction.
     elevation_rad : float
         Elevation of that peak, radians.
     peaks : tuple of Peak
@@ -93,6 +95,7 @@ class AcousticFrame:
     band_log_energy: FloatArray
     looming: Looming | NotUsable
     feature: FloatArray
+    least_prominence: float = 1.0
     bearing_age_s: float = 0.0
     health: ArrayHealth | NotUsable = _NOT_MONITORED
     tone: ToneReading | NotUsable = TONE_IS_OFF

@@ -53,7 +53,12 @@ class HopSpectra:
             slice(b.start - bins.start, b.stop - bins.start) for b in bands
         )
         frequencies = bin_frequencies_hz(self.srp_bins, sample_rate_hz, nfft)
-        self._beams = Steering.towards(array, frequencies, *settings.directions_rad(), speed)
+        # A row of elevation each: the few dimensions and nodes that do for one are too many for all together.
+        azimuths = settings.azimuths_rad()
+        self.beams = tuple(
+            Steering.towards(array, frequencies, azimuths, elevation, speed)
+            for elevation in settings.elevations_rad()
+        )
         self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft, speed)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order
@@ -100,12 +105,11 @@ class HopSpectra:
         self, music: MusicStage, spectra: Complex64Array, powers: Float32Array, prewhitened: list[Steered]
     ) -> None:
         """Give MUSIC the raw spectra, or the prewhitened ones at the level of the raw ones."""
-        if not prewhitened or prewhitened[0][1] is self._beams:
+        if not prewhitened or prewhitened[0][1] is self.beams[0]:
             music.push(spectra[:, self._srp])
         else:
-            whitened, beams = prewhitened[0]
             level = np.sqrt(powers[:, self._srp].mean(axis=2, keepdims=True))
-            music.push(whitened * level, beams)
+            music.push(prewhitened[0][0] * level, [beams for _, beams in prewhitened[: len(self.beams)]])
 
     def _sums(
         self,
@@ -115,21 +119,22 @@ class HopSpectra:
         mask: ChannelMask,
     ) -> tuple[FloatArray, Complex128Array]:
         """Return steered power and pair sums of one hop, scaled to all microphones."""
-        srp = prewhitened[0] if prewhitened else (whitened[:, self._srp], self._beams)
-        if len(prewhitened) > 1:
-            pairs = pair_sum(*prewhitened[1], self._order)
+        n_rows = len(self.beams)
+        rows = prewhitened[:n_rows] or [(whitened[:, self._srp], beams) for beams in self.beams]
+        if len(prewhitened) > n_rows:
+            pairs = pair_sum(*prewhitened[n_rows], self._order)
         else:
             pairs = pair_sum_of(mask.cross(matrices), self._feature_beams, self._order)
-        power = steered_power(*srp) * mask.power_scale
+        power = np.concatenate([steered_power(*row) for row in rows]) * mask.power_scale
         if self.ego_noise is not None:
-            power = self.ego_noise.levelled(power, len(srp[0]))
+            power = self.ego_noise.levelled(power, len(whitened))
         return power, pairs * mask.pair_scale
 
     def _music(self, n_microphones: int, settings: FrontEndSettings) -> MusicStage | None:
         if not settings.music_sources:
             return None
         azimuths, sources = settings.azimuths_rad(), settings.music_sources
-        return MusicStage(self._beams, azimuths, sources, n_microphones, settings.window_hops)
+        return MusicStage(self.beams, azimuths, sources, n_microphones, settings.window_hops)
 
     def _monitor(
         self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings
@@ -145,7 +150,7 @@ class HopSpectra:
         chosen, nfft = settings.ego_noise, settings.nfft
         if chosen is None:
             return None
-        beams = [(self._beams, self._srp)]
+        beams = [(row, self._srp) for row in self.beams]
         if chosen.feature:
             beams.append((self._feature_beams, self._feature))
         part = spanned(part for _, part in beams)

@@ -12,10 +12,12 @@ from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, m
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
+from worldstate.frontend.direction.noise_floor import noise_prominence
 from worldstate.frontend.direction.peaks import highest_peaks
 from worldstate.frontend.direction.srp import normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
 from worldstate.frontend.spectra.bands import SILENCE
+from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
@@ -112,6 +114,7 @@ class FrontEnd:
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
         with one_blas_thread():
             self._spectra = HopSpectra(array, self.sample_rate_hz, settings)
+            self._least_prominence = self._noise_prominence()
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._tone = self._tone_stage()
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
@@ -248,8 +251,9 @@ class FrontEnd:
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         settings, health, music = self.settings, self._hops[-1].health, self._spectra.music
         recent, window = self._srp(settings.bearing_hops), self._srp(settings.window_hops)
-        peaks = highest_peaks(recent.max(axis=0), self._azimuths, settings.max_peaks)
-        bearing = bearing_of(peaks, self._azimuths, settings.bearing_std_rad)
+        spectrum, floor = recent.max(axis=0), self._least_prominence
+        peaks = highest_peaks(spectrum, self._azimuths, settings.max_peaks)
+        bearing = bearing_of(spectrum, peaks, self._azimuths, floor, settings.bearing_std_rad)
         return AcousticFrame(
             stamp_ns=self._start_ns + nanoseconds(hop.end / self.sample_rate_hz),
             sample_index=hop.end,
@@ -260,6 +264,7 @@ class FrontEnd:
             bearing_rad=bearing.azimuth_rad,
             bearing_std_rad=bearing.std_rad,
             prominence=bearing.prominence,
+            least_prominence=floor,
             elevation_rad=self._elevation_rad(recent, bearing.azimuth_rad),
             peaks=peaks,
             ambiguity=self._ambiguity,
@@ -272,6 +277,14 @@ class FrontEnd:
             health=health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
         )
+
+    def _noise_prominence(self) -> float:
+        """Return the peak-to-median ratio that noise reaches in the interval of a bearing."""
+        settings, spectra = self.settings, self._spectra
+        frequencies = bin_frequencies_hz(spectra.srp_bins, self.sample_rate_hz, settings.nfft)
+        n_frames = settings.bearing_hops * 2.0 * self.sample_rate_hz / (settings.hop_rate_hz * settings.nfft)
+        speed = settings.speed_of_sound_m_s
+        return noise_prominence(spectra.beams, self.array, frequencies, n_frames, speed)
 
     def _last(self, n_hops: int) -> list[HopSums]:
         return list(self._hops)[-n_hops:]

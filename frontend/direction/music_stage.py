@@ -1,5 +1,6 @@
 """MUSIC on a stream: the covariance of a running window, its tracked subspace, and the spectrum."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,7 @@ class MusicStage:
 
     def __init__(
         self,
-        beams: Steering,
+        beams: Sequence[Steering],
         azimuths_rad: FloatArray,
         sources: int,
         n_microphones: int,
@@ -43,14 +44,14 @@ class MusicStage:
         if not 1 <= sources < n_microphones:
             expected = f"1 to {n_microphones - 1} with {n_microphones} microphones"
             raise InvalidArgumentError(f"music_sources: expected {expected}, got {sources}")
-        self._beams = beams
-        self._whitened: Steering | None = None
+        self._beams = beams  # One row of elevation each
+        self._whitened: Sequence[Steering] | None = None
         self._azimuths = azimuths_rad
         self._sources = sources
-        self._window = WindowSum(window_hops, len(beams.weights), n_microphones)
+        self._window = WindowSum(window_hops, len(beams[0].weights), n_microphones)
         self._tracker = SubspaceTracker(sources)
 
-    def push(self, spectra: Complex64Array, beams: Steering | None = None) -> None:
+    def push(self, spectra: Complex64Array, beams: Sequence[Steering] | None = None) -> None:
         r"""Take the frames of a hop (frames, K, M), and the beams that belong to them if they are whitened.
 
         .. math:: R_k = \sum_{t \in window} x_{t,k}\, x_{t,k}^H
@@ -81,8 +82,8 @@ class MusicStage:
         """Return the normalised spectrum of `music_spectrum` on the factored beams."""
         beams = self._beams if self._whitened is None else self._whitened
         # A plain steering vector has modulus one at every microphone.
-        length = mask.n_kept if self._whitened is None else beams.squared_lengths(mask.keep)
-        floor = np.finfo(np.float32).eps * mask.n_kept
-        outside = np.maximum(length - beams.power_within(vectors), floor)
+        lengths = [mask.n_kept if self._whitened is None else one.squared_lengths(mask.keep) for one in beams]
+        rows = [length - one.power_within(vectors) for length, one in zip(lengths, beams, strict=True)]
+        outside = np.maximum(np.concatenate(rows, axis=1), np.finfo(np.float32).eps * mask.n_kept)
         score = outside.min(axis=1, keepdims=True) / outside
         return np.asarray(score.mean(axis=0))

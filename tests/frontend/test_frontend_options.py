@@ -45,12 +45,12 @@ def test_azimuth_and_elevation(azimuth: float, elevation: float) -> None:
     assert np.degrees(frame.elevation_rad) == pytest.approx(elevation, abs=2.0)
 
 
-def test_the_horizon_row_is_the_default() -> None:
+def test_the_horizon_and_the_street_below_are_the_default() -> None:
     sound = waves(ARRAY, [(20.0, 5.0)])
-    wide = FrontEnd(ARRAY, RATE, FrontEndSettings(elevation_span_deg=(-10.0, 10.0))).process(sound)[-1]
+    wide = FrontEnd(ARRAY, RATE, FrontEndSettings(elevation_span_deg=(-12.0, 12.0))).process(sound)[-1]
     plain = FrontEnd(ARRAY, RATE).process(sound)[-1]
-    np.testing.assert_allclose(wide.srp_map[2], plain.srp, rtol=1e-4)
-    assert plain.srp_map.shape == (1, 181)
+    np.testing.assert_allclose(wide.srp_map[:2], plain.srp_map, rtol=1e-4)
+    assert plain.srp_map.shape == (2, 181)
     assert plain.elevation_rad == 0.0
 
 

@@ -91,7 +91,7 @@ def test_a_window_sum_forgets_what_was_loud(length: int, levels: list[float]) ->
 def test_stream_equals_pyroomacoustics_on_the_same_frames(snr: float, sources: int) -> None:
     """Every hop of a source that moves at 40 deg/s, in noise without any source, and far above the noise."""
     rng, window = np.random.default_rng(3), 5
-    stage = MusicStage(BEAMS, GRID, sources, 56, window)
+    stage = MusicStage([BEAMS], GRID, sources, 56, window)
     peer = pra.doa.MUSIC(
         ROOF.positions_m.T, RATE, NFFT, c=343.0, num_src=sources, azimuth=GRID, frequency_normalization=True
     )
@@ -120,10 +120,10 @@ def test_whitened_music_is_the_generalised_eigenvalue_form() -> None:
     B = roots @ RESPONSE
     B *= np.sqrt(56.0) / np.linalg.norm(B, axis=1, keepdims=True)
     beams = Steering(None, B.conj().astype(np.complex64), B.astype(np.complex64))
-    stage = MusicStage(BEAMS, GRID, 1, 56, 1)
+    stage = MusicStage([BEAMS], GRID, 1, 56, 1)
     stage.push(X.astype(np.complex64))
     raw = stage.read(mask)
-    stage.push(whitened, beams)
+    stage.push(whitened, [beams])
     reading = stage.read(mask)
     assert isinstance(raw, MusicReading)
     assert isinstance(reading, MusicReading)

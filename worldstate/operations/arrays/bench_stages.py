@@ -70,7 +70,7 @@ class _Stages:
         self._beams, self._feature_beams = srp_beams(), feature_steering(array, FEATURE_BINS, RATE_HZ)
         self._meter = LevelMeter(56, RATE_HZ, FrontEndSettings())
         self._tone = ToneStage(array, RATE_HZ, ENGINE_BAND_HZ)
-        self._music = MusicStage(self._beams, AZIMUTHS_RAD, 1, 56, window_hops=10)
+        self._music = MusicStage([self._beams], AZIMUTHS_RAD, 1, 56, window_hops=10)
         self._monitor = ChannelMonitor(array, bin_frequencies_hz(FEATURE_BINS, RATE_HZ, NFFT), RATE_HZ)
         self._powers: list[NDArray[Any]] = []
         self._pairs: list[NDArray[Any]] = []
