@@ -75,15 +75,17 @@ class BoostedTrees:
 
     def scores(self, X: FloatArray) -> FloatArray:
         """Return the sums before the softmax, shape (n, inputs) -> (n, classes)."""
-        trees = np.arange(len(self.split))
-        rows = np.arange(len(X))[:, None]
-        node = np.zeros((len(X), len(trees)), np.intp)
+        # Flat indices: a walk of two rows takes a sixth of what indexing by row and tree takes.
+        first = np.arange(len(self.split)) * self.split.shape[1]
+        row = np.arange(len(X))[:, None] * X.shape[1]
+        node = np.zeros((len(X), len(first)), np.intp)
         while True:
+            at = first + node
             # Every tree of every row goes one question further; those in a leaf stay there.
-            asked = X[rows, self.split[trees, node]] <= self.threshold[trees, node]
-            following = np.where(asked, self.yes[trees, node], self.no[trees, node])
+            below = X.take(row + self.split.take(at)) <= self.threshold.take(at)
+            following = np.where(below, self.yes.take(at), self.no.take(at))
             if (following == node).all():
                 break
             node = following
         of_class = self.tree_class[:, None] == np.arange(len(self.baseline))
-        return np.asarray(self.baseline + self.value[trees, node] @ of_class)
+        return np.asarray(self.baseline + self.value.take(first + node) @ of_class)

@@ -16,7 +16,7 @@ import numpy as np
 from worldstate.ground.checks import freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import Layout
-from worldstate.ground.typing import FloatArray
+from worldstate.ground.typing import BoolArray, FloatArray
 
 from .boosted_trees import BoostedTrees
 from .sequence_inputs import INPUTS, SIDES, HopEvidence, sequence_inputs
@@ -28,6 +28,8 @@ GROUPS = (*(f"coming_{end_s:g}s" for end_s in COMING_S), *OTHERS)
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
 # Times are stated of vehicles that come within so long: beyond, nothing in the sound says when.
 LONGEST_S = 5.0
+SMOOTHED_HOPS, HELD_HOPS = 3, 10
+_SMALLEST = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +68,40 @@ def _crossing(below: FloatArray, edges: FloatArray, level: float) -> FloatArray:
     return np.asarray(edges[upper - 1] + np.clip(part, 0.0, 1.0) * (edges[upper] - edges[upper - 1]))
 
 
+@dataclass(frozen=True, slots=True)
+class SequenceAlarm:
+    """When a side is in alarm: log-odds of coming into view within three seconds, smoothed and held."""
+
+    threshold_nats: float  # Of the mean log-odds of .3 s
+    onsets_per_hour: float  # That hazard-free streams were allowed when it was set
+
+    def raised(self, posterior: SequencePosterior) -> BoolArray:
+        """Return whether each side is in alarm at every hop of a stream, shape (n, 2)."""
+        over = smoothed_log_odds(posterior) >= self.threshold_nats
+        return np.stack([held(side) for side in over.T], axis=1)
+
+
+def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
+    """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
+    within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
+    log_odds = np.log(within) - np.log1p(-within)
+    padded = np.concatenate([np.repeat(log_odds[:1], SMOOTHED_HOPS - 1, axis=0), log_odds])
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, SMOOTHED_HOPS, axis=0).mean(axis=-1))
+
+
+def held(over: BoolArray, hops: int = HELD_HOPS) -> BoolArray:
+    """Return an alarm that stays for so many hops after the last one above its threshold.
+
+    Examples
+    --------
+    >>> held(np.array([False, True, False, False, False]), hops=2)
+    array([False,  True,  True,  True, False])
+    """
+    at = np.arange(len(over))
+    last = np.maximum.accumulate(np.where(over, at, -hops - 1))
+    return np.asarray(at - last <= hops)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceModel:
     """Trees over the groups, the shares that they were trained at, and how far times may be off."""
@@ -75,6 +111,7 @@ class SequenceModel:
     trees: BoostedTrees
     share: FloatArray  # shape (groups,): Of hops and sides of the streams that it was trained on
     margin_s: float = 0.0  # Beyond the trees' own interval, so that it holds nine of ten
+    alarm: SequenceAlarm | None = None  # Before one is set
 
     def __post_init__(self) -> None:
         freeze_arrays(self, share=(len(GROUPS),))

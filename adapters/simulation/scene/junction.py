@@ -187,7 +187,7 @@ def site(name: str) -> Site:
         return replace(site("S" + name[1:]), name=name)
     if name not in SITES:
         raise InvalidArgumentError(f"site: expected one of {', '.join(SITES + MOVING_SITES)}, got {name!r}")
-    return PLANS[name] if name in PLANS else _drawn(name)
+    return PLANS[name] if name in PLANS else drawn_site(name)
 
 
 # Fitted: a search for the least difference, and the least odd part of it, between the expected pattern
@@ -235,8 +235,14 @@ PLANS = {
 }
 
 
-def _drawn(name: str) -> Site:
-    """Draw a site from the family of those in `PLANS`, by a generator seeded with its name."""
+def drawn_site(name: str) -> Site:
+    """Draw a site from the family of those in `PLANS`, by a generator seeded with its name.
+
+    Examples
+    --------
+    >>> drawn_site("SA101").opposite_wall_m is None, drawn_site("SB101").opposite_wall_m is None
+    (False, True)
+    """
     rng = site_generator(name)
     with_wall = name.startswith("SA")
     ahead, corners = rng.uniform(4.5, 5.2), rng.uniform(2.3, 3.1, 2)

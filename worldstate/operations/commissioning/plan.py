@@ -1,0 +1,92 @@
+"""Which streams a model for an array is learned from, and which ones examine it."""
+
+from dataclasses import dataclass
+
+from worldstate.adapters.simulation.scene.junction import SITES, drawn_site, site
+from worldstate.adapters.simulation.scene.settings import rate_for
+from worldstate.adapters.simulation.stream.settings import StreamSettings
+from worldstate.adapters.simulation.stream.traffic import traffic_named
+from worldstate.ground.checks import in_range
+
+APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
+# Seeds of streams that are learned from and of those that examine; neither is ever the other.
+LEARNED_SEED, EXAM_SEED = 1000, 2000
+
+
+@dataclass(frozen=True, slots=True)
+class CommissionSettings:
+    """How much is simulated, and what alarms are allowed.
+
+    Parameters
+    ----------
+    junctions : int
+        Drawn junctions to learn from, half with a wall across the crossing street; with few, a model learns
+        these streets instead of streets.
+    approach_minutes, hazard_free_minutes : float
+        Stream at each of them.
+    exam_minutes : float
+        Hazard-free stream at each junction of the exam; approaches take three fifths of that.
+    onsets_per_hour : float
+        Alarms allowed where nobody comes.
+    bandwidth_hz : float
+        Sound is rendered up to here.
+    seed : int
+        Another seed, other streams.
+    leave_out : tuple of str
+        Sites never to be learned from, windows of the real junction included.
+
+    Examples
+    --------
+    >>> plan = learned_streams(CommissionSettings(junctions=2))
+    >>> [f"{one.site.name} {one.traffic.name} {one.minutes:g}" for one in plan][:2]
+    ['SA101 approaches 7.2', 'SA101 no-hazard 6']
+    """
+
+    junctions: int = 16
+    approach_minutes: float = 7.2
+    hazard_free_minutes: float = 6.0
+    exam_minutes: float = 24.0
+    onsets_per_hour: float = 20.0
+    bandwidth_hz: float = 2000.0
+    seed: int = 1
+    leave_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        in_range("junctions", self.junctions, 2, 200)
+        in_range("approach_minutes", self.approach_minutes, 0.5, 120.0)
+        in_range("hazard_free_minutes", self.hazard_free_minutes, 0.5, 120.0)
+        in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
+        in_range("onsets_per_hour", self.onsets_per_hour, 0.1, 3600.0)
+        in_range("seed", self.seed, 0, LEARNED_SEED - 1)
+
+
+def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
+    """Return the streams that a model learns from: drawn junctions, none of the five with a name."""
+    kinds = ((APPROACHES, settings.approach_minutes), (HAZARD_FREE, settings.hazard_free_minutes))
+    return [
+        _stream(f"S{'AB'[i % 2]}{101 + i // 2}", traffic, minutes, LEARNED_SEED + settings.seed, settings)
+        for i in range(settings.junctions)
+        for traffic, minutes in kinds
+    ]
+
+
+def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
+    """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
+    kinds = ((APPROACHES, 0.6 * settings.exam_minutes), (HAZARD_FREE, settings.exam_minutes))
+    return [
+        _stream(name, traffic, minutes, EXAM_SEED + settings.seed, settings)
+        for name in SITES
+        for traffic, minutes in kinds
+    ]
+
+
+def _stream(
+    name: str, traffic: str, minutes: float, seed: int, settings: CommissionSettings
+) -> StreamSettings:
+    return StreamSettings(
+        site(name) if name in SITES else drawn_site(name),
+        minutes,
+        seed,
+        traffic_named(traffic),
+        sample_rate_hz=rate_for(settings.bandwidth_hz),
+    )

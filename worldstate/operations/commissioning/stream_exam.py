@@ -1,0 +1,235 @@
+"""What a sequence model is worth on streams: approaches detected, alarms an hour, calibration, times.
+
+An approach is one vehicle, two that come from both sides at once, or one with another behind it. It is
+detected where an alarm stands at some hop of the five seconds before the first T0, and its lead is counted
+from the first such hop; the next approach lies farther away than that. An onset is a rising edge of the alarm
+of either side in a stream without hazards.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
+from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.sequence.sequence_model import (
+    HORIZONS_S,
+    LONGEST_S,
+    SequenceAlarm,
+    SequencePosterior,
+    held,
+    smoothed_log_odds,
+)
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.operations.metrics.alarm_rate import poisson_interval
+from worldstate.operations.metrics.time_to_visible import visible_errors
+from worldstate.operations.recordings.advisories import (
+    LONGEST_LEAD_S,
+    SECONDS_PER_HOUR,
+    SLACK_S,
+    rising_edges,
+)
+
+from .heard_stream import HeardStream
+from .stream_labels import StreamTruth
+
+HOP_S = 0.1
+TOGETHER_S, FOLLOWING_S, AFTER_S = 4.0, 6.0, 6.0
+# Hardly heard before they are seen; told apart, with no target of their own.
+QUIET_KINDS = ("bicycle", "scooter", "electric")
+_CALIBRATED_S = (1.0, 2.0, 3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """Vehicles that belong together, the first to come into view first."""
+
+    flow: str  # "single", "both" or "queue"
+    entries_s: tuple[float, ...]
+    sides: tuple[int, ...]
+    kinds: tuple[str, ...]
+
+    @property
+    def quiet(self) -> bool:
+        """Whether any of them is a quiet road user."""
+        return any(kind in QUIET_KINDS for kind in self.kinds)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExaminedStream:
+    """A stream, what a model believed of it, and the alarm that was set without it."""
+
+    heard: HeardStream
+    truth: StreamTruth
+    posterior: SequencePosterior
+    alarm: SequenceAlarm
+
+
+def approaches(heard: HeardStream) -> list[Approach]:
+    """Collect the approaches of a stream by the flows that its vehicles arrived in."""
+    vehicles = heard.vehicles
+    order = np.argsort(vehicles.entry_s)
+    left = [i for i in order.tolist() if vehicles.hazard[i] and np.isfinite(vehicles.entry_s[i])]
+    found = []
+    while left:
+        first = left.pop(0)
+        flow, entry_s = vehicles.flow[first], vehicles.entry_s[first]
+        with_it = [i for i in left if _belongs(flow, vehicles.flow[i], vehicles.entry_s[i] - entry_s)]
+        # A follower's leader is the only one of its arm so shortly before it.
+        with_it = [i for i in with_it if (vehicles.arm[i] == vehicles.arm[first]) == (flow == "queue")]
+        left = [i for i in left if i not in with_it]
+        every = [first, *with_it]
+        found.append(
+            Approach(
+                flow if flow in ("both", "queue") else "single",
+                tuple(vehicles.entry_s[every].tolist()),
+                tuple(SIDES.index(arm) for arm in vehicles.arm[every]),
+                tuple(vehicles.kind[every].tolist()),
+            )
+        )
+    return found
+
+
+def _belongs(flow: str, other: str, later_s: float) -> bool:
+    if flow == "both":
+        return other == "both" and later_s < TOGETHER_S
+    return flow == "queue" and other == "follows" and later_s < FOLLOWING_S
+
+
+def alarm_for(quiet: Sequence[SequencePosterior], onsets_per_hour: float) -> SequenceAlarm:
+    """Return the lowest threshold at which hazard-free streams have no more onsets an hour."""
+    louder = [smoothed_log_odds(one).max(axis=1) for one in quiet]
+    if not louder:
+        raise InvalidArgumentError("quiet: expected at least one hazard-free stream, got none")
+    pooled = np.sort(np.concatenate(louder))
+    hours = pooled.size * HOP_S / SECONDS_PER_HOUR
+    # Downwards in steps of a share of the hops: onsets rise with every step but for hops that join alarms.
+    ranks = np.unique(np.geomspace(1, 0.3 * pooled.size, 200).astype(np.intp))
+    chosen = float(pooled[-1]) + 1e-6
+    for threshold in pooled[-ranks].tolist():
+        onsets = sum(rising_edges(held(one >= threshold)).size for one in louder)
+        if onsets / hours > onsets_per_hour:
+            break
+        chosen = threshold
+    return SequenceAlarm(chosen, onsets_per_hour)
+
+
+def examine(streams: Sequence[ExaminedStream]) -> dict[str, float | int | None]:
+    """Return the figures of some streams together, ready for a table and for JSON."""
+    told = [one for stream in streams for one in _outcomes(stream)]
+    loud = [one for one in told if not one.approach.quiet]
+    found: dict[str, float | int | None] = {"approaches": len(loud), **_detections(loud)}
+    for flow in ("single", "both", "queue"):
+        found[f"detected_{flow}"] = _mean([one.detected for one in loud if one.approach.flow == flow])
+    found["detected_quiet"] = _mean([one.detected for one in told if one.approach.quiet])
+    singles = [one for one in loud if one.approach.flow == "single"]
+    found["other_side_too"] = _mean([one.other_side for one in singles])
+    found["wrong_side_only"] = _mean([one.other_side and not one.own_side for one in singles])
+    found["both_sides_found"] = _mean([one.every_side for one in loud if one.approach.flow == "both"])
+    found["onsets_after"] = _mean([one.onsets_after for one in loud])
+    return found | _false_alarms(streams) | _calibration(streams) | _times(streams)
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    approach: Approach
+    lead_s: float  # 0 where missed
+    own_side: bool
+    other_side: bool
+    every_side: bool
+    onsets_after: int
+
+    @property
+    def detected(self) -> bool:
+        return self.lead_s > 0.0
+
+
+def _outcomes(stream: ExaminedStream) -> list[_Outcome]:
+    time_s, raised = stream.heard.hops.time_s, stream.alarm.raised(stream.posterior)
+    any_side = np.asarray(raised.any(axis=1))
+    onsets_s = time_s[rising_edges(any_side)]
+    told = []
+    for one in approaches(stream.heard):
+        first, last = one.entries_s[0], max(one.entries_s)
+        if first - LONGEST_LEAD_S < time_s[0] or last + AFTER_S > time_s[-1]:
+            continue
+        before = _before(time_s, first)
+        alarms_s = time_s[before & any_side]
+        by_side = np.asarray(raised[before].any(axis=0))
+        told.append(
+            _Outcome(
+                approach=one,
+                lead_s=first - float(alarms_s[0]) if alarms_s.size else 0.0,
+                own_side=bool(by_side[one.sides[0]]),
+                other_side=bool(by_side[1 - one.sides[0]]),
+                every_side=all(
+                    raised[_before(time_s, entry_s), side].any()
+                    for entry_s, side in zip(one.entries_s, one.sides, strict=True)
+                ),
+                onsets_after=int(((onsets_s >= last) & (onsets_s < last + AFTER_S)).sum()),
+            )
+        )
+    return told
+
+
+def _before(time_s: FloatArray, entry_s: float) -> BoolArray:
+    return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
+
+
+def _detections(told: Sequence[_Outcome]) -> dict[str, float | None]:
+    from scipy.stats import beta
+
+    hits, n = sum(one.detected for one in told), len(told)
+    # The exact interval of a share (C. Clopper and E. Pearson, Biometrika 26, 1934).
+    low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(0.975, hits + 1, n - hits)) if hits < n else 1.0
+    return {
+        "detected": _mean([one.detected for one in told]),
+        "detected_low": low if n else None,
+        "detected_high": high if n else None,
+        "lead_s": _mean([one.lead_s for one in told if one.detected]),
+        "lead_missed_as_0_s": _mean([one.lead_s for one in told]),
+    }
+
+
+def _false_alarms(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+    quiet = [one for one in streams if not one.heard.vehicles.columns.get("hazard", np.zeros(0)).any()]
+    alarms = [np.asarray(one.alarm.raised(one.posterior).any(axis=1)) for one in quiet]
+    hours = sum(map(len, alarms)) * HOP_S / SECONDS_PER_HOUR
+    if not hours:
+        return {"hazard_free_hours": 0.0, "onsets_per_hour": None, "hazard_free_share": None}
+    onsets = sum(rising_edges(one).size for one in alarms)
+    low, high = poisson_interval(onsets, hours)
+    rate = {"onsets_per_hour": onsets / hours, "onsets_low": low, "onsets_high": high}
+    return {"hazard_free_hours": hours, **rate, "hazard_free_share": _mean(np.concatenate(alarms))}
+
+
+def _calibration(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+    within = np.concatenate([one.posterior.within().reshape(-1, len(HORIZONS_S)) for one in streams])
+    coming_s = np.concatenate([one.truth.coming_s.reshape(-1) for one in streams])
+    found: dict[str, float | None] = {}
+    for horizon_s in _CALIBRATED_S:
+        said, true = within[:, HORIZONS_S.index(horizon_s)], coming_s <= horizon_s
+        found[f"skill_{horizon_s:g}s"] = brier_skill(said, true)
+        found[f"ece_{horizon_s:g}s"] = expected_calibration_error(said, true)
+    return found
+
+
+def _times(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+    coming = [one.truth.coming_s <= LONGEST_S for one in streams]
+    true = np.concatenate([one.truth.coming_s[at] for one, at in zip(streams, coming, strict=True)])
+    if not true.size:
+        return {"time_rmse_of_constant": None, "time_coverage": None, "time_width_s": None}
+    stated = [one.posterior.time_to_visible_s()[at] for one, at in zip(streams, coming, strict=True)]
+    errors = visible_errors(np.concatenate(stated), true)
+    return {
+        "time_rmse_of_constant": errors.rmse_s / errors.constant_rmse_s,
+        "time_coverage": errors.coverage,
+        "time_width_s": errors.width_s,
+    }
+
+
+def _mean(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
