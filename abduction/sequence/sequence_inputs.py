@@ -12,7 +12,10 @@ import numpy as np
 from worldstate.ground.typing import FloatArray
 
 MEMORY_HOPS = 31  # three seconds and the hop itself
-QUIET_HOPS, QUIET_SHARE = 600, 0.2  # the street's own level: the quietest fifth of the last minute
+QUIET_HOPS = 600
+# The street's own level is what the quietest fifth of the last minute stays below, its own evidence what half
+# of the minute does: another junction moves both, and a vehicle a few seconds long neither.
+QUIET_SHARE, USUAL_SHARE = 0.2, 0.5
 _SECOND, _TWO, _THREE = 10, 20, 30
 SIDES = ("left", "right")
 
@@ -39,9 +42,9 @@ class HopEvidence:
 
 
 INPUTS = (
-    *("this", "this_1s", "this_2s", "this_before", "this_highest"),
-    *("other", "other_1s", "other_2s", "other_highest"),
-    *("visible", "visible_1s", "visible_2s", "visible_highest"),
+    *("this", "this_above", "this_1s", "this_2s", "this_before", "this_highest"),
+    *("other", "other_above", "other_1s", "other_2s", "other_highest"),
+    *("visible", "visible_above", "visible_1s", "visible_2s", "visible_highest"),
     *("level", "level_1s", "level_2s"),
     *("loudness", "loudness_1s", "loudness_2s"),
     *("prominence", "prominence_1s"),
@@ -59,21 +62,24 @@ def sequence_inputs(evidence: HopEvidence) -> FloatArray:
     >>> sequence_inputs(flat).shape == (5, 2, len(INPUTS))
     True
     """
-    level, loudness = (one - quiet(one) for one in (evidence.level, evidence.loudness))
+    level, loudness = (one - running(one, QUIET_SHARE) for one in (evidence.level, evidence.loudness))
+    above = evidence.sides - np.stack([running(side, USUAL_SHARE) for side in evidence.sides.T], axis=1)
     # Where nothing could be read the rate is 0 and its deviation that of knowing nothing.
     refused = ~np.isfinite(evidence.looming_hz)
     rate = np.where(refused, 0.0, evidence.looming_hz)
     spread = np.where(refused, 10.0, np.minimum(evidence.looming_std_hz, 10.0))
     azimuth = np.where(np.isfinite(evidence.bearing_rad), evidence.bearing_rad, 0.0)
     swing = highest(azimuth, _SECOND) + highest(-azimuth, _SECOND)
-    shared = [evidence.visible, *_changes(evidence.visible), highest(evidence.visible, _THREE)]
+    shared = [evidence.visible, evidence.visible - running(evidence.visible, USUAL_SHARE)]
+    shared += [*_changes(evidence.visible), highest(evidence.visible, _THREE)]
     shared += [level, *_changes(evidence.level), loudness, *_changes(evidence.loudness)]
     shared += [evidence.prominence, ago(evidence.prominence, _SECOND), rate / spread, np.log(spread)]
     both = []
     for side in range(len(SIDES)):
         mine, other, sign = evidence.sides[:, side], evidence.sides[:, 1 - side], 1.0 - 2.0 * side
-        own = [mine, *_changes(mine), ago(mine, _SECOND) - ago(mine, _THREE), highest(mine, _THREE)]
-        own += [other, *_changes(other), highest(other, _THREE)]
+        own = [mine, above[:, side], *_changes(mine)]
+        own += [ago(mine, _SECOND) - ago(mine, _THREE), highest(mine, _THREE)]
+        own += [other, above[:, 1 - side], *_changes(other), highest(other, _THREE)]
         turned = [sign * azimuth, sign * (azimuth - ago(azimuth, _SECOND)), swing]
         both.append(np.stack([*own, *shared, *turned], axis=1))
     return np.stack(both, axis=1)
@@ -107,13 +113,19 @@ def highest(values: FloatArray, hops: int) -> FloatArray:
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, hops + 1).max(axis=1))
 
 
-def quiet(values: FloatArray) -> FloatArray:
-    """Return the value that the quietest fifth of the last minute stays below, hop by hop."""
+def running(values: FloatArray, share: float) -> FloatArray:
+    """Return the value that a share of the last minute stays below, hop by hop.
+
+    Examples
+    --------
+    >>> running(np.array([3.0, 1.0, 2.0]), 0.5)
+    array([3., 1., 2.])
+    """
     padded = np.concatenate([np.full(QUIET_HOPS - 1, np.nan), values])
     found = np.empty(len(values))
     heard = np.minimum(np.arange(len(values)) + 1, QUIET_HOPS)
     # NaN sorts last: the rank counts what was heard.
-    rank = np.floor(QUIET_SHARE * (heard - 1)).astype(np.intp)
+    rank = np.floor(share * (heard - 1)).astype(np.intp)
     windows = np.lib.stride_tricks.sliding_window_view(padded, QUIET_HOPS)
     for begin in range(0, len(values), 1000):
         block = np.sort(windows[begin : begin + 1000], axis=1)

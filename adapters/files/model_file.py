@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.signature_io import AnySignature
-from worldstate.ground.serialisation import Layout, Via, decode, encode
+from worldstate.ground.serialisation import ADDED, Layout, Via, decode, encode
 
 from .atomic import write_text
 from .json_file import read_json, refused_as_file
@@ -68,6 +69,8 @@ class Model:
         Threshold, sustained rule and risk map for each budget.
     provenance : Provenance
         Where it comes from.
+    sequence : SequenceModel, optional
+        From seconds of the signature's evidence to who comes into view, and when.
 
     Examples
     --------
@@ -76,11 +79,12 @@ class Model:
     [0.01, 0.02, 0.05]
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Model", "1.2.0", order="provenance signature policies")
+    LAYOUT: ClassVar = Layout("worldstate.Model", "1.3.0", order="provenance signature policies sequence")
 
     signature: AnySignature
     policies: Annotated[CueingPolicies, Via(tuple[CueingPolicy, ...], attrgetter("policies"), CueingPolicies)]
     provenance: Provenance
+    sequence: SequenceModel | None = field(default=None, metadata=ADDED)
 
     @property
     def domain(self) -> ModelDomain | None:
