@@ -58,7 +58,10 @@ def hear_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream
             middle.append(samples[:, stream.scene.microphones.middle].copy())
             frames += front_end.process(samples)
             loudness |= block.loudness_db
-    about = {"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed}
+    about = {
+        **{"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
+        "sample_rate_hz": settings.sample_rate_hz,
+    }
     hops = HopTable(_columns(frames, np.concatenate(middle)), name=_name(settings), about=about)
     return HeardStream(hops, _vehicles(stream), _rows(stream, loudness))
 

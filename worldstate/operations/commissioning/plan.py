@@ -1,6 +1,6 @@
 """Which streams a model for an array is learned from, and which ones examine it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from worldstate.adapters.simulation.scene.junction import SITES, drawn_site, site
 from worldstate.adapters.simulation.scene.settings import rate_for
@@ -33,7 +33,9 @@ class CommissionSettings:
     seed : int
         Another seed, other streams.
     leave_out : tuple of str
-        Sites never to be learned from, windows of the real junction included.
+        Real junctions whose labelled windows are not learned.
+    quick : bool
+        Whether this is to try the command: what comes out is marked as unfit for use.
 
     Examples
     --------
@@ -50,6 +52,7 @@ class CommissionSettings:
     bandwidth_hz: float = 2000.0
     seed: int = 1
     leave_out: tuple[str, ...] = ()
+    quick: bool = False
 
     def __post_init__(self) -> None:
         in_range("junctions", self.junctions, 2, 200)
@@ -58,6 +61,13 @@ class CommissionSettings:
         in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
         in_range("onsets_per_hour", self.onsets_per_hour, 0.1, 3600.0)
         in_range("seed", self.seed, 0, LEARNED_SEED - 1)
+
+
+def quick_settings(settings: CommissionSettings) -> CommissionSettings:
+    """Return settings under which two junctions of a minute each are all that is learned."""
+    return replace(
+        settings, junctions=2, approach_minutes=1.2, hazard_free_minutes=0.5, exam_minutes=2.0, quick=True
+    )
 
 
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
@@ -75,7 +85,7 @@ def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     kinds = ((APPROACHES, 0.6 * settings.exam_minutes), (HAZARD_FREE, settings.exam_minutes))
     return [
         _stream(name, traffic, minutes, EXAM_SEED + settings.seed, settings)
-        for name in SITES
+        for name in (SITES[2:3] if settings.quick else SITES)
         for traffic, minutes in kinds
     ]
 

@@ -24,6 +24,7 @@ from worldstate.abduction.sequence.sequence_model import (
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.alarm_rate import poisson_interval
+from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.recordings.advisories import (
     LONGEST_LEAD_S,
@@ -195,7 +196,7 @@ def _detections(told: Sequence[_Outcome]) -> dict[str, float | None]:
 
 
 def _false_alarms(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
-    quiet = [one for one in streams if not one.heard.vehicles.columns.get("hazard", np.zeros(0)).any()]
+    quiet = [one for one in streams if _hazard_free(one)]
     alarms = [np.asarray(one.alarm.raised(one.posterior).any(axis=1)) for one in quiet]
     hours = sum(map(len, alarms)) * HOP_S / SECONDS_PER_HOUR
     if not hours:
@@ -233,3 +234,37 @@ def _times(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
 
 def _mean(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
     return float(np.mean(values)) if len(values) else None
+
+
+def warned_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
+    """Return the share of approaches whose alarm stood that long before T0 or earlier, shape (times,)."""
+    leads = np.array(
+        [one.lead_s for stream in streams for one in _outcomes(stream) if not one.approach.quiet]
+    )
+    return np.array([np.mean(leads > before) if leads.size else np.nan for before in before_s])
+
+
+def auroc_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
+    """Return the AUROC of what alarms are read from, so long before T0 against hazard-free hops, (times,)."""
+    quiet = [smoothed_log_odds(one.posterior).max(axis=1) for one in streams if _hazard_free(one)]
+    if not quiet:
+        return np.full(len(before_s), np.nan)
+    none = np.concatenate(quiet)
+    areas = []
+    for before in before_s:
+        scores = np.concatenate([_scores_at(one, before) for one in streams])
+        labels = np.concatenate([np.ones(scores.size, bool), np.zeros(none.size, bool)])
+        area = auroc(np.concatenate([scores, none]), labels)
+        areas.append(np.nan if area is None else area)
+    return np.array(areas)
+
+
+def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
+    time_s, scores = stream.heard.hops.time_s, smoothed_log_odds(stream.posterior).max(axis=1)
+    entries = [one.entries_s[0] for one in approaches(stream.heard) if not one.quiet]
+    at = np.searchsorted(time_s, np.array(entries) - before_s + SLACK_S) - 1
+    return np.asarray(scores[at[(at >= 0)]])
+
+
+def _hazard_free(stream: ExaminedStream) -> bool:
+    return not stream.heard.vehicles.columns.get("hazard", np.zeros(0)).any()

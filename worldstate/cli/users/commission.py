@@ -1,0 +1,94 @@
+"""`worldstate commission`: an array in, a model for it and what to expect of it out.
+
+Simulate streets for an array, listen to them, learn what a window and what three seconds of windows say, set
+the alarm to what hazard-free streets allow, and examine all of it on five other junctions: approaches
+detected, lead, alarms an hour, both sides, times to visible. Usable before any microphone is bought.
+
+Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes on
+there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.operations.commissioning.plan import CommissionSettings
+
+EXAMPLE = """\
+examples:
+  worldstate commission --array mics.csv --out my_model.json --streams streams --jobs 2
+  worldstate commission --array mics.csv --out try.json --quick"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add_array_options(parser, "OVAD's")
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    add("--report", type=Path, metavar="JSON", help="write what the exam found")
+    add("--figure", type=Path, metavar="PNG", help="draw what the exam found")
+    streams = "keep streams that were listened to, and take those that are there (default: beside MODEL)"
+    add("--streams", type=Path, metavar="DIR", help=streams)
+    windows = "labelled windows of this array at real junctions, learned too: feat0..feat59, Class, ..."
+    add("--labelled", type=Path, metavar="CSV", help=windows)
+    add("--onsets", type=float, default=20.0, metavar="N", help="alarms an hour allowed (default: 20)")
+    add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
+    add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
+    add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
+    add(
+        "--quick", action="store_true", help="from minutes of sound: to try the command, not to use the model"
+    )
+    add("--seed", type=int, default=1, help="another seed, other streams (default: 1)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.datasets.feature_table import read_features
+    from worldstate.adapters.files.model_file import save_model
+    from worldstate.cli.common.output import write_report
+    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.operations.commissioning.commission import LEARNING_STEPS, commission, exam_of
+    from worldstate.operations.commissioning.exam_figure import write_exam_figure
+    from worldstate.operations.commissioning.plan import exam_streams, learned_streams
+    from worldstate.operations.commissioning.stream_exam import examine
+
+    check_outputs(arguments, "out", "report", figures=("figure",))
+    settings = _settings(arguments)
+    folder = arguments.streams or arguments.out.with_suffix(".streams")
+    array = given_array(arguments) or ovad_array()
+    table = None if arguments.labelled is None else read_features(arguments.labelled).group("static")
+    # Streams take nearly all of the time; what is learned from them counts as a few more.
+    steps = len(learned_streams(settings)) + LEARNING_STEPS
+    with progress_bar("commissioning", steps) as bar:
+        model = commission(array, settings, folder, table=table, jobs=arguments.jobs, on_step=bar.advance)
+    save_model(arguments.out, model)
+    report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": not settings.quick}
+    if arguments.exam:
+        with progress_bar("exam", len(exam_streams(settings))) as bar:
+            examined = exam_of(array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance)
+        report |= examine(examined)
+        if arguments.figure is not None:
+            write_exam_figure(examined, arguments.figure)
+    if arguments.report is not None:
+        write_report(arguments.report, report)
+    lines = ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
+    return CommandResult(report, lines=lines)
+
+
+def _settings(arguments: argparse.Namespace) -> "CommissionSettings":
+    from worldstate.operations.commissioning.plan import CommissionSettings, quick_settings
+
+    settings = CommissionSettings(
+        junctions=arguments.junctions,
+        onsets_per_hour=arguments.onsets,
+        seed=arguments.seed,
+        leave_out=tuple(arguments.leave_out),
+    )
+    return quick_settings(settings) if arguments.quick else settings
