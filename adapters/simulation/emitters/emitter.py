@@ -14,6 +14,7 @@ from .birds import birds
 from .music import music
 from .signals import gate
 from .steps import steps
+from .tones import tone
 from .tools import drill, saw
 from .voice import voice
 from .warning_signals import beeper, horn, siren, wail
@@ -28,6 +29,7 @@ SYNTHESES: dict[str, Synthesis] = {
     "drill": drill,
     "music": music,
     "birds": birds,
+    "tone": tone,
     "siren": siren,
     "wail": wail,
     "horn": horn,

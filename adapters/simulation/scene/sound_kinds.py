@@ -49,6 +49,8 @@ _TABLE = (
     SoundKind("music", "music with beat and bass", 80.0, 2.5, BOX_DB),
     # Assumed: small songbirds at full song.
     SoundKind("birds", "songbirds", 82.0, 5.0),
+    # Assumed: an air conditioner's fan, a transformer.
+    SoundKind("tone", "steady tones of a machine", 85.0, 2.0, BOX_DB),
     # 110 dB(A) at 3.5 m in front, DIN 14610, is 121 at 1 m.
     SoundKind("siren", "two-tone siren", 121.0, 1.8, MOUTH_DB, VEHICLE),
     # Assumed as loud as the two-tone one.

@@ -49,7 +49,7 @@ SCENES = (
 KINDS = ("light", "medium", "heavy", "electric", "bicycle", "scooter", "tram")
 SOUNDS = (
     *("voice", "steps", "bell", "saw", "drill", "music", "birds", "siren", "wail", "horn", "beeper"),
-    *("bicycle-bell", "rain", "gusts"),
+    *("bicycle-bell", "rain", "gusts", "tone"),
 )
 PRESETS = ("street-6", "street-6-calm")
 STREAM_SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")

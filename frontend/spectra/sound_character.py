@@ -1,0 +1,196 @@
+r"""What one microphone hears, in numbers that do not depend on its level: modulation, tones, harmonics.
+
+Band levels are read a hundred times a second; over the last two seconds their modulation spectrum, and the
+share of it that the bands have in common, tell steps, speech and blows from tyres and engines, whose bands
+fluctuate each by itself as noise does. A finer spectrum, once a hop, shows tones and combs of harmonics.
+"""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from scipy.fft import next_fast_len, rfft
+
+from worldstate.ground.checks import in_range
+from worldstate.ground.typing import FloatArray, IntArray
+from worldstate.ground.values import NotUsable
+
+from .decimator import Decimator
+
+HOPS_A_SECOND = 10
+EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)
+_HIGH = 4  # Bands from here on: below 450 Hz wind and engines are modulated, too
+_FRAMES, _MEMORY = 10, 200  # Levels a hop, and levels in the window
+_SHORT_S, _LONG_S = 0.032, 0.1706  # A syllable's onset; partials of a bell 6 Hz apart
+# Rates of modulation, Hz: swell, beats and steps, syllables (two), roughness (three).
+_RATES_HZ = (0.4, 1.3, 2.8, 6.2, 10.2, 16.2, 30.2, 50.1)
+_TOGETHER_HZ = (0.4, 2.2, 8.2, 16.2, 50.1)
+_TONES_HZ = (80.0, 300.0, 900.0, 2700.0)
+_AROUND_HZ = 150.0  # Half the width over which the floor under a tone is averaged
+_COMB_S = (1.0 / 400.0, 1.0 / 75.0)  # Periods of voices, strings and motors
+_EXCESS = (-2.0, 4.0)  # Nats at which an excess is cut: one strong line is no comb
+_HEIGHTS = (4.0, 8.0)  # Nats above the floor: a line that noise hardly has, and one that counts most
+_PAUSE, _LAG, _SMOOTH = 0.7, 5, 5  # Nats below the median; frames between two levels, and in a mean
+_QUANTILES = (0.05, 0.5, 0.95)
+_FORGET_LINES, _FORGET_PEAKS = 0.1, 0.05  # A hop: means over one and over two seconds
+_LEAST = 1e-14  # Power of a silent band, far below a 24-bit converter's
+
+MEASURES = (
+    *(f"modulation {part} {low:g}" for part in ("low", "high") for low in _RATES_HZ[:-1]),
+    *(f"together {low:g}" for low in _TOGETHER_HZ[:-1]),
+    *("rise", "fall", "pause", "flux low", "flux high"),
+    *(f"{name} {low:g}" for name in ("steady", "tonal", "peak") for low in _TONES_HZ[:-1]),
+    *("comb", "comb varies", "line", "line varies", "line holds"),
+)
+
+
+class SoundCharacter:
+    """Take one microphone hop by hop and measure the last two seconds."""
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        in_range("sample_rate_hz", sample_rate_hz, 2.0 * EDGES_HZ[-1], np.inf)
+        self._decimator = Decimator(sample_rate_hz, EDGES_HZ[-1])
+        rate = self._decimator.rate_hz
+        short, long = (round(length_s * rate) for length_s in (_SHORT_S, _LONG_S))
+        ends = np.round(np.arange(1 - _FRAMES, 1) * rate / (HOPS_A_SECOND * _FRAMES)).astype(int)
+        self._sound: FloatArray = np.zeros(max(long, short - ends[0]))
+        self._frames = len(self._sound) + ends[:, None] + np.arange(-short, 0)
+        self._bands = _Bands(short, rate)
+        self._lines = _Lines(long, rate)
+        self._levels: FloatArray = np.zeros((_MEMORY, len(EDGES_HZ) - 1))
+        self._n_hops = 0
+
+    def push(self, samples: FloatArray) -> None:
+        """Take the samples of the next hop of 0.1 s, shape (n,)."""
+        new = self._decimator.push(samples)
+        self._sound = np.concatenate([self._sound, new])[len(new) :]
+        self._levels[:-_FRAMES] = self._levels[_FRAMES:]
+        self._levels[-_FRAMES:] = self._bands.levels(self._sound[self._frames])
+        self._lines.push(self._sound)
+        self._n_hops += 1
+
+    def read(self) -> FloatArray | NotUsable:
+        """Return the `MEASURES` of the last two seconds, shape (measures,)."""
+        if self._n_hops <= _MEMORY // _FRAMES:
+            return NotUsable("needs two seconds of sound")
+        return np.concatenate([_modulation(self._levels), _swings(self._levels), self._lines.read()])
+
+
+class _Bands:
+    """Log-levels of the bands of short frames."""
+
+    def __init__(self, length: int, rate_hz: float) -> None:
+        self._window = np.hanning(length + 1)[:-1] / np.sqrt(length)
+        self._size = next_fast_len(length, real=True)
+        hz = np.fft.rfftfreq(self._size, 1.0 / rate_hz)
+        self._sums = np.stack([(hz >= low) & (hz < high) for low, high in _pairs(EDGES_HZ)], axis=1) * 1.0
+
+    def levels(self, frames: FloatArray) -> FloatArray:
+        """Log-levels, shape (frames, bands)."""
+        return np.asarray(np.log(_power(rfft(frames * self._window, self._size)) @ self._sums + _LEAST))
+
+
+class _Lines:
+    """Tones and combs in spectra of long frames, as running means."""
+
+    def __init__(self, length: int, rate_hz: float) -> None:
+        self._window = np.hanning(length + 1)[:-1] / np.sqrt(length)
+        hz = np.fft.rfftfreq(length, 1.0 / rate_hz)
+        first, last = np.searchsorted(hz, (EDGES_HZ[0], EDGES_HZ[-1]))
+        self._band, self._step_hz = slice(first, last), float(hz[1])
+        self._starts: IntArray = np.searchsorted(hz[self._band], _TONES_HZ[:-1])
+        self._counts = np.diff([*self._starts.tolist(), last - first])
+        half, count = round(_AROUND_HZ / self._step_hz), last - first
+        self._left = np.maximum(np.arange(count) - half, 0)
+        self._right = np.minimum(np.arange(count) + half + 1, count)
+        self._taper = np.hanning(count + 2)[1:-1]
+        low, high = (round(period * 2 * count * self._step_hz) for period in _COMB_S)
+        self._combs = slice(low, high)
+        self._excess, self._ratio = np.zeros(count), np.ones(count)
+        self._peaks: FloatArray = np.zeros(len(self._starts))
+        self._log_hz = np.log(hz[self._band])
+        # Running means of what a moment says: the comb and its square; of the strongest line its weight, and
+        # by that weight its pitch and the square of it; whether it stands out at all.
+        self._moments: FloatArray = np.zeros(6)
+
+    def push(self, sound: FloatArray) -> None:
+        """Take the sound that ends now, at least one frame of it."""
+        frame = sound[-len(self._window) :]
+        level = np.log(_power(rfft(frame * self._window)[self._band]) + _LEAST)
+        excess = level - self._floor(level)
+        self._excess += _FORGET_LINES * (excess - self._excess)
+        self._ratio += _FORGET_LINES * (np.exp(excess) - self._ratio)
+        self._peaks += _FORGET_PEAKS * (np.maximum.reduceat(excess, self._starts) - self._peaks)
+        self._moments += _FORGET_PEAKS * (self._moment(excess) - self._moments)
+
+    def read(self) -> FloatArray:
+        """Lines that stay, energy above the floor, the strongest line of each moment, harmonics."""
+        steady = np.maximum.reduceat(self._excess, self._starts)
+        tonal = np.log(np.add.reduceat(self._ratio, self._starts) / self._counts)
+        comb, comb_square, weight, pitch, pitch_square, holds = self._moments.tolist()
+        pitch, pitch_square = pitch / weight, pitch_square / weight
+        spreads = [math.sqrt(max(comb_square - comb**2, 0.0)), math.sqrt(max(pitch_square - pitch**2, 0.0))]
+        return np.concatenate([steady, tonal, self._peaks, [comb, spreads[0], pitch, spreads[1], holds]])
+
+    def _floor(self, level: FloatArray) -> FloatArray:
+        sums = np.concatenate([[0.0], np.cumsum(level)])
+        return np.asarray((sums[self._right] - sums[self._left]) / (self._right - self._left))
+
+    def _moment(self, excess: FloatArray) -> FloatArray:
+        comb, strongest = self._combed(excess), int(excess.argmax())
+        height, pitch = float(excess[strongest]), float(self._log_hz[strongest])
+        weight = math.exp(min(height, _HEIGHTS[1]))
+        return np.array(
+            [comb, comb * comb, weight, weight * pitch, weight * pitch * pitch, height > _HEIGHTS[0]]
+        )
+
+    def _combed(self, excess: FloatArray) -> float:
+        """Log of the highest line of the spectrum of the spectrum, over its mean."""
+        clipped = np.clip(excess, *_EXCESS) * self._taper
+        power = _power(rfft(clipped, 2 * len(clipped)))
+        return 0.5 * float(np.log((power[self._combs].max() + _LEAST) / (power.mean() + _LEAST)))
+
+
+def _modulation(levels: FloatArray) -> FloatArray:
+    r"""Modulation spectrum by rate, low and high bands, and the share that the high bands have in common.
+
+    .. math:: m_r = \ln \langle |E_b(f)|^2 \rangle_{b, f \in r}, \qquad
+              c_r = \ln \frac{\sum_{f \in r} |\sum_b E_b(f)|^2}{\sum_{f \in r} \sum_b |E_b(f)|^2}
+    """
+    spectrum = rfft((levels - levels.mean(axis=0)) * _TAPER[:, None], axis=0)
+    power = _power(spectrum)
+    high = power[:, _HIGH:].sum(axis=1)
+    low = power[:, :_HIGH].sum(axis=1) / _HIGH
+    each = np.stack([low, high / (power.shape[1] - _HIGH)])
+    together = _TOGETHER @ np.stack([_power(spectrum[:, _HIGH:].sum(axis=1)), high], axis=1)
+    shared = np.log(together[:, 0] + _LEAST) - np.log(together[:, 1] + _LEAST)
+    return np.concatenate([np.log(each @ _RATES.T + 1e-6).ravel(), shared])
+
+
+def _swings(levels: FloatArray) -> FloatArray:
+    """How far the level rises and falls, how long it pauses, and how fast bands change."""
+    sums = np.cumsum(levels[:, _HIGH:].mean(axis=1))
+    smooth = np.sort((sums[_SMOOTH:] - sums[:-_SMOOTH]) / _SMOOTH)
+    low, middle, high = smooth[[int(q * len(smooth)) for q in _QUANTILES]]
+    pause = np.searchsorted(smooth, middle - _PAUSE) / len(smooth)
+    change = np.abs(levels[_LAG:] - levels[:-_LAG]).mean(axis=0)
+    return np.array([high - middle, middle - low, pause, change[:_HIGH].mean(), change[_HIGH:].mean()])
+
+
+def _power(spectrum: np.ndarray) -> FloatArray:
+    return np.asarray(np.square(spectrum.real) + np.square(spectrum.imag))
+
+
+def _pairs(edges: tuple[float, ...]) -> list[tuple[float, float]]:
+    return list(pairwise(edges))
+
+
+def _groups(edges: tuple[float, ...]) -> FloatArray:
+    """Means over the rates of modulation between edges, shape (groups, rates)."""
+    hz = np.fft.rfftfreq(_MEMORY, 1.0 / (_FRAMES * HOPS_A_SECOND))
+    inside = np.stack([(hz >= low) & (hz < high) for low, high in _pairs(edges)])
+    return np.asarray(inside / inside.sum(axis=1, keepdims=True))
+
+
+_TAPER = np.hanning(_MEMORY + 2)[1:-1] / np.sqrt(0.375 * _MEMORY)
+_RATES, _TOGETHER = _groups(_RATES_HZ), _groups(_TOGETHER_HZ)

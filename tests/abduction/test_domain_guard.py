@@ -1,0 +1,80 @@
+"""The guard of a model's domain: verdicts against scipy's softmax, files, what flagged evidence says."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import softmax
+
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.signature.domain_guard import (
+    DomainGuard,
+    Familiar,
+    Foreign,
+    WarningSignal,
+    neutral,
+)
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
+
+# Two measures: foreign sounds lie to the right, signals at (0, 5); the street is at the origin.
+GUARD = DomainGuard(
+    measures=("x", "y"),
+    foreign=("speech", "music"),
+    signals=("siren",),
+    weights=np.array([[0.0, 0.0], [2.0, 0.0], [2.0, -1.0], [0.0, 2.0]]),
+    biases=np.array([4.0, 0.0, 0.0, 0.0]),
+    threshold=1.0,
+    kinds_of_signals=("siren",),
+    centres=np.array([[0.0, 5.0]]),
+    whitening=np.eye(2),
+)
+measures = st.lists(st.floats(-9.0, 9.0), min_size=2, max_size=2).map(np.array)
+
+
+@given(measures)
+def test_log_odds_are_those_of_the_softmax_over_the_threshold(x: np.ndarray) -> None:
+    street = softmax(GUARD.weights @ x + GUARD.biases)[0]
+    verdict = GUARD.judge(x)
+    assert verdict.log_odds == pytest.approx(np.log((1.0 - street) / street) - 1.0, abs=1e-6)
+    assert isinstance(verdict, Familiar) == (verdict.log_odds <= 0.0)
+
+
+def test_what_is_told_and_why() -> None:
+    assert isinstance(GUARD.judge(np.zeros(2)), Familiar)
+    speech, music = GUARD.judge(np.array([6.0, 1.0])), GUARD.judge(np.array([6.0, -1.0]))
+    assert isinstance(speech, Foreign) and speech.reason == "sounds like speech"
+    assert isinstance(music, Foreign) and music.reason == "sounds like music"
+    siren = GUARD.judge(np.array([0.0, 5.5]))
+    assert isinstance(siren, WarningSignal) and siren.signal == "siren"
+
+
+@given(st.floats(-9.0, 9.0), st.floats(6.5, 20.0))
+def test_no_signal_out_of_reach_of_all_that_were_heard(x: float, y: float) -> None:
+    assert not isinstance(GUARD.judge(np.array([x, y])), WarningSignal)
+
+
+@given(measures)
+def test_a_file_gives_the_same_verdict(x: np.ndarray) -> None:
+    assert decode(DomainGuard, encode(GUARD), "guard").judge(x) == GUARD.judge(x)
+
+
+def test_coefficients_that_do_not_fit_are_refused() -> None:
+    said = encode(GUARD) | {"biases": [0.0]}
+    with pytest.raises(InvalidArgumentError, match="biases"):
+        decode(DomainGuard, said, "guard")
+
+
+levels = st.floats(-20.0, 20.0)
+
+
+@given(levels, levels, levels, levels, st.floats(0.0, 10.0))
+def test_flagged_evidence_says_nothing_within_the_margin_and_never_more(
+    left: float, right: float, visible: float, none: float, margin: float
+) -> None:
+    evidence = SignatureEvidence(("left", "right"), (left, right), visible, none)
+    flagged = neutral(evidence, margin)
+    assert (flagged.visible, flagged.none) == (visible, none)
+    for before, after in zip(evidence.hidden, flagged.hidden, strict=True):
+        assert abs(after - none) == pytest.approx(max(abs(before - none) - margin, 0.0), abs=1e-9)
+        assert (after - none) * (before - none) >= 0.0
