@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.frontend.approach.energy_floor import EnergyFloor
 from worldstate.frontend.approach.looming import Looming, fitted_looming
 from worldstate.frontend.approach.tone_stage import ToneStage
 from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
@@ -117,6 +118,7 @@ class FrontEnd:
             self._least_prominence = self._noise_prominence()
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._tone = self._tone_stage()
+        self._energy_floor = EnergyFloor()
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
 
     def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
@@ -244,6 +246,7 @@ class FrontEnd:
         with one_blas_thread():
             self._hops.append(self._spectra.push(hop.samples))
             levels = self._meter.push(hop.samples, self._keep)
+            self._energy_floor.push(float(self._hops[-1].energies[self._used].mean()))
             if self._tone is not None:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
             return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
@@ -294,6 +297,11 @@ class FrontEnd:
         """Microphones that are used in the newest hop."""
         return self._hops[-1].health.mask.keep
 
+    @property
+    def _used(self) -> BoolArray | slice:
+        """Microphones whose energy counts: those kept, or all where none is."""
+        return self._keep if self._keep.any() else slice(None)
+
     def _srp(self, n_hops: int) -> FloatArray:
         """SRP-PHAT of the last hops, (E, A)."""
         hops = self._last(n_hops)
@@ -340,10 +348,11 @@ class FrontEnd:
             return NotUsable(f"needs {settings.looming_hops} hops, got {len(hops)}")
         # The same microphones in the whole window: one that fails within it must not look like a step of
         # level.
-        keep = self._keep if self._keep.any() else slice(None)
-        energies = np.array([hop.energies for hop in hops])[:, keep].mean(axis=1)
+        energies = np.array([hop.energies for hop in hops])[:, self._used].mean(axis=1)
         if energies.min() <= SILENCE:
             return NotUsable("silence within the window")
         times = (np.array([hop.centre for hop in hops]) - end) / self.sample_rate_hz
         low, high = settings.looming_band_hz
-        return fitted_looming(times, np.log(energies), ((high - low) / settings.hop_rate_hz) ** -0.5)
+        scatter = ((high - low) / settings.hop_rate_hz) ** -0.5
+        noise = self._energy_floor.read(float(energies.min()), scatter)
+        return fitted_looming(times, np.log(energies), scatter, noise.mean, noise.std)

@@ -6,12 +6,14 @@ For a point source at range d the band energy E goes as 1/d^2, eq. (2):
 
 It depends on neither the source level nor the distance nor a constant attenuation. One window is read twice:
 
-* the slope of log E over the window, which is 2 / TTA somewhere near its middle; * the straight line through
-E^(-1/2), which is proportional to d itself: exact at constant speed, and evaluated
-  at the END of the window.
+* the slope of log E over the window, which is 2 / TTA somewhere near its middle;
+* the straight line through E^(-1/2), which is proportional to d itself: exact at constant speed, and
+  evaluated at the END of the window.
 
-Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise from elsewhere and diffraction
-round a corner bias both: what is measured is then the approach of the sound, not of the vehicle.
+Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise N from elsewhere makes both
+too small, by a seventh at 10 dB and by two thirds at 0 dB; where N is known the range is that of E - N.
+Diffraction round a corner biases both: what is measured is then the approach of the sound, not of the
+vehicle.
 
 The accuracy is limited by the randomness of the sound itself, which no number of microphones averages out: n
 energies over T seconds, each of scatter s = (bandwidth x interval)^(-1/2), give TTA with a relative error of
@@ -40,6 +42,11 @@ MAX_LOG_STD = 0.7
 # The fitted range at the end of the window must be this many standard deviations from zero: nearer to it the
 # quotient 1/TTA has no useful variance.
 _MIN_RANGE_SIGMA = 2.0
+# Below this ratio at the end of the window (1.8 dB) the beginning of the window is noise alone.
+_LEAST_RATIO = 1.5
+# Share of an energy that counts as the source's where the noise would leave less, for the first guess only;
+# steps of the fit after it (a third changes 1/TTA by less than a tenth of its error); least ratio of ranges.
+_LEAST_EXCESS, _STEPS, _LEAST_RANGE = 0.1, 2, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,15 +79,20 @@ class Looming:
     log_slope_std_hz: float
 
 
-def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Looming | NotUsable:
+def looming(
+    times_s: ArrayLike,
+    log_energy: ArrayLike,
+    floor_std: float,
+    noise_energy: float = 0.0,
+    noise_energy_std: float = 0.0,
+) -> Looming | NotUsable:
     r"""Estimate 1/TTA from one window of band energies, eq. (2).
 
-    .. math:: E^{-1/2}(t) \propto a + b\, t, \quad
+    .. math:: (E - N)^{-1/2}(t) \propto a + b\, t, \quad
               \frac{1}{\mathrm{TTA}} = -\frac{b}{a} \text{ at } t = 0, \qquad
               \frac{d}{dt} \log E = \frac{2}{\mathrm{TTA}}
 
-    The line through :math:`E^{-1/2}` is weighted by the square of the exponential fit, because log E scatters
-    evenly and E^(-1/2) in proportion to its value.
+    The fit is weighted by the energies of the model, because log E scatters evenly.
 
     Parameters
     ----------
@@ -91,17 +103,21 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
     floor_std : float
         Standard deviation of `log_energy` by chance alone, nats, > 0: 1 / sqrt(bandwidth x interval) for
         noise-like sound. The standard errors assume at least this.
+    noise_energy, noise_energy_std : float
+        Mean energy N of all but the approaching source, in the unit of E, and its standard deviation.
 
     Returns
     -------
     Looming or NotUsable
-        Rates in 1/s. Not usable if the energies scatter by more than 3 dB about the fit, or if the fitted
-        range reaches zero within its error.
+        Rates in 1/s; the slope of log E is that of the energies as they are, noise included. Not usable if
+        the energies scatter by more than 3 dB about the fit, if the fitted range reaches zero within its
+        error, or if the source has less than 1.5 times the energy of the noise.
 
     Raises
     ------
     InvalidArgumentError
-        On fewer than four points, another shape, unsorted times or numbers that are not finite.
+        On fewer than four points, another shape, unsorted times, negative noise or numbers that are not
+        finite.
 
     References
     ----------
@@ -116,55 +132,104 @@ def looming(times_s: ArrayLike, log_energy: ArrayLike, floor_std: float) -> Loom
     >>> found = looming(times_s, -2 * np.log(20 - 10 * times_s), floor_std=0.01)
     >>> round(found.inverse_tta_hz, 3), round(found.log_slope_hz / 2, 3)
     (0.5, 0.403)
+
+    The same in noise as loud as the source is at the end:
+
+    >>> energy = (20 - 10 * times_s) ** -2.0 + 1 / 1000
+    >>> round(looming(times_s, np.log(energy), 0.01, noise_energy=1 / 1000).inverse_tta_hz, 3)
+    0.5
     """
     times = finite_array("times_s", times_s, (None,))
     energies = finite_array("log_energy", log_energy, times.shape)
     floor = in_range("floor_std", floor_std, 0.0, np.inf, open_low=True, open_high=True)
     if len(times) < MIN_POINTS or np.any(np.diff(times) <= 0.0):
         raise InvalidArgumentError(f"times_s: expected {MIN_POINTS} or more ascending times, got {times}")
-    return fitted_looming(times, energies, floor)
+    noise = in_range("noise_energy", noise_energy, 0.0, np.inf, open_high=True)
+    noise_std = in_range("noise_energy_std", noise_energy_std, 0.0, np.inf, open_high=True)
+    return fitted_looming(times, energies, floor, noise, noise_std)
 
 
-def fitted_looming(times: FloatArray, energies: FloatArray, floor: float) -> Looming | NotUsable:
+def fitted_looming(
+    times: FloatArray, energies: FloatArray, floor: float, noise: float = 0.0, noise_std: float = 0.0
+) -> Looming | NotUsable:
     """Return what `looming` does for arrays that are finite and fit each other.
 
     Shapes: times (n,), energies (n,).
     """
-    centred = energies - energies.mean()
-    exponential = _fit_line(times, centred, np.ones_like(times))
-    # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.
-    model = np.exp(-0.5 * (exponential.level + exponential.slope * times))
-    straight = _fit_line(times, np.exp(-0.5 * centred), model)
-    scatter = 2.0 * straight.scatter
-    if min(exponential.scatter, scatter) > MAX_LOG_STD:
+    level = float(energies.mean())
+    scale = np.exp(-level)
+    exponential = _fit_line(times, energies - level, np.ones_like(times))
+    source = _fit_source(times, np.exp(energies - level), noise * scale)
+    if source is None:
+        return NotUsable("range reaches zero within the window")
+    if min(exponential.scatter, source.scatter) > MAX_LOG_STD:
         return NotUsable("energy scatters by more than 3 dB about the fit")
-    return _read(exponential, straight, max(exponential.scatter, floor), 0.5 * max(scatter, floor))
+    if source.level**-2 < _LEAST_RATIO * noise * scale:
+        return NotUsable(f"the source has less than {_LEAST_RATIO} times the energy of the noise")
+    return _read(exponential, source, floor, noise_std * scale)
 
 
-def _read(exponential: "_Line", straight: "_Line", log_std: float, range_std: float) -> Looming | NotUsable:
-    level, slope = straight.level, straight.slope
-    if level < _MIN_RANGE_SIGMA * range_std * np.sqrt(straight.level_variance):
+def _read(exponential: "_Line", source: "_Source", floor: float, noise_std: float) -> Looming | NotUsable:
+    scatter = max(source.scatter, floor)
+    covariance = scatter**2 * source.covariance + noise_std**2 * np.outer(source.by_noise, source.by_noise)
+    if source.level < _MIN_RANGE_SIGMA * np.sqrt(covariance[0, 0]):
         return NotUsable("range reaches zero within the error of the window")
-    rate = -slope / level
-    variance = straight.slope_variance + rate**2 * straight.level_variance + 2.0 * rate * straight.covariance
+    rate = -source.slope / source.level
+    gradient = np.array([-rate, -1.0]) / source.level
+    log_std = max(exponential.scatter, floor)
     return Looming(
         inverse_tta_hz=rate,
-        std_hz=float(range_std / level * np.sqrt(variance)),
+        std_hz=float(np.sqrt(gradient @ covariance @ gradient)),
         log_slope_hz=exponential.slope,
         log_slope_std_hz=float(log_std * np.sqrt(exponential.slope_variance)),
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Source:
+    """Energy ``(level + slope t)^-2`` of a source, with what noise and scatter do to its parameters."""
+
+    level: float
+    slope: float
+    scatter: float  # Relative, of the energies
+    covariance: FloatArray  # shape (2, 2): For a relative scatter of one
+    by_noise: FloatArray  # shape (2,): Derivative by the noise
+
+
+def _fit_source(times: FloatArray, energy: FloatArray, noise: float) -> _Source | None:
+    """Fit E = N + (a + b t)^-2 with errors in proportion to E; None if the range reaches zero."""
+    # Gauss-Newton from the line through E^(-1/2).
+    excess = np.log(np.maximum(energy - noise, _LEAST_EXCESS * energy))
+    # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.
+    smooth = _fit_line(times, excess, np.ones_like(times))
+    model = np.exp(-0.5 * (smooth.level + smooth.slope * times))
+    line = _fit_line(times, np.exp(-0.5 * excess), model)
+    parameters = np.array([line.level, line.slope])
+    powers = np.stack([np.ones_like(times), times], axis=1)
+    for _ in range(_STEPS + 1):
+        ranges = powers @ parameters
+        if ranges.min() <= _LEAST_RANGE * ranges.max():
+            return None
+        weights = 1.0 / (ranges**-2 + noise)
+        jacobian = powers * (-2.0 * ranges**-3 * weights)[:, None]
+        residual = (energy - noise - ranges**-2) * weights
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        step = covariance @ (jacobian.T @ residual)
+        parameters = parameters + step
+    # The last step is that of the residuals, which the scatter counts: it has become too small to matter.
+    scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
+    by_noise = -covariance @ (jacobian.T @ weights)
+    return _Source(float(parameters[0]), float(parameters[1]), scatter, covariance, by_noise)
+
+
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """Line ``value = level + slope t`` with variances for relative errors of unit variance."""
+    """Line ``value = level + slope t``, and its slope's variance for relative errors of unit variance."""
 
     slope: float
     level: float
     scatter: float
     slope_variance: float
-    level_variance: float
-    covariance: float
 
 
 def _fit_line(times: FloatArray, values: FloatArray, scale: FloatArray) -> _Line:
@@ -176,4 +241,4 @@ def _fit_line(times: FloatArray, values: FloatArray, scale: FloatArray) -> _Line
     slope, level = (s0 * v1 - s1 * v0) / determinant, (s2 * v0 - s1 * v1) / determinant
     residual = (values - level - slope * times) / scale
     scatter = float(np.sqrt(residual @ residual / (len(times) - 2)))
-    return _Line(slope, level, scatter, s0 / determinant, s2 / determinant, -s1 / determinant)
+    return _Line(slope, level, scatter, s0 / determinant)

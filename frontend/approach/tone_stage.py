@@ -5,8 +5,9 @@ of a wavelength, so that a tone from any direction adds up. `decimator` keeps th
 per second. In the last second the peak with the highest ratio to the noise around it is searched under a Hann
 window, so that neither harmonics nor rumble leak into it, and refined as in `tone`.
 
-The noise floor is the median power around the line: the standard deviation is the bound of Rife and Boorstyn
-at the local signal-to-noise ratio, whatever the colour of the noise.
+The noise floor is the median power around the line, or what is left beside the line where that is more: a
+line that wanders, and a hump of coloured noise, leave most of themselves. The standard deviation is the bound
+of Rife and Boorstyn at that signal-to-noise ratio, with what a wandering line leaves counted for more.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.ground.values import NotUsable
 
 from .harmonic_sum import MEDIAN_OF_EXPONENTIAL
-from .tone import climb
+from .tone import climb, tone_wave
 
 # Firing frequencies of road vehicles, idling motorcycle single to a car at high revolutions.
 ENGINE_BAND_HZ = (20.0, 400.0)
@@ -36,6 +37,9 @@ _RING = (5, 40)
 # Least ratio of the peak to the floor, A^2 N / 4 sigma^2, or 15.6 dB for eta N: white noise exceeds it in one
 # window of a thousand.
 _EVIDENT = 18.0
+# What white noise leaves beside a line is up to twice what is around it. More is the line's own: of a
+# frequency that wanders by .2 to 1 %, the error is 2.5 times what white noise of that power would make.
+_CHANCE, _WANDER = 2.0, 6.0
 # Tolerance of the refinement as a share of a resolution, the bound for eta N of 80 dB. From the vertex of a
 # parabola two steps suffice; where three do not converge there is no tone.
 _TOLERANCE, _STEPS = 1e-4, 3
@@ -54,9 +58,8 @@ class ToneReading:
     """
 
     frequency_hz: float  # Mean over the window, by the stream's own sample rate
-    # Bound at this SNR; larger in truth for a line that varies within the window.
-    frequency_std_hz: float
-    snr: float  # eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from the noise around the line
+    frequency_std_hz: float  # Of that mean
+    snr: float  # eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from what is around and beside the line
     mean_square: float  # A^2 / 2 of the averaged microphones, squared units of the samples
     age_s: float  # From the middle of the window to the end of the hop, seconds
 
@@ -117,10 +120,13 @@ class ToneStage:
         power = self._spectrum.power(sound)
         begin, band = self._spectrum.peak(power), self._spectrum.omega_range
         omega, amplitude = climb(sound, begin, band, _TOLERANCE, _STEPS)
-        snr = 0.5 * abs(amplitude) ** 2 / self._spectrum.floor_near(power, omega)
+        rest = sound - (amplitude * tone_wave(omega, len(sound))).real
+        around, beside = self._spectrum.floor_near(power, omega), self._spectrum.beside(rest, omega)
+        snr = 0.5 * abs(amplitude) ** 2 / max(around, beside)
         if not 0.5 * snr * len(sound) > _EVIDENT:
             return NotUsable("no tone above the noise")
-        std = float(np.sqrt(tone_crb_hz2(snr, len(sound), self._rate)))
+        noise = around + _WANDER * max(beside - _CHANCE * around, 0.0)
+        std = float(np.sqrt(tone_crb_hz2(0.5 * abs(amplitude) ** 2 / noise, len(sound), self._rate)))
         frequency = omega * self._rate / (2.0 * np.pi)
         return ToneReading(frequency, std, snr, 0.5 * abs(amplitude) ** 2, self._age_s())
 
@@ -190,6 +196,11 @@ class _Spectrum:
         above = power[centre + inner : centre + outer]
         around = np.sort(np.concatenate([below, above]))
         return float(around[len(around) // 2]) / MEDIAN_OF_EXPONENTIAL + _least(power)
+
+    def beside(self, rest: FloatArray, omega: float) -> float:
+        """Return the mean power beside a line that was taken out, as far as its own lobes reach."""
+        centre, reach = round(omega / self._step), _PADDING * _RING[0]
+        return float(self.power(rest)[max(centre - reach, 1) : centre + reach + 1].mean())
 
 
 def _vertex(left: float, middle: float, right: float) -> float:

@@ -33,14 +33,20 @@ def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path
     assert len(before) + len(after) == len(whole)
     if not follows:
         assert before + after == whole
-    heard = [(s["stamp_ns"], s["cues"][0]["risk"], s["bearing"]["azimuth_rad"]) for s in before + after]
-    expected = [(s["stamp_ns"], s["cues"][0]["risk"], s["bearing"]["azimuth_rad"]) for s in whole]
-    stamps, values = np.split(np.array(heard) - expected, [1], axis=1)
+
+    def told(snapshot: dict) -> tuple[float, ...]:
+        bearing = snapshot["bearing"]
+        return snapshot["stamp_ns"], snapshot["cues"][0]["risk"], bearing["azimuth_rad"] if bearing else 9.0
+
+    expected = np.array([told(s) for s in whole])
+    stamps, values = np.split(np.array([told(s) for s in before + after]) - expected, [1], axis=1)
     assert np.abs(stamps).max() == 0.0
     # Frames of the transform lie elsewhere in a file that begins elsewhere: of two directions that are nearly
     # as loud, now one and now the other is the louder.
     assert (np.abs(values) < 0.05).mean() > (0.9 if follows else 1.0 - 1e-9)
-    assert set(whole[0]["bearing"]) == {"azimuth_rad", "std_rad", "prominence"}
+    stated = [s["bearing"] for s in whole if s["bearing"]]
+    assert len(stated) > len(whole) / 2
+    assert set(stated[0]) == {"azimuth_rad", "std_rad", "prominence"}
 
 
 def test_the_engine_is_followed_with_ego_noise_only(approach, tmp_path, capsys):

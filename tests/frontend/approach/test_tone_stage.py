@@ -15,6 +15,7 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 
+SLOW = 6_000
 RATE = 47_998
 PAIR = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]])
 BOTH = ChannelMask.all_of(2)
@@ -23,6 +24,15 @@ SETTINGS = FrontEndSettings(tone_band_hz=(20.0, 400.0))
 
 def line(frequency_hz: float, seconds: float, rate: float, phase: float = 0.3) -> np.ndarray:
     return np.cos(2 * np.pi * frequency_hz / rate * np.arange(round(seconds * rate)) + phase)
+
+
+def each_hop(sound: np.ndarray) -> list[ToneReading | NotUsable]:
+    """Readings of both microphones hearing the same, one a tenth of a second."""
+    stage, found = ToneStage(PAIR, SLOW), []
+    for hop in on_both(sound).reshape(-1, SLOW // 10, 2):
+        stage.push(hop, BOTH)
+        found.append(stage.read())
+    return found
 
 
 def on_both(sound: np.ndarray) -> np.ndarray:
@@ -82,6 +92,35 @@ def test_noise_alone_is_no_tone() -> None:
         stage.push(rng.standard_normal((4_000, 2), dtype=np.float32), BOTH)
         found += isinstance(stage.read(), ToneReading)
     assert found <= 4
+
+
+@pytest.mark.parametrize("slope", [1.0, 1.5])
+def test_steep_or_gusty_noise_is_no_tone(slope: float) -> None:
+    """Without a look beside the line a quarter of the seconds of f^-3 had one."""
+    rng, n = np.random.default_rng(7), 40 * SLOW
+    white = np.fft.rfft(rng.standard_normal(n))
+    steep = np.fft.irfft(white / np.maximum(np.fft.rfftfreq(n, 1 / SLOW), 5.0) ** slope, n)
+    gusts = np.exp(np.interp(np.arange(n), np.arange(0, n, SLOW // 2), rng.standard_normal(80)))
+    for sound in (steep / steep.std(), gusts * rng.standard_normal(n)):
+        found = [isinstance(one, ToneReading) for one in each_hop(sound)]
+        assert np.mean(found) <= 0.1
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.002, 0.01])
+def test_what_is_stated_of_a_wandering_line_is_its_error(wander: float) -> None:
+    """The bound of a steady line stated a hundredth of the error of one that wanders by 1 %."""
+    rng, n = np.random.default_rng(8), 40 * SLOW
+    knots = rng.standard_normal(n // (SLOW // 10) + 1)
+    frequency = 83.37 * (1.0 + wander * np.interp(np.arange(n), SLOW // 10 * np.arange(len(knots)), knots))
+    phase = 2 * np.pi * np.cumsum(frequency) / SLOW
+    z = []
+    for hop, one in enumerate(each_hop(10.0 * np.sin(phase) + rng.standard_normal(n))):
+        if isinstance(one, ToneReading):
+            middle = (hop + 1) * SLOW // 10 - round(one.age_s * SLOW)
+            truth = frequency[max(middle - 47 * SLOW // 100, 0) : middle + 47 * SLOW // 100].mean()
+            z.append((one.frequency_hz - truth) / one.frequency_std_hz)
+    assert len(z) > 300
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_coloured_noise_and_rumble_hide_no_line() -> None:
