@@ -32,6 +32,10 @@ from .posterior import abduce as abduce
 from .posterior import log_lambda as log_lambda
 from .posterior import statistic as statistic
 from .signature.classifier_signature import ClassifierSignature as ClassifierSignature
+from .signature.domain_guard import DomainGuard as DomainGuard
+from .signature.domain_guard import Familiar as Familiar
+from .signature.domain_guard import Foreign as Foreign
+from .signature.domain_guard import WarningSignal as WarningSignal
 from .signature.ensemble import EnsembleModel as EnsembleModel
 from .signature.ensemble_training import SiteEnsembleClassifier as SiteEnsembleClassifier
 from .signature.published_signature import SignatureModel as SignatureModel

@@ -6,13 +6,16 @@ from typing import Protocol
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.checks import in_range
+from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing, Measurement
@@ -93,6 +96,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         Weighs the model's scores with bearing, approach and engine line, eq. (5); the scores as they are
         without.
 
+    guard : DomainGuard, optional
+        Tells foreign sounds and warning signals; evidence of a foreign one counts by what exceeds its margin.
     uncalibrated : bool
         Go on with another array, rate or band than the model was made for. Give the filter a policy of
         alpha 0 then, which states no budget.
@@ -111,7 +116,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     InvalidArgumentError
         If the array, the rate or a setting does not fit; see `FrontEnd`.
     OutOfDomainError
-        If the model has a `domain` and was made for another array, rate or feature.
+        If the model has a `domain` and was made for another array, rate or feature, or the guard for other
+        measures.
 
     Examples
     --------
@@ -136,6 +142,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         settings: AcousticSettings | None = None,
         front_end_settings: FrontEndSettings | None = None,
         grounding: Grounding | None = None,
+        guard: DomainGuard | None = None,
         uncalibrated: bool = False,
     ) -> None:
         front_end_settings = front_end_settings or FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
@@ -143,6 +150,10 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
             front_end_settings = replace(front_end_settings, feature_order=order)
+        if guard is not None:
+            if guard.measures != MEASURES:
+                raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
+            front_end_settings = replace(front_end_settings, character=True)
         self.source = "acoustic"
         self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
         self.last_frame: AcousticFrame | None = None
@@ -150,6 +161,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self._vision = vision
         self._settings = settings or AcousticSettings()
         self._grounding = grounding
+        self._guard = guard
 
     def measure(self, block: Float32Array, /) -> list[Measurement]:
         """Take the next samples; return a measurement for each hop that ends in them.
@@ -204,15 +216,24 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         )
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
+        domain = self._judged(frame)
+        if isinstance(domain, Foreign) and self._guard is not None:
+            signature = neutral(signature, self._guard.margin)
         return Measurement(
             stamp_ns=frame.stamp_ns,
             signature=signature,
             co_evidence=self._ask(frame.stamp_ns, bearing, signature),
             bearing=bearing,
             approach=approach,
+            domain=domain,
             sightings=self._vision.sightings(frame.stamp_ns) if self._vision else (),
             source=self.source,
         )
+
+    def _judged(self, frame: AcousticFrame) -> DomainVerdict | None:
+        if self._guard is None or isinstance(frame.character, NotUsable):
+            return None
+        return self._guard.judge(frame.character)
 
     def _ask(self, stamp_ns: int, bearing: Bearing | NotUsable, signature: SignatureEvidence) -> CoEvidence:
         if self._vision is None:

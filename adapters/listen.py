@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
@@ -168,6 +169,8 @@ class Source:
         Time of the first sample on the clock of that belief.
     engine : EngineSpeed or None
         Of the own vehicle, whose lines are then cancelled together with its learned noise.
+    guard : DomainGuard or None
+        Tells sounds that the model was not made for.
 
     Examples
     --------
@@ -199,6 +202,7 @@ class Source:
     resume: WorldFilter | None = None
     start_ns: int = 0
     engine: EngineSpeed | None = None
+    guard: DomainGuard | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -388,6 +392,7 @@ def _heard(
         settings=settings,
         t0_s=recording.t0_s if recording else None,
         hazard_free=recording is not None and recording.label == "none",
+        guard=model.guard,
     )
     return source, recording
 
@@ -603,6 +608,7 @@ def measure_steps(
             start_ns=source.start_ns,
             vision=source.camera_channel(),
             grounding=source.settings.grounding,
+            guard=source.guard,
             front_end_settings=source.settings.front_end(source.array, audio.sample_rate_hz),
             uncalibrated=source.settings.uncalibrated,
         )

@@ -12,6 +12,7 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
 _NOT_MONITORED = NotUsable("microphones were not monitored")
+CHARACTER_IS_OFF = NotUsable("the character is off: see FrontEndSettings.character")
 TONE_IS_OFF = NotUsable("the tone is off: see FrontEndSettings.tone_band_hz")
 
 
@@ -65,6 +66,9 @@ class AcousticFrame:
         Faults of the microphones and which were left out.
     tone : ToneReading or NotUsable
         Engine line over the last `tone_hops` hops; not usable when it is off or no tone exceeds the noise.
+    character : ndarray, shape (37,), or NotUsable
+        What the middle microphone heard in the last two seconds, whatever its level: modulation, what bands
+        have in common, tones, harmonics. A `DomainGuard` reads it.
 
     Examples
     --------
@@ -99,3 +103,4 @@ class AcousticFrame:
     bearing_age_s: float = 0.0
     health: ArrayHealth | NotUsable = _NOT_MONITORED
     tone: ToneReading | NotUsable = TONE_IS_OFF
+    character: FloatArray | NotUsable = CHARACTER_IS_OFF

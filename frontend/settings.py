@@ -65,6 +65,8 @@ class FrontEndSettings:
         Settings of ego-noise suppression, used with `FrontEnd.learn_ego_noise`; None switches it off.
     watch_channels : bool
         Detect faulty microphones and leave them out.
+    character : bool
+        Measure what one microphone hears over two seconds: `AcousticFrame.character`.
     feature_order : tuple of int, optional
         Channels in the order in which the feature forms its pairs, where it is not that of the array.
 
@@ -106,6 +108,7 @@ class FrontEndSettings:
     speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S
     ego_noise: EgoNoiseSettings | None = None
     watch_channels: bool = True
+    character: bool = False
     feature_order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:

@@ -20,13 +20,14 @@ from worldstate.frontend.ego_noise.ego_noise import EgoNoise
 from worldstate.frontend.spectra.bands import SILENCE
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
+from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds
 
-from .frame import TONE_IS_OFF, AcousticFrame
+from .frame import CHARACTER_IS_OFF, TONE_IS_OFF, AcousticFrame
 from .hop_spectra import HopSpectra, HopSums
 from .levels import LevelMeter
 from .settings import FrontEndSettings
@@ -119,6 +120,8 @@ class FrontEnd:
         self._meter = LevelMeter(array.n_microphones, self.sample_rate_hz, settings)
         self._tone = self._tone_stage()
         self._energy_floor = EnergyFloor()
+        self._character = SoundCharacter(self.sample_rate_hz) if settings.character else None
+        self._nearest = np.argsort(np.linalg.norm(array.centred_m, axis=1), kind="stable")
         self._hops: deque[HopSums] = deque(maxlen=max(settings.window_hops, settings.looming_hops))
 
     def process(self, block: ArrayLike, captured_ns: int | None = None) -> list[AcousticFrame]:
@@ -249,6 +252,8 @@ class FrontEnd:
             self._energy_floor.push(float(self._hops[-1].energies[self._used].mean()))
             if self._tone is not None:
                 self._tone.push(hop.samples, self._hops[-1].health.mask)
+            if self._character is not None:
+                self._character.push(hop.samples[:, self._middle])
             return self._frame(hop, levels) if hop.index >= self.settings.window_hops else None
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
@@ -279,6 +284,7 @@ class FrontEnd:
             bearing_age_s=self._age_s(settings.bearing_hops, hop.end),
             health=health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
+            character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
         )
 
     def _noise_prominence(self) -> float:
@@ -301,6 +307,12 @@ class FrontEnd:
     def _used(self) -> BoolArray | slice:
         """Microphones whose energy counts: those kept, or all where none is."""
         return self._keep if self._keep.any() else slice(None)
+
+    @property
+    def _middle(self) -> int:
+        """The usable microphone nearest to the centre."""
+        usable = self._nearest[self._keep[self._nearest]]
+        return int(usable[0] if len(usable) else self._nearest[0])
 
     def _srp(self, n_hops: int) -> FloatArray:
         """SRP-PHAT of the last hops, (E, A)."""

@@ -24,31 +24,68 @@ from worldstate.ground.typing import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Familiar:
-    """A sound as the model knows them."""
+    """A sound as the model knows them.
+
+    Parameters
+    ----------
+    log_odds : float
+        Of anything else, over the guard's threshold, nats: not positive.
+
+    Examples
+    --------
+    >>> Familiar(-3.2).log_odds
+    -3.2
+    """
 
     LAYOUT: ClassVar = Layout(constants={"kind": "familiar"})
 
-    log_odds: float  # Of anything else, over the threshold: negative
+    log_odds: float
 
 
 @dataclass(frozen=True, slots=True)
 class Foreign:
-    """A sound that the model was not made for."""
+    """A sound that the model was not made for.
+
+    Parameters
+    ----------
+    reason : str
+        What it is taken for.
+    log_odds : float
+        Over the guard's threshold, nats: positive.
+
+    Examples
+    --------
+    >>> Foreign("sounds like speech", 4.0).reason
+    'sounds like speech'
+    """
 
     LAYOUT: ClassVar = Layout(constants={"kind": "foreign"})
 
     reason: str
-    log_odds: float  # Over the threshold: positive
+    log_odds: float
 
 
 @dataclass(frozen=True, slots=True)
 class WarningSignal:
-    """What a vehicle warns with: siren, horn, reversing beeper, bell of a bicycle."""
+    """What a vehicle warns with: evidence of it is left as it is.
+
+    Parameters
+    ----------
+    signal : str
+        Siren, horn, reversing beeper or bicycle bell.
+    log_odds : float
+        Over the guard's threshold, nats: positive.
+
+    Examples
+    --------
+    >>> WarningSignal("siren", 9.0).signal
+    'siren'
+    """
 
     LAYOUT: ClassVar = Layout(constants={"kind": "warning-signal"})
 
     signal: str
-    log_odds: float  # Over the threshold: positive
+    log_odds: float
 
 
 DomainVerdict: TypeAlias = Familiar | Foreign | WarningSignal
@@ -56,21 +93,56 @@ DomainVerdict: TypeAlias = Familiar | Foreign | WarningSignal
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DomainGuard:
-    """Coefficients of a guard, no rows of what it was trained on."""
+    """Coefficients of a guard, no rows of what it was trained on.
 
-    measures: tuple[str, ...]  # Names of what it reads, in their order
-    foreign: tuple[str, ...]  # Kinds of foreign sounds that it has heard
-    signals: tuple[str, ...]  # And of warning signals
-    weights: FloatArray  # shape (1 + foreign + signals, measures): The street first
-    biases: FloatArray  # shape (1 + foreign + signals,)
-    threshold: float  # Log-odds that so many hops of streets never heard exceed as its training states
+    Parameters
+    ----------
+    measures : tuple of str
+        Names of what it reads, in their order.
+    foreign, signals : tuple of str
+        Kinds of foreign sounds and of warning signals that it has heard.
+    weights : ndarray, shape (1 + foreign + signals, measures)
+        Of the softmax, the street first.
+    biases : ndarray, shape (1 + foreign + signals,)
+        Of the softmax.
+    threshold : float
+        Log-odds that .025 of the hops of streets never heard exceed.
+    kinds_of_signals : tuple of str
+        The signal that each centre is of: two sirens are one.
+    centres : ndarray, shape (kinds, measures)
+        Mean of every kind of signal.
+    whitening : ndarray, shape (measures, measures)
+        Makes the reach of a kind the unit ball.
+    margin : float
+        Nats that evidence of a foreign sound has to exceed to say anything.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the coefficients do not fit one another or a kind is missing.
+
+    Examples
+    --------
+    >>> reach = {"kinds_of_signals": ("siren",), "centres": [[9.0]], "whitening": [[1.0]]}
+    >>> weights = [[0.0], [1.0], [2.0]]
+    >>> guard = DomainGuard(("x",), ("speech",), ("siren",), weights, [3.0, 0.0, -5.0], 1.0, **reach)
+    >>> guard.judge(np.array([0.0])).log_odds < 0.0, guard.judge(np.array([4.5])).reason
+    (True, 'sounds like speech')
+    """
+
+    measures: tuple[str, ...]
+    foreign: tuple[str, ...]
+    signals: tuple[str, ...]
+    weights: FloatArray
+    biases: FloatArray
+    threshold: float
     # The softmax alone takes every whistle that it has never heard for a siren.
-    kinds_of_signals: tuple[str, ...]  # The signal that each centre is of: two sirens are one
-    centres: FloatArray  # shape (kinds, measures): Mean of every kind of signal
-    whitening: FloatArray  # shape (measures, measures): Makes the reach of a kind the unit ball
-    # Nats that flagged evidence has to exceed to say anything. Without end it costs .64 of the detections of
-    # vehicles that come while a foreign sound is as loud as they are, with 2 nats .28; both leave alarms in
-    # .016 and .018 of the hops of foreign sounds alone, .11 before (25 sounds, each of a kind never heard).
+    kinds_of_signals: tuple[str, ...]
+    centres: FloatArray
+    whitening: FloatArray
+    # Without end it costs .64 of the detections of vehicles that come while a foreign sound is as loud as
+    # they are, with 2 nats .28; both leave alarms in .02 of the hops of foreign sounds alone, .11 before (25
+    # sounds at five sites, each of a kind and at a site never heard).
     margin: float = 2.0
 
     def __post_init__(self) -> None:
@@ -81,12 +153,26 @@ class DomainGuard:
         freeze_arrays(self, centres=(len(self.kinds_of_signals), inputs))
 
     def log_odds(self, measures: FloatArray) -> FloatArray:
-        """Return the log-odds of anything but the street, over the threshold, shape (n,)."""
+        r"""Return the log-odds of anything but the street, over the threshold, shape (n,).
+
+        .. math:: \log \sum_{c \ne street} e^{w_c^T x + b_c} - (w_{street}^T x + b_{street}) - \tau
+
+        Parameters
+        ----------
+        measures : ndarray, shape (n, measures)
+            Rows.
+        """
         logits = measures @ self.weights.T + self.biases
         return np.asarray(np.logaddexp.reduce(logits[:, 1:], axis=1) - logits[:, 0] - self.threshold)
 
     def judge(self, measures: FloatArray) -> DomainVerdict:
-        """Return what the measures of two seconds say, shape (measures,)."""
+        """Return what the measures of two seconds say.
+
+        Parameters
+        ----------
+        measures : ndarray, shape (measures,)
+            `AcousticFrame.character`.
+        """
         log_odds = float(self.log_odds(measures[None])[0])
         if log_odds <= 0.0:
             return Familiar(log_odds)

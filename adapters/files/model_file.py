@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
 from worldstate.abduction.sequence.sequence_model import SequenceModel
+from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.ground.serialisation import ADDED, Layout, Via, decode, encode
@@ -79,12 +80,15 @@ class Model:
     [0.01, 0.02, 0.05]
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Model", "1.3.0", order="provenance signature policies sequence")
+    LAYOUT: ClassVar = Layout(
+        "worldstate.Model", "1.4.0", order="provenance signature policies sequence guard"
+    )
 
     signature: AnySignature
     policies: Annotated[CueingPolicies, Via(tuple[CueingPolicy, ...], attrgetter("policies"), CueingPolicies)]
     provenance: Provenance
     sequence: SequenceModel | None = field(default=None, metadata=ADDED)
+    guard: DomainGuard | None = field(default=None, metadata=ADDED)
 
     @property
     def domain(self) -> ModelDomain | None:

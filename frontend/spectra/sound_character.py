@@ -9,6 +9,7 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
 from worldstate.ground.checks import in_range
@@ -60,7 +61,7 @@ class SoundCharacter:
         self._levels: FloatArray = np.zeros((_MEMORY, len(EDGES_HZ) - 1))
         self._n_hops = 0
 
-    def push(self, samples: FloatArray) -> None:
+    def push(self, samples: NDArray[np.floating]) -> None:
         """Take the samples of the next hop of 0.1 s, shape (n,)."""
         new = self._decimator.push(samples)
         self._sound = np.concatenate([self._sound, new])[len(new) :]

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
+from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag, SourceEvidence
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
@@ -54,6 +55,7 @@ class _Memory:
     instant: _Posterior | None
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
     bearing: Bearing | None = field(default=None, metadata=ADDED)
+    domain: DomainVerdict | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,7 @@ def memory_record(memory: Memory) -> _Memory:
         instant=None if instant is None else _posterior_record(instant),
         threshold=memory.threshold,
         bearing=memory.bearing,
+        domain=memory.domain,
     )
 
 
@@ -128,6 +131,7 @@ def memory_of(record: FilterRecord) -> Memory:
         instant=None if kept.instant is None else _posterior_of(kept.instant, directions),
         threshold=kept.threshold,
         bearing=kept.bearing,
+        domain=kept.domain,
     )
 
 

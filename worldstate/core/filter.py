@@ -173,6 +173,7 @@ class WorldFilter:
             cues=cues_of(memory, self._model, self.risk, alarmed(memory)),
             calibrated=self.policy.alpha > 0.0,
             bearing=memory.bearing,
+            domain=memory.domain,
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
 from worldstate.abduction.posterior import Posterior
+from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.track import Track
@@ -32,6 +33,7 @@ class Memory:
     # How far the threshold has moved, where the policy lets it.
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
     bearing: Bearing | None = None  # Of the last measurement
+    domain: DomainVerdict | None = None  # Of the last measurement
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

@@ -196,5 +196,6 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
         births=hidden.births,
         seq=memory.seq + 1,
         bearing=None if isinstance(measurement.bearing, NotUsable) else measurement.bearing,
+        domain=measurement.domain,
         last_ns=tuple(sorted(last_ns.items())),
     )

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.values import NotUsable
 
 
@@ -101,6 +102,8 @@ class Measurement:
         Marginalised where not usable.
     sightings : tuple of Sighting
         All that the co-evidence channel reports, in the queried sector or not.
+    domain : Familiar, Foreign, WarningSignal or None
+        Whether the model was made for what was heard; None where nothing tells.
     source : str
         Name of the modality.
 
@@ -120,6 +123,7 @@ class Measurement:
     bearing: Bearing | NotUsable
     approach: Approach | NotUsable
     sightings: tuple[Sighting, ...] = ()
+    domain: DomainVerdict | None = None
     # Overlap is discounted within a source and evidence multiplied across sources: two with one name would
     # count as one that repeats itself.
     source: str = "acoustic"

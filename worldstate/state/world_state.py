@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
 from worldstate.measurement.measurement import Bearing
@@ -45,6 +46,9 @@ class WorldState:
         not, no cue states an alpha.
     bearing : Bearing or None
         Loudest source of the last measurement, with its standard deviation; None where it had no bearing.
+    domain : Familiar, Foreign, WarningSignal or None
+        Whether the model was made for what was heard last. Of a foreign sound it gives the reason, and the
+        evidence of that hop counts little; a warning signal comes from a vehicle.
 
     Examples
     --------
@@ -53,7 +57,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.2.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.3.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -65,6 +69,7 @@ class WorldState:
     clock: str = "media"
     calibrated: bool = field(default=False, metadata=ADDED)
     bearing: Bearing | None = None
+    domain: DomainVerdict | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.

@@ -1,0 +1,78 @@
+"""A guard in the acoustic adapter: foreign sounds say less, warning signals as much, snapshots say why."""
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.signature.domain_guard import DomainGuard, Familiar, Foreign, WarningSignal
+from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.core.filter import WorldFilter
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.spectra.sound_character import MEASURES
+from worldstate.ground.errors import OutOfDomainError
+from worldstate.state.world_state import WorldState
+
+RATE_HZ = 6000
+ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
+STEADY, SHARED = MEASURES.index("line holds"), MEASURES.index("together 2.2")
+
+
+class Alarmed:
+    """A model that hears a vehicle on the left whatever it is given."""
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return SignatureEvidence(("left", "right"), (3.0, 0.0), -2.0, -1.0)
+
+
+def guard() -> DomainGuard:
+    """What its bands share makes a sound foreign, a line that holds a signal."""
+    weights = np.zeros((3, len(MEASURES)))
+    weights[1, SHARED], weights[2, STEADY] = 12.0, 20.0
+    return DomainGuard(
+        measures=MEASURES,
+        foreign=("speech",),
+        signals=("siren",),
+        weights=weights,
+        biases=np.array([12.0, 0.0, 0.0]),
+        threshold=0.0,
+        kinds_of_signals=("siren",),
+        centres=np.zeros((1, len(MEASURES))),
+        whitening=np.zeros((len(MEASURES), len(MEASURES))),
+    )
+
+
+def sounds() -> dict[type, np.ndarray]:
+    """Three seconds of noise, of noise that swells four times a second, and of a tone."""
+    rng, time = np.random.default_rng(1), np.arange(3 * RATE_HZ) / RATE_HZ
+    noise = 0.02 * rng.standard_normal((len(time), 3))
+    swelling = noise * (1.05 + np.sin(8.0 * np.pi * time))[:, None]
+    tone = noise + 0.2 * np.sin(2.0 * np.pi * 700.0 * time)[:, None]
+    return {Familiar: noise, Foreign: swelling, WarningSignal: tone}
+
+
+@pytest.mark.parametrize("kind", [Familiar, Foreign, WarningSignal])
+def test_only_foreign_sounds_lose_their_evidence_and_the_snapshot_says_so(kind: type) -> None:
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Alarmed(), guard=guard()).measure(sounds()[kind])
+    assert [one.domain for one in measured[:11]] == [None] * 11
+    last = measured[-1]
+    assert isinstance(last.domain, kind)
+    assert last.signature.hidden == ((1.0, -1.0) if kind is Foreign else (3.0, 0.0))
+    world = WorldFilter()
+    for one in measured:
+        world = world.update(one)
+    again = WorldState.from_json(world.state.to_json())
+    assert again.domain == last.domain
+    if isinstance(last.domain, Foreign):
+        assert again.to_dict()["domain"]["reason"] == "sounds like speech"
+
+
+def test_a_guard_of_other_measures_is_refused() -> None:
+    one = guard()
+    renamed = DomainGuard(
+        ("loudness", *MEASURES[1:]),
+        *(one.foreign, one.signals, one.weights, one.biases, one.threshold),
+        *(one.kinds_of_signals, one.centres, one.whitening),
+    )
+    with pytest.raises(OutOfDomainError, match="guard"):
+        AcousticAdapter(ARRAY, RATE_HZ, Alarmed(), guard=renamed)
