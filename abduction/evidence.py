@@ -23,10 +23,12 @@ class SideEvidence:
         Posterior of hidden vehicles on both sides at the training prior.
     direct : float
         Posterior of a source in the open, whose bearing says where it is: no side is named then.
+    visible : float
+        Log-likelihood of one in view above that of none, with a source in the open left aside, nats.
 
     Examples
     --------
-    >>> SideEvidence(("left", "right"), (2.5, -1.0), 0.02, 0.01).log_ratios[0]
+    >>> SideEvidence(("left", "right"), (2.5, -1.0), 0.02, 0.01, 0.3).log_ratios[0]
     2.5
     """
 
@@ -34,6 +36,7 @@ class SideEvidence:
     log_ratios: tuple[float, ...]
     both: float
     direct: float
+    visible: float
 
 
 @dataclass(frozen=True, slots=True)

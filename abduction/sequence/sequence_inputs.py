@@ -5,7 +5,7 @@ mirrored onto the left, so that one model serves both. Where less than that was 
 in.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,9 +36,34 @@ class HopEvidence:
     def __len__(self) -> int:
         return len(self.visible)
 
-    def last(self, hops: int) -> "HopEvidence":
-        """Return the last hops alone."""
-        return HopEvidence(*(getattr(self, one.name)[-hops:] for one in fields(self)))
+    @classmethod
+    def heard(
+        cls,
+        sides: FloatArray,
+        visible: FloatArray,
+        *,
+        feature: FloatArray,
+        band_log_energy: FloatArray,
+        prominence: FloatArray,
+        looming_hz: FloatArray,
+        looming_std_hz: FloatArray,
+        bearing_rad: FloatArray,
+    ) -> "HopEvidence":
+        """Return the evidence of hops, one a row, from what the window model and the front-end said.
+
+        The only way from either to a sequence: a model that learns one and reads another is worth nothing.
+        """
+        # In double precision: streams on disk keep half of it, and its logarithm would have the other half's.
+        return cls(
+            sides=sides,
+            visible=visible,
+            level=np.log(np.asarray(feature, np.float64)).mean(axis=1),
+            loudness=np.asarray(band_log_energy, np.float64).mean(axis=1),
+            prominence=np.log(prominence),
+            looming_hz=looming_hz,
+            looming_std_hz=looming_std_hz,
+            bearing_rad=bearing_rad,
+        )
 
 
 INPUTS = (
@@ -53,40 +78,130 @@ INPUTS = (
 )
 
 
-def sequence_inputs(evidence: HopEvidence) -> FloatArray:
-    """Return the inputs of both sides at every hop, shape (n, 2, inputs).
+# What is kept of a hop, without gaps: the first five change, the first three have a highest.
+COLUMNS = ("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing")
+_CHANGING, _HIGHEST = 5, 3
+_PROMINENCE, _RATE, _SPREAD, _BEARING = range(5, 9)
+# What of it is usual in the street: two levels that the quietest fifth stays below, then evidence.
+USUAL = ("level", "loudness", "left", "right", "visible")
+_LEVELS = 2
+_EVERY = (
+    *COLUMNS[:_HIGHEST],
+    *("level", "loudness", "left_above", "right_above", "visible_above"),
+    *(f"{name}_1s" for name in COLUMNS[:_CHANGING]),
+    *(f"{name}_2s" for name in COLUMNS[:_CHANGING]),
+    *("left_before", "right_before"),
+    *(f"{name}_highest" for name in COLUMNS[:_HIGHEST]),
+    *("prominence", "prominence_1s", "approach", "approach_std"),
+    *("bearing", "bearing_1s", "bearing_spread"),
+)
 
-    Examples
-    --------
-    >>> flat = HopEvidence(np.zeros((5, 2)), *np.zeros((7, 5)))
-    >>> sequence_inputs(flat).shape == (5, 2, len(INPUTS))
-    True
-    """
-    level, loudness = (one - running(one, QUIET_SHARE) for one in (evidence.level, evidence.loudness))
-    above = evidence.sides - np.stack([running(side, USUAL_SHARE) for side in evidence.sides.T], axis=1)
+
+def _of_side(this: str, other: str) -> list[int]:
+    named = [name.replace("this", this).replace("other", other) for name in INPUTS]
+    return [_EVERY.index(name) for name in named]
+
+
+_OWN = [COLUMNS.index(name) for name in USUAL]
+_ORDER = (_of_side("left", "right"), _of_side("right", "left"))
+_MIRRORED = np.where(np.isin(INPUTS, ("bearing", "bearing_1s")), -1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Columns:
+    """What inputs are made of: columns now and before, and what is usual in the street, one row a hop."""
+
+    now: FloatArray  # shape (n, 9): `columns_of`
+    second: FloatArray  # The same one, two and three seconds before
+    two: FloatArray
+    three: FloatArray
+    highest: FloatArray  # shape (n, 3): Of both sides and the visible, over three seconds
+    swing: FloatArray  # shape (n,): Of the bearing, over one
+    usual: FloatArray  # shape (n, 5): `level` and `loudness` of the quiet street, then usual evidence
+
+    def inputs(self) -> FloatArray:
+        """Return the inputs of both sides, shape (n, 2, inputs)."""
+        now, second = self.now, self.second
+        spread = now[:, _SPREAD]
+        rest = [now[:, _PROMINENCE], second[:, _PROMINENCE], now[:, _RATE] / spread, np.log(spread)]
+        rest += [now[:, _BEARING], now[:, _BEARING] - second[:, _BEARING], self.swing]
+        changes = [(now - one)[:, :_CHANGING] for one in (second, self.two)]
+        before = (second - self.three)[:, : len(SIDES)]
+        above = streets_own(now) - self.usual
+        parts = [now[:, :_HIGHEST], above, *changes, before, self.highest, np.stack(rest, axis=1)]
+        every = np.concatenate(parts, axis=1)
+        left, right = (every[:, order] for order in _ORDER)
+        return np.stack([left, right * _MIRRORED], axis=1)
+
+
+def columns_of(evidence: HopEvidence) -> FloatArray:
+    """Return evidence as columns without gaps, shape (n, 9), as `COLUMNS` names them."""
     # Where nothing could be read the rate is 0 and its deviation that of knowing nothing.
     refused = ~np.isfinite(evidence.looming_hz)
     rate = np.where(refused, 0.0, evidence.looming_hz)
     spread = np.where(refused, 10.0, np.minimum(evidence.looming_std_hz, 10.0))
     azimuth = np.where(np.isfinite(evidence.bearing_rad), evidence.bearing_rad, 0.0)
-    swing = highest(azimuth, _SECOND) + highest(-azimuth, _SECOND)
-    shared = [evidence.visible, evidence.visible - running(evidence.visible, USUAL_SHARE)]
-    shared += [*_changes(evidence.visible), highest(evidence.visible, _THREE)]
-    shared += [level, *_changes(evidence.level), loudness, *_changes(evidence.loudness)]
-    shared += [evidence.prominence, ago(evidence.prominence, _SECOND), rate / spread, np.log(spread)]
-    both = []
-    for side in range(len(SIDES)):
-        mine, other, sign = evidence.sides[:, side], evidence.sides[:, 1 - side], 1.0 - 2.0 * side
-        own = [mine, above[:, side], *_changes(mine)]
-        own += [ago(mine, _SECOND) - ago(mine, _THREE), highest(mine, _THREE)]
-        own += [other, above[:, 1 - side], *_changes(other), highest(other, _THREE)]
-        turned = [sign * azimuth, sign * (azimuth - ago(azimuth, _SECOND)), swing]
-        both.append(np.stack([*own, *shared, *turned], axis=1))
-    return np.stack(both, axis=1)
+    single = [evidence.visible, evidence.level, evidence.loudness, evidence.prominence, rate, spread, azimuth]
+    return np.concatenate([evidence.sides, np.stack(single, axis=1)], axis=1)
 
 
-def _changes(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return values - ago(values, _SECOND), values - ago(values, _TWO)
+def streets_own(columns: FloatArray) -> FloatArray:
+    """Return the columns whose usual values are kept for a minute, as `USUAL` names them."""
+    return np.asarray(columns[:, _OWN])
+
+
+def sequence_inputs(evidence: HopEvidence) -> FloatArray:
+    """Return the inputs of both sides at every hop, shape (n, 2, inputs).
+
+    Examples
+    --------
+    >>> flat = HopEvidence(np.zeros((5, 2)), *np.ones((7, 5)))
+    >>> sequence_inputs(flat).shape == (5, 2, len(INPUTS))
+    True
+    """
+    columns = columns_of(evidence)
+    shares = [QUIET_SHARE] * _LEVELS + [USUAL_SHARE] * (len(USUAL) - _LEVELS)
+    usual = [running(one, share) for one, share in zip(streets_own(columns).T, shares, strict=True)]
+    azimuth = columns[:, _BEARING]
+    return _Columns(
+        now=columns,
+        second=ago(columns, _SECOND),
+        two=ago(columns, _TWO),
+        three=ago(columns, _THREE),
+        highest=np.stack([highest(one, _THREE) for one in columns[:, :_HIGHEST].T], axis=1),
+        swing=highest(azimuth, _SECOND) + highest(-azimuth, _SECOND),
+        usual=np.stack(usual, axis=1),
+    ).inputs()
+
+
+def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
+    """Return the inputs of the last hop, shape (1, 2, inputs), from what is kept of a stream.
+
+    Shapes: recent (up to 31, 9), minute (up to 600, 5).
+    """
+    now = len(recent) - 1
+
+    def before(hops: int) -> FloatArray:
+        at = max(now - hops, 0)
+        return recent[at : at + 1]
+
+    swing = recent[-1 - _SECOND :, _BEARING]
+    usual = [_ranked(minute[:, :_LEVELS], QUIET_SHARE), _ranked(minute[:, _LEVELS:], USUAL_SHARE)]
+    return _Columns(
+        now=recent[-1:],
+        second=before(_SECOND),
+        two=before(_TWO),
+        three=before(_THREE),
+        highest=recent[:, :_HIGHEST].max(axis=0)[None],
+        swing=(swing.max() + (-swing).max())[None],
+        usual=np.concatenate(usual)[None],
+    ).inputs()
+
+
+def _ranked(values: FloatArray, share: float) -> FloatArray:
+    """Return the value of each column that a share of its rows stays below."""
+    rank = int(share * (len(values) - 1))
+    return np.asarray(np.partition(values, rank, axis=0)[rank])
 
 
 def ago(values: FloatArray, hops: int) -> FloatArray:

@@ -115,6 +115,9 @@ class SequenceModel:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, share=(len(GROUPS),))
+        # A posterior is moved to another prior by dividing by it.
+        if (self.share <= 0.0).any():
+            raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")
         if self.trees.inputs > len(INPUTS) or len(self.trees.baseline) != len(GROUPS):
             raise InvalidArgumentError(
                 f"trees: expected {len(INPUTS)} inputs and {len(GROUPS)} groups, "

@@ -91,6 +91,22 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
     return np.asarray(np.log(present) - np.log(rest.sum(axis=1, keepdims=True)))
 
 
+def visible_ratios(posteriors: FloatArray, prior: FloatArray) -> FloatArray:
+    r"""Return what a window says of a vehicle in view against nobody, shape (n,), nats.
+
+    .. math:: \log \frac{P_{front}}{\pi_{front}} - \log \frac{P_{none}}{\pi_{none}}
+
+    Shapes: posteriors (n, classes), prior (classes,).
+
+    Examples
+    --------
+    >>> visible_ratios(np.array([[0.4, 0.2, 0.2, 0.2]]), np.full(4, 0.25)).round(2)
+    array([0.69])
+    """
+    ratios = posteriors[:, [FRONT, NONE]] / prior[[FRONT, NONE]]
+    return np.asarray(np.log(ratios[:, 0]) - np.log(ratios[:, 1]))
+
+
 def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> SignatureEvidence:
     """Return what one window says, from its posteriors at the training prior.
 
@@ -107,7 +123,8 @@ def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: Flo
     ratios = explanation_ratios(explained(posteriors, classes, prior), known)[0]
     left, right = side_ratios(posteriors, classes, prior)[0].tolist()
     both, direct = (_column(posteriors, classes, name)[0, 0].item() for name in (BOTH, DIRECT))
-    return evidence_of(ratios, SideEvidence(DIRECTIONS, (left, right), both, direct))
+    visible = visible_ratios(posteriors, prior).item()
+    return evidence_of(ratios, SideEvidence(DIRECTIONS, (left, right), both, direct, visible))
 
 
 def _sides_filled(shares: FloatArray, classes: tuple[str, ...]) -> FloatArray:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_up_sequence import evidence_of
 
 from worldstate.abduction.sequence.boosted_trees import BoostedTrees
 from worldstate.abduction.sequence.sequence_inputs import (
@@ -19,13 +20,6 @@ from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S, Seq
 from worldstate.ground.errors import InvalidArgumentError
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def evidence_of(rng: np.random.Generator, hops: int) -> HopEvidence:
-    single = rng.normal(size=(7, hops)).cumsum(axis=1)
-    single[4:6][:, rng.random(hops) < 0.3] = np.nan
-    single[5] = np.abs(single[5]) + 0.01
-    return HopEvidence(rng.normal(size=(hops, 2)).cumsum(axis=0), *single)
 
 
 @given(SEEDS)
@@ -49,7 +43,8 @@ def test_the_mirrored_street_exchanges_the_sides(seed: int) -> None:
 def test_three_seconds_are_all_that_is_kept_but_for_the_streets_own_level(seed: int) -> None:
     whole = evidence_of(np.random.default_rng(seed), 70)
     levels = np.array([name in ("level", "loudness") or name.endswith("_above") for name in INPUTS])
-    last, short = sequence_inputs(whole)[-1], sequence_inputs(whole.last(MEMORY_HOPS))[-1]
+    kept = HopEvidence(*(getattr(whole, one.name)[-MEMORY_HOPS:] for one in fields(whole)))
+    last, short = sequence_inputs(whole)[-1], sequence_inputs(kept)[-1]
     np.testing.assert_allclose(last[:, ~levels], short[:, ~levels], atol=1e-9)
 
 

@@ -1,0 +1,117 @@
+"""A sequence model read hop by hop: what is kept of a stream, and what its last hop says of both sides."""
+
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from worldstate.ground.checks import freeze_arrays
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import NotUsable
+
+from .sequence_inputs import (
+    COLUMNS,
+    MEMORY_HOPS,
+    QUIET_HOPS,
+    SIDES,
+    USUAL,
+    HopEvidence,
+    columns_of,
+    last_inputs,
+    streets_own,
+)
+from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
+
+# Before, what is usual in a street is what was heard just now.
+LEAST_HOPS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceHistory:
+    """What is kept of a stream: three seconds of its evidence, a minute of what is usual in its street.
+
+    Examples
+    --------
+    >>> SequenceHistory().hops
+    0
+    """
+
+    # shapes (up to 31, 9), as `columns_of`, and (up to 600, 5), as `streets_own`; the last hop last
+    recent: FloatArray = field(default_factory=partial(np.zeros, (0, len(COLUMNS))))
+    minute: FloatArray = field(default_factory=partial(np.zeros, (0, len(USUAL))))
+
+    def __post_init__(self) -> None:
+        # An empty list in a file has no second axis.
+        for name, width in (("recent", len(COLUMNS)), ("minute", len(USUAL))):
+            object.__setattr__(self, name, np.reshape(getattr(self, name), (-1, width)))
+        if len(self.recent) > MEMORY_HOPS or len(self.minute) > QUIET_HOPS or self.hops > len(self.minute):
+            raise InvalidArgumentError(
+                f"history: expected at most {MEMORY_HOPS} hops in a minute of {QUIET_HOPS}, "
+                f"got {len(self.recent)} in {len(self.minute)}"
+            )
+
+    @property
+    def hops(self) -> int:
+        """Number of hops that are kept, up to three seconds of them."""
+        return len(self.recent)
+
+    def heard(self, evidence: HopEvidence) -> "SequenceHistory":
+        """Return the history one hop on."""
+        columns = columns_of(evidence)
+        return SequenceHistory(
+            np.concatenate([self.recent[1 - MEMORY_HOPS :], columns]),
+            np.concatenate([self.minute[1 - QUIET_HOPS :], streets_own(columns)]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceReading:
+    """What the last seconds said of both sides, at the share of hazards that the model was trained at.
+
+    Examples
+    --------
+    >>> even = np.full(len(GROUPS), 1 / len(GROUPS))
+    >>> SequenceReading(np.stack([even, even]), even, margin_s=0.2).groups.shape == (2, len(GROUPS))
+    True
+    """
+
+    groups: FloatArray  # shape (2, groups): Posterior of the left and the right side
+    share: FloatArray  # shape (groups,): The prior in it
+    margin_s: float = 0.0
+    alarm: SequenceAlarm | None = None
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, groups=(len(SIDES), len(GROUPS)), share=(len(GROUPS),))
+        if (self.groups < 0.0).any() or not np.allclose(self.groups.sum(axis=1), 1.0, atol=1e-6):
+            raise InvalidArgumentError("groups: expected probabilities that sum to one on each side")
+        if (self.share <= 0.0).any():
+            raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")
+
+
+class SequenceReader:
+    """Reads a stream hop by hop, what `SequenceModel.posterior` reads of the whole.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.sequence.boosted_trees import BoostedTrees
+    >>> stump = dict(split=[[0, 0, 0]], threshold=[[0.5, 0, 0]], yes=[[1, 1, 2]], no=[[2, 1, 2]])
+    >>> trees = BoostedTrees(**stump, value=[[0.0, -1.0, 1.0]], tree_class=[0], baseline=[0.0] * len(GROUPS))
+    >>> reader = SequenceReader(SequenceModel(trees, np.full(len(GROUPS), 1 / len(GROUPS))))
+    >>> hop = HopEvidence(np.array([[2.0, -2.0]]), *np.ones((7, 1)))
+    >>> [isinstance(reader.read(hop), SequenceReading) for _ in range(10)].count(True)
+    1
+    """
+
+    def __init__(self, model: SequenceModel, history: SequenceHistory | None = None) -> None:
+        self._model = model
+        self.history = history or SequenceHistory()  # All that is carried; `Checkpoint` writes it to disk
+
+    def read(self, evidence: HopEvidence) -> SequenceReading | NotUsable:
+        """Take the next hop in; return what it says together with those before."""
+        self.history = history = self.history.heard(evidence)
+        if history.hops < LEAST_HOPS:
+            return NotUsable(f"less than {LEAST_HOPS} hops of evidence")
+        posterior = self._model.of_inputs(last_inputs(history.recent, history.minute))
+        model = self._model
+        return SequenceReading(posterior.groups[0], model.share, model.margin_s, model.alarm)

@@ -1,0 +1,53 @@
+"""A sequence model read hop by hop says what it says of the whole stream, from what a file can keep."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_up_sequence import evidence_of, sequence_model
+
+from worldstate.abduction.sequence.sequence_inputs import HopEvidence
+from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
+from worldstate.ground.serialisation import decode, encode
+from worldstate.ground.values import NotUsable
+
+
+def _hops(whole: HopEvidence) -> list[HopEvidence]:
+    columns = [getattr(whole, one.name) for one in fields(whole)]
+    return [HopEvidence(*(column[at : at + 1] for column in columns)) for at in range(len(whole))]
+
+
+# Longer and shorter than the minute that is kept.
+@given(st.integers(0, 2**32 - 1), st.sampled_from([15, 60, 620]))
+@settings(max_examples=5)
+def test_hop_by_hop_it_says_what_the_model_says_of_the_whole_stream(seed: int, hops: int) -> None:
+    rng = np.random.default_rng(seed)
+    model, whole = sequence_model(rng), evidence_of(rng, hops)
+    reader, said = SequenceReader(model), model.posterior(whole).groups
+    for number, hop in enumerate(_hops(whole)):
+        reading = reader.read(hop)
+        if number < 9:
+            assert isinstance(reading, NotUsable)
+        else:
+            assert isinstance(reading, SequenceReading)
+            np.testing.assert_array_equal(reading.groups, said[number])
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_a_history_from_a_file_goes_on_to_the_bit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model, hops = sequence_model(rng), _hops(evidence_of(rng, 50))
+    reader = SequenceReader(model)
+    cut = int(rng.integers(0, 40))
+    for hop in hops[:cut]:
+        reader.read(hop)
+    written = json.dumps(encode(reader.history), allow_nan=False)
+    again = SequenceReader(model, decode(SequenceHistory, json.loads(written), "history"))
+    for hop in hops[cut:]:
+        here, there = reader.read(hop), again.read(hop)
+        if isinstance(here, SequenceReading):
+            np.testing.assert_array_equal(here.groups, there.groups)
+    assert isinstance(here, SequenceReading)

@@ -1,0 +1,32 @@
+"""Sequence models and streams made up of random numbers."""
+
+import numpy as np
+
+from worldstate.abduction.sequence.boosted_trees import BoostedTrees
+from worldstate.abduction.sequence.sequence_inputs import INPUTS, HopEvidence
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequenceModel
+
+
+def evidence_of(rng: np.random.Generator, hops: int) -> HopEvidence:
+    """Return a stream that wanders, its looming and bearing refused now and then."""
+    single = rng.normal(size=(7, hops)).cumsum(axis=1)
+    single[4:6][:, rng.random(hops) < 0.3] = np.nan
+    single[5] = np.abs(single[5]) + 0.01
+    return HopEvidence(rng.normal(size=(hops, 2)).cumsum(axis=0), *single)
+
+
+def sequence_model(rng: np.random.Generator, alarm: SequenceAlarm | None = None) -> SequenceModel:
+    """Return a model of stumps, five for each input."""
+    trees = 5 * len(INPUTS)
+    here = np.tile([0, 1, 2], (trees, 1))
+    split, threshold = np.zeros((trees, 3), int), np.zeros((trees, 3))
+    split[:, 0], threshold[:, 0] = np.arange(trees) % len(INPUTS), rng.normal(size=trees)
+    yes, no = here.copy(), here.copy()
+    yes[:, 0], no[:, 0] = 1, 2
+    stumps = BoostedTrees(
+        *(split, threshold, yes, no, rng.normal(size=(trees, 3))),
+        rng.integers(0, len(GROUPS), trees),
+        np.zeros(len(GROUPS)),
+    )
+    share = 0.9 * rng.dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
+    return SequenceModel(stumps, share, margin_s=0.2, alarm=alarm)
