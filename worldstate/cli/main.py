@@ -25,6 +25,7 @@ COMMANDS = (
     "users.train",
     "users.model",
     "users.calibrate",
+    "users.commission",
     "users.measure_absence",
     "studies.evaluate",
     "studies.evaluate_features",

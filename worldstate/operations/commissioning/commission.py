@@ -90,6 +90,7 @@ def learn_sequence(
     streams: Sequence[HeardStream],
     fit_windows: FitWindows,
     onsets_per_hour: float,
+    rng: np.random.Generator,
     on_step: Callable[[], None] = lambda: None,
 ) -> LearnedSequence:
     """Train a sequence model on streams, junction by junction out of fold.
@@ -111,13 +112,13 @@ def learn_sequence(
     for fold in sorted(set(folds)):
         inside = [labelled[i] for i, at in enumerate(folds) if at != fold]
         outside = [i for i, at in enumerate(folds) if at == fold]
-        model = train_sequence(inside)
+        model = train_sequence(inside, rng)
         margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
         left_out += [(i, model.posterior(labelled[i].evidence)) for i in outside]
         on_step()
     quiet = [posterior for i, posterior in left_out if streams[i].hops.about["traffic"] == HAZARD_FREE]
     alarm, margin_s = alarm_for(quiet, onsets_per_hour), float(np.mean(margins))
-    final = replace(train_sequence(list(labelled.values())), margin_s=margin_s, alarm=alarm)
+    final = replace(train_sequence(list(labelled.values()), rng), margin_s=margin_s, alarm=alarm)
     on_step()
     examined = [
         ExaminedStream(streams[i], labelled[i].truth, replace(posterior, margin_s=margin_s), alarm)
@@ -158,20 +159,18 @@ def commission(
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
     """Make a model for an array from simulated streets, and from labelled windows where there are any."""
-    streams = []
+    streams, rng = [], np.random.default_rng(settings.seed)
     for one in heard_streams(learned_streams(settings), array, folder, jobs):
         streams.append(one)
         on_step()
     open_field = open_field_windows(
-        open_field_features(
-            array, N_OPEN // 10 if settings.quick else N_OPEN, np.random.default_rng(settings.seed)
-        )
+        open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng)
     )
     real = None if table is None else table.select(~np.isin(table.environments, settings.leave_out))
     rate_hz = streams[0].hops.about["sample_rate_hz"]
     domain = domain_of(array, [rate_hz], [_site(one) for one in streams])
     fit = partial(_windows_learned, real, open_field, domain)
-    learned = learn_sequence(streams, fit, settings.onsets_per_hour, on_step)
+    learned = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
         windows,

@@ -3,6 +3,7 @@
 The sound itself is not kept: an hour of 56 channels at 6 kHz is 5 GB, what is heard in it 50 MB.
 """
 
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 
 HOPS, VEHICLES, ROWS = "hops", "vehicles", "rows"
@@ -108,28 +109,35 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
 
 
 def _vehicles(stream: DrawnStream) -> HopTable:
-    told = [
-        (
-            *(one.number, one.event.flow, one.event.manoeuvre.motion.kind.name, one.event.manoeuvre.arm),
-            *(np.nan if one.t0_s is None else one.t0_s, one.hazard),
-        )
-        for one in stream.vehicles
-    ]
-    return HopTable.of_rows(("vehicle", "flow", "kind", "arm", "entry_s", "hazard"), told)
+    # Typed column by column: of no vehicles at all rows would make columns of floats.
+    every = stream.vehicles
+    motions = [one.event.manoeuvre for one in every]
+    return HopTable(
+        {
+            "vehicle": np.array([one.number for one in every], np.int64),
+            "flow": np.array([one.event.flow for one in every], np.str_),
+            "kind": np.array([one.motion.kind.name for one in motions], np.str_),
+            "arm": np.array([one.arm for one in motions], np.str_),
+            "entry_s": np.array([np.nan if one.t0_s is None else one.t0_s for one in every], np.float64),
+            "hazard": np.array([one.hazard for one in every], np.bool_),
+        }
+    )
 
 
 def _rows(stream: DrawnStream, loudness_db: dict[int, FloatArray]) -> HopTable:
-    parts = [
-        {
-            "vehicle": np.full(len(one.time_s), one.number),
-            "time_s": one.time_s,
-            "x_m": one.axle_m * np.cos(one.axle_rad),
-            "y_m": one.axle_m * np.sin(one.axle_rad),
-            "in_view": one.in_view,
-            "loudness_db": loudness_db[one.number],
-        }
-        for one in stream.vehicles
-    ]
+    every = stream.vehicles
+    azimuth, distance = (_joined([getattr(one, name) for one in every]) for name in ("axle_rad", "axle_m"))
     return HopTable(
-        {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+        {
+            "vehicle": np.repeat([one.number for one in every], [len(one.time_s) for one in every]),
+            "time_s": _joined([one.time_s for one in every]),
+            "x_m": distance * np.cos(azimuth),
+            "y_m": distance * np.sin(azimuth),
+            "in_view": _joined([one.in_view for one in every]).astype(np.bool_),
+            "loudness_db": _joined([loudness_db[one.number] for one in every]),
+        }
     )
+
+
+def _joined(parts: Sequence[AnyArray]) -> AnyArray:
+    return np.concatenate(parts) if parts else np.zeros(0)

@@ -267,4 +267,4 @@ def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
 
 
 def _hazard_free(stream: ExaminedStream) -> bool:
-    return not stream.heard.vehicles.columns.get("hazard", np.zeros(0)).any()
+    return not stream.heard.vehicles.hazard.any()

@@ -1,0 +1,34 @@
+"""`worldstate commission` from an array file to a model that can be read, and its exam."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from worldstate.adapters.files.model_file import read_model
+from worldstate.cli.main import main
+
+ARRAY = "x,y,z\n0,0.2,0\n0,0.05,0\n0.05,-0.1,0\n0,-0.25,0\n"
+
+
+@pytest.mark.slow
+def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mics.csv").write_text(ARRAY)
+    out, figure, report = tmp_path / "model.json", tmp_path / "exam.png", tmp_path / "exam.json"
+    command = ["commission", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
+    more = ["--figure", str(figure), "--report", str(report)]
+    assert main([*command, *more]) == 0
+    assert "unfit for use" in capsys.readouterr().out
+    model = read_model(out)
+    assert model.sequence is not None and model.sequence.alarm is not None
+    assert model.domain is not None and len(model.domain.positions_m) == 4
+    assert "unfit" in model.provenance.dataset
+    told = json.loads(report.read_text())
+    assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
+    heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}
+    before = out.read_bytes()
+    assert main(command) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()} == heard
+    assert out.read_bytes() == before

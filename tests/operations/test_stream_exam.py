@@ -1,0 +1,128 @@
+"""An exam of made-up streams, counted by hand: who is detected, when, on which side, and what alarms cost."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
+from worldstate.operations.commissioning.heard_stream import HeardStream
+from worldstate.operations.commissioning.stream_exam import (
+    ExaminedStream,
+    alarm_for,
+    approaches,
+    auroc_before,
+    examine,
+    warned_before,
+)
+from worldstate.operations.commissioning.stream_labels import stream_truth
+from worldstate.operations.recordings.hop_table import HopTable
+
+Vehicle = tuple[str, str, str, float]  # flow, kind, arm, T0
+FREE = GROUPS.index("none")
+SOON = GROUPS.index("coming_1s")
+
+
+def heard(vehicles: list[Vehicle], duration_s: float = 60.0, site: str = "SB1") -> HeardStream:
+    """Return a stream in which every vehicle is heard for eight seconds before its T0 and three after it."""
+    rows = []
+    for number, (_, _, arm, entry_s) in enumerate(vehicles):
+        for time_s in np.round(np.arange(max(entry_s - 8.0, 0.0), entry_s + 3.0, 0.1), 1):
+            side = 1.0 if arm == "left" else -1.0
+            seen = bool(entry_s < time_s < entry_s + 1.5)
+            rows.append((number, time_s, 6.0, side * (entry_s - time_s), seen, 60.0))
+    flow, kind, arm, entry_s = zip(*vehicles, strict=True) if vehicles else ((), (), (), ())
+    told = {
+        "vehicle": np.arange(len(vehicles)),
+        "flow": np.array(flow, np.str_),
+        "kind": np.array(kind, np.str_),
+        "arm": np.array(arm, np.str_),
+        "entry_s": np.array(entry_s, np.float64),
+        "hazard": np.ones(len(vehicles), bool),
+    }
+    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
+    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * len(names)
+    hops = HopTable({"time_s": np.round(np.arange(1.0, duration_s, 0.1), 1)}, about={"site": site})
+    return HeardStream(hops, HopTable(told), HopTable(dict(zip(names, columns, strict=True))))
+
+
+def examined(stream: HeardStream, spans: list[tuple[float, float, int]]) -> ExaminedStream:
+    """Return a stream with a posterior that is sure of a side in some spans of time and of nobody else."""
+    time_s = stream.hops.time_s
+    groups = np.full((len(time_s), 2, len(GROUPS)), 1e-4)
+    groups[..., FREE] = 1.0
+    for begin, end, side in spans:
+        inside = (time_s >= begin - 1e-6) & (time_s <= end + 1e-6)
+        groups[inside, side, FREE], groups[inside, side, SOON] = 1e-4, 1.0
+    groups /= groups.sum(axis=-1, keepdims=True)
+    posterior = SequencePosterior(groups, margin_s=0.0)
+    return ExaminedStream(stream, stream_truth(stream), posterior, SequenceAlarm(-0.1, 20.0))
+
+
+VEHICLES: list[Vehicle] = [
+    ("left", "light", "left", 10.0),
+    ("right", "heavy", "right", 22.0),
+    *(("both", "light", "left", 34.0), ("both", "light", "right", 34.8)),
+    *(("queue", "light", "right", 46.0), ("follows", "light", "right", 48.5)),
+]
+
+
+def test_approaches_are_put_together_by_who_came_with_whom() -> None:
+    found = approaches(heard([*VEHICLES, ("left", "bicycle", "left", 55.0)]))
+    assert [(one.flow, one.entries_s, one.sides, one.quiet) for one in found] == [
+        ("single", (10.0,), (0,), False),
+        ("single", (22.0,), (1,), False),
+        ("both", (34.0, 34.8), (0, 1), False),
+        ("queue", (46.0, 48.5), (1, 1), False),
+        ("single", (55.0,), (0,), True),
+    ]
+
+
+def test_figures_are_those_counted_by_hand() -> None:
+    spans = [
+        (8.2, 9.5, 0),  # the first: detected, some two seconds before
+        (19.0, 21.0, 0),  # the second: on the wrong side alone
+        *((33.0, 33.8, 0), (34.0, 34.6, 1)),  # both sides
+        (51.0, 52.0, 0),  # nobody: the queue is missed, and warned of when it is over
+    ]
+    figures = examine(
+        [examined(heard(VEHICLES), spans), examined(heard([]), [(20.0, 20.5, 1), (40.0, 41.0, 0)])]
+    )
+    assert (figures["approaches"], figures["detected"]) == (4, 0.75)
+    assert (figures["detected_single"], figures["detected_both"], figures["detected_queue"]) == (
+        1.0,
+        1.0,
+        0.0,
+    )
+    assert (figures["other_side_too"], figures["wrong_side_only"], figures["both_sides_found"]) == (
+        0.5,
+        0.5,
+        1.0,
+    )
+    assert figures["onsets_after"] == 0.25
+    hours = 590 * 0.1 / 3600.0
+    assert figures["onsets_per_hour"] == pytest.approx(2.0 / hours)
+    # The .3 s mean of log-odds passes the threshold two hops in.
+    assert figures["lead_s"] == pytest.approx(np.mean([1.7, 2.9, 0.9]), abs=0.11)
+    assert figures["lead_missed_as_0_s"] == pytest.approx(0.75 * float(figures["lead_s"] or 0.0))
+
+
+def test_curves_say_who_is_warned_by_then() -> None:
+    streams = [examined(heard(VEHICLES[:2]), [(7.0, 9.9, 0), (21.0, 21.9, 1)]), examined(heard([]), [])]
+    before_s = np.array([0.0, 0.5, 2.0, 4.0])
+    np.testing.assert_array_equal(warned_before(streams, before_s), [1.0, 1.0, 0.5, 0.0])
+    np.testing.assert_allclose(auroc_before(streams, before_s), [1.0, 1.0, 0.75, 0.5], atol=0.01)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(5.0, 200.0))
+def test_an_alarm_keeps_the_onsets_it_was_set_for_on_the_streams_it_was_set_on(
+    seed: int, rate: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    quiet = [SequencePosterior(rng.dirichlet(np.full(len(GROUPS), 0.2), (600, 2)), 0.0) for _ in range(3)]
+    alarm = alarm_for(quiet, rate)
+    onsets = 0
+    for one in quiet:
+        raised = alarm.raised(one).any(axis=1)
+        onsets += int((raised & ~np.concatenate([[False], raised[:-1]])).sum())
+    assert onsets <= rate * 1800 * 0.1 / 3600.0
