@@ -4,12 +4,14 @@ import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from worldstate.abduction.bearing_vote import with_bearing_vote
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.direct_sound import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import MEASURES
@@ -205,8 +207,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     def interpret(self, frame: AcousticFrame) -> Measurement:
         """Turn what was heard at one hop into a measurement, the camera's answer included.
 
-        A coarse bearing says which half of the street the peak is in, not where the vehicle is: then the side
-        comes from the signature, never from the sign of the bearing.
+        The bearing of direct sound votes for its side; that of reflected sound, or a coarse one, says which
+        half of the street the peak is in, not where the vehicle is: then the side is the signature's.
         """
         self.last_frame = frame
         signature = self._model.evidence(frame.feature)
@@ -214,6 +216,9 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         approach = (
             looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
         )
+        if isinstance(bearing, Bearing):
+            direct = direct_probability(frame.peaks)
+            signature = with_bearing_vote(signature, bearing.azimuth_rad, bearing.std_rad, direct)
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         domain = self._judged(frame)

@@ -121,10 +121,28 @@ def test_a_sound_beside_the_view_is_not_asked_about() -> None:
 def test_a_coarse_bearing_takes_its_side_from_the_signature() -> None:
     vision = VisionQuery(PinholeCamera(), camera_log(0.4))
     coarse = AcousticSettings(coarse_std_rad=0.0)
-    sound = plane_wave(-0.3, 1.0)
+    # Two waves as strong: reflected sound, whose bearing does not vote.
+    sound = plane_wave(-0.3, 1.0) + plane_wave(-1.1, 1.0, seed=4)
     for model, answer in ((Level(left=1.0), Present), (Level(right=1.0), Absent), (Level(), Present)):
         (measured,) = AcousticAdapter(ARRAY, RATE_HZ, model, vision, settings=coarse).measure(sound)
         assert isinstance(measured.co_evidence, answer)
+
+
+@pytest.mark.parametrize("azimuth_rad", [-1.0, -0.5, 0.5, 1.0])
+def test_direct_sound_has_the_side_of_its_bearing(azimuth_rad: float) -> None:
+    """Trained on images in the far wall, the model names the other side of a source in the open."""
+    wrong = Level(right=5.0, left=-2.0) if azimuth_rad > 0 else Level(left=5.0, right=-2.0)
+    for measured in AcousticAdapter(ARRAY, RATE_HZ, wrong).measure(plane_wave(azimuth_rad, 1.3)):
+        left, right = measured.signature.hidden
+        assert (left - right) * azimuth_rad > 0.0
+        # Direct sound is no evidence of something hidden.
+        assert max(left, right) < 1.0
+
+
+def test_reflected_sound_has_the_side_of_the_signature() -> None:
+    sound = plane_wave(0.5, 1.3) + plane_wave(-0.7, 1.3, seed=4)
+    for measured in AcousticAdapter(ARRAY, RATE_HZ, Level(right=5.0, left=-2.0)).measure(sound):
+        assert measured.signature.hidden == (-2.0, 5.0)
 
 
 def test_without_prominence_there_is_no_bearing() -> None:

@@ -1,0 +1,51 @@
+"""A bearing votes for a side in proportion to how surely its sound is direct, and hides nothing else."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+
+from worldstate.abduction.bearing_vote import with_bearing_vote
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.frontend.direction.direct_sound import direct_probability
+from worldstate.frontend.direction.peaks import Peak
+
+likelihoods = st.floats(-8.0, 8.0)
+bearings = st.tuples(st.floats(-1.5, 1.5), st.floats(0.03, 0.9))
+chances = st.floats(0.0, 1.0)
+
+
+def of(values: tuple[float, ...]) -> SignatureEvidence:
+    return SignatureEvidence(("left", "right"), values[:2], values[2], values[3])
+
+
+@given(st.tuples(*[likelihoods] * 4), bearings, chances)
+def test_it_raises_nothing_and_mirrors(
+    values: tuple[float, ...], bearing: tuple[float, float], d: float
+) -> None:
+    before, voted = of(values), with_bearing_vote(of(values), *bearing, d)
+    assert (voted.visible, voted.none) == (before.visible, before.none)
+    assert logsumexp(voted.hidden) <= logsumexp(before.hidden) + 1e-9
+    mirrored = with_bearing_vote(of((values[1], values[0], *values[2:])), -bearing[0], bearing[1], d)
+    np.testing.assert_allclose(mirrored.hidden, voted.hidden[::-1], atol=1e-6)
+
+
+@given(st.tuples(*[likelihoods] * 4), st.floats(0.2, 1.5))
+def test_sure_direct_sound_is_the_bearings(values: tuple[float, ...], azimuth: float) -> None:
+    voted = with_bearing_vote(of(values), azimuth, 0.1, 1.0)
+    assert voted.hidden[0] - voted.hidden[1] > 3.0
+    assert logsumexp(voted.hidden) <= logsumexp([voted.visible, voted.none]) + 1e-9
+
+
+@given(st.tuples(*[likelihoods] * 4), bearings)
+def test_reflected_sound_changes_nothing(values: tuple[float, ...], bearing: tuple[float, float]) -> None:
+    assert with_bearing_vote(of(values), *bearing, 0.0) == of(values)
+
+
+@pytest.mark.parametrize("value", [0.05, 0.3, 0.6, 0.95])
+def test_direct_is_a_lone_peak_that_takes_most_of_the_sound(value: float) -> None:
+    lone, image = Peak(0.5, value, 8.0), Peak(-0.7, 0.8 * value, 6.4)
+    assert (direct_probability([lone]) > 0.5) == (value > 0.45)
+    assert direct_probability([lone, image]) == 0.0
+    assert direct_probability([]) == 0.0
