@@ -10,10 +10,10 @@ is that of the bearing :math:`\theta \pm \sigma`:
 with the mean of the likelihoods of visible and none.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import logsumexp, ndtr
 
 from .evidence import SignatureEvidence
 
@@ -36,12 +36,12 @@ def with_bearing_vote(
     if direct < _LEAST or set(evidence.directions) != {"left", "right"}:
         return evidence
     hidden = np.array(evidence.hidden)
-    total = float(logsumexp(hidden))
-    neutral = float(logsumexp([evidence.visible, evidence.none]))
+    total = float(np.logaddexp(*hidden))
+    neutral = float(np.logaddexp(evidence.visible, evidence.none))
     # Log of the sum over two sides, and of the two others: the means differ by the same log 2.
     kept = np.log1p(-direct) if direct < 1.0 else -np.inf
     level = min(total, float(np.logaddexp(kept + total, np.log(direct) + neutral)))
-    left = 0.5 * _IMAGE + (1.0 - _IMAGE) * float(ndtr(azimuth_rad / std_rad))
+    left = 0.5 * _IMAGE + (1.0 - _IMAGE) * 0.5 * math.erfc(-azimuth_rad / (math.sqrt(2.0) * std_rad))
     by_bearing = np.array([left if side == "left" else 1.0 - left for side in evidence.directions])
     shares = (1.0 - direct) * np.exp(hidden - total) + direct * by_bearing
     return replace(evidence, hidden=tuple((level + np.log(shares)).tolist()))
