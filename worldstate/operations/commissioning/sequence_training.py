@@ -74,7 +74,7 @@ def exported(machine: object, check: FloatArray) -> BoostedTrees:
         inner = ~nodes["is_leaf"].astype(bool)
         at = np.flatnonzero(inner)
         # A threshold may be a value of the training set itself, which must stay on its side of it.
-        split[row, at], threshold[row, at] = nodes["feature_idx"][at], _rounded_up(nodes["num_threshold"][at])
+        split[row, at], threshold[row, at] = nodes["feature_idx"][at], rounded_up(nodes["num_threshold"][at])
         yes[row, at], no[row, at] = nodes["left"][at], nodes["right"][at]
         value[row, : len(nodes)] = _rounded(np.where(inner, 0.0, nodes["value"]))
     # Groups that no hop belonged to keep no chance.
@@ -86,10 +86,10 @@ def exported(machine: object, check: FloatArray) -> BoostedTrees:
     return trees
 
 
-def _rounded_up(values: FloatArray) -> FloatArray:
+def rounded_up(values: FloatArray) -> FloatArray:
     """Return values of seven figures, none below its own."""
     near = _rounded(values)
-    return np.where(near < values, _rounded(near + 5e-7 * np.abs(near)), near)
+    return np.where(near < values, _rounded(near + 1e-6 * np.abs(near)), near)
 
 
 def _rounded(values: FloatArray) -> FloatArray:
