@@ -312,7 +312,8 @@ def open_source(
         What `worldstate measure-absence` wrote. Where it holds the camera's scale of health and the recording
         folder has a video, the degradation is read from that.
     model : path or Model, optional
-        Model; the one that ships where not given.
+        Model; where not given, of the two that ship that for a standing or for a moving ego, as the data set
+        or the context says.
     context : Context, optional
         Rates, occluders and ego motion; defaults where not given.
     resume : path or Checkpoint, optional
@@ -356,8 +357,7 @@ def open_source(
     settings, context = settings or ListenSettings(), context or Context()
     if engine is not None and not settings.ego_noise:
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
-    chosen = model if isinstance(model, Model) else read_model(model)
-    source, recording = _heard(as_sound(path), array, chosen, context, settings)
+    source, recording = _heard(as_sound(path), array, model, context, settings)
     source = _with_camera(source, recording, detections, detector, camera, miss_rates)
     before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
     return replace(
@@ -372,15 +372,16 @@ def open_source(
 def _heard(
     sound: SoundInput,
     array: Path | str | MicrophoneArray | None,
-    model: Model,
+    given: Path | str | Model | None,
     context: Context,
     settings: ListenSettings,
 ) -> tuple[Source, Recording | None]:
     """Return what is heard and by which array and model, and the recording folder if it is one."""
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
+    moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
+    model = given if isinstance(given, Model) else read_model(given, moving_ego=moves)
     policy = _policy(model, settings.alpha)
     heard_by = _array(sound, array, model, settings)
-    moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
     stated = not settings.uncalibrated and states_budget(model.domain, heard_by, moves)
     source = Source(
         sound=recording.audio_path if recording else sound,

@@ -65,10 +65,13 @@ def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatAr
     """
     summaries = dict(zip(KINDS, np.split(reference, len(KINDS), axis=1), strict=True))
     views = {kind: levels - summary for kind, summary in summaries.items() if kind in wanted}
-    if SHAPE in wanted or SHAPE_CHANGE in wanted:
-        views[SHAPE] = shape_features(levels, SEGMENTS)
     if SHAPE_CHANGE in wanted:
-        views[SHAPE_CHANGE] = views[SHAPE] - shape_features(summaries["median"], SEGMENTS)
+        # One call for both: of a single window most of it is what calls cost.
+        shapes = shape_features(np.concatenate([levels, summaries["median"]]), SEGMENTS)
+        views[SHAPE], of_site = shapes[: len(levels)], shapes[len(levels) :]
+        views[SHAPE_CHANGE] = views[SHAPE] - of_site
+    elif SHAPE in wanted:
+        views[SHAPE] = shape_features(levels, SEGMENTS)
     return views
 
 

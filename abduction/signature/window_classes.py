@@ -9,6 +9,8 @@ open. The first belongs to either side by a half, the second is as likely under 
 so that a direct sound moves no explanation against another: which side it is on, its bearing says.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
@@ -29,6 +31,7 @@ from .published_signature import (
 BOTH, DIRECT = "both", "direct"
 WINDOW_CLASSES = (*CLASSES, BOTH, DIRECT)
 _MIRRORED = {LEFT: RIGHT, RIGHT: LEFT}
+_IS_SIDE = np.isin(range(len(CLASSES)), (LEFT, RIGHT)).astype(float)
 
 
 def checked_classes(classes: tuple[str, ...]) -> tuple[str, ...]:
@@ -58,11 +61,7 @@ def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -
     array([[0.  , 0.75, 0.  , 0.25],
            [0.2 , 0.3 , 0.2 , 0.3 ]])
     """
-    four = _sides_filled(shares, classes)
-    if DIRECT not in classes:
-        return four
-    known = _sides_filled(prior[None], classes)
-    return np.asarray(four + _column(shares, classes, DIRECT) * (known / known.sum()))
+    return _Parts.of(shares, classes).explained(_Parts.of(prior[None], classes))
 
 
 def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
@@ -81,14 +80,7 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
     >>> side_ratios(window, WINDOW_CLASSES, np.full(6, 1 / 6)).round(2)
     array([[1.45, 1.45]])
     """
-    direct = _column(posteriors, classes, DIRECT)
-    known = 1.0 - _column(prior[None], classes, DIRECT)
-    sides = posteriors[:, [LEFT, RIGHT]] + _column(posteriors, classes, BOTH)
-    expected = prior[[LEFT, RIGHT]] + _column(prior[None], classes, BOTH)
-    # Two sums of products in place of an exponential of logarithms: this runs at every hop.
-    present = sides / expected * known + direct
-    rest = posteriors[:, [FRONT, NONE]] / prior[[FRONT, NONE]] * known + direct
-    return np.asarray(np.log(present) - np.log(rest.sum(axis=1, keepdims=True)))
+    return _Parts.of(posteriors, classes).side_ratios(_Parts.of(prior[None], classes))
 
 
 def visible_ratios(posteriors: FloatArray, prior: FloatArray) -> FloatArray:
@@ -119,22 +111,42 @@ def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: Flo
     >>> sides.both, sides.direct, sides.log_ratios[0] > sides.log_ratios[1]
     (0.1, 0.1, True)
     """
-    known = explained(prior[None], classes, prior)[0]
-    ratios = explanation_ratios(explained(posteriors, classes, prior), known)[0]
-    left, right = side_ratios(posteriors, classes, prior)[0].tolist()
-    both, direct = (_column(posteriors, classes, name)[0, 0].item() for name in (BOTH, DIRECT))
+    seen, known = _Parts.of(posteriors, classes), _Parts.of(prior[None], classes)
+    ratios = explanation_ratios(seen.explained(known), known.explained(known)[0])[0]
+    left, right = seen.side_ratios(known)[0].tolist()
     visible = visible_ratios(posteriors, prior).item()
+    both, direct = seen.both.item(), seen.direct.item()
     return evidence_of(ratios, SideEvidence(DIRECTIONS, (left, right), both, direct, visible))
 
 
-def _sides_filled(shares: FloatArray, classes: tuple[str, ...]) -> FloatArray:
-    four = shares[:, : len(CLASSES)].copy()
-    four[:, [LEFT, RIGHT]] += 0.5 * _column(shares, classes, BOTH)
-    return four
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """Posteriors or priors by class; zero where a model does not know one."""
 
+    four: FloatArray  # shape (n, 4): Of front, left, none, right
+    both: FloatArray  # shape (n, 1)
+    direct: FloatArray
 
-def _column(shares: FloatArray, classes: tuple[str, ...], name: str) -> FloatArray:
-    """Return one class's share, shape (n, 1); zero where the model does not know it."""
-    if name not in classes:
-        return np.zeros((len(shares), 1))
-    return shares[:, [classes.index(name)]]
+    @classmethod
+    def of(cls, shares: FloatArray, classes: tuple[str, ...]) -> "_Parts":
+        n_four, zero = len(CLASSES), np.zeros((len(shares), 1))
+        both, direct = (
+            shares[:, n_four + i : n_four + i + 1] if name in classes else zero
+            for i, name in ((0, BOTH), (int(BOTH in classes), DIRECT))
+        )
+        return cls(shares[:, :n_four], both, direct)
+
+    @property
+    def filled(self) -> FloatArray:
+        """The four, each side with half of what both have."""
+        return np.asarray(self.four + 0.5 * self.both * _IS_SIDE)
+
+    def explained(self, prior: "_Parts") -> FloatArray:
+        known = prior.filled
+        return np.asarray(self.filled + self.direct * (known / known.sum()))
+
+    def side_ratios(self, prior: "_Parts") -> FloatArray:
+        known = 1.0 - prior.direct
+        sides = (self.four[:, [LEFT, RIGHT]] + self.both) / (prior.four[:, [LEFT, RIGHT]] + prior.both)
+        rest = self.four[:, [FRONT, NONE]] / prior.four[:, [FRONT, NONE]] * known + self.direct
+        return np.asarray(np.log(sides * known + self.direct) - np.log(rest[:, :1] + rest[:, 1:]))

@@ -83,8 +83,9 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
         _LOG.warning("the model names no array that it was made for: no budget is stated")
         return False
     check_array(domain, array, WAY_OUT)
-    if moving_ego and domain.ego_motion == "standing":
-        _LOG.warning("the model was made for a standing ego, this one moves: no budget is stated")
+    if domain.ego_motion == ("standing" if moving_ego else "moving"):
+        does, made_for = "moves" if moving_ego else "stands", domain.ego_motion
+        _LOG.warning("the model was made for a %s ego, this one %s: no budget is stated", made_for, does)
         return False
     return True
 

@@ -124,13 +124,15 @@ def load_model(path: str | Path | None = None) -> tuple[AnySignature, CueingPoli
     return model.signature, model.policies
 
 
-def read_model(path: str | Path | None = None) -> Model:
+def read_model(path: str | Path | None = None, *, moving_ego: bool = False) -> Model:
     """Read a model; without a path, the one that ships with the package.
 
     Parameters
     ----------
     path : str or Path, optional
         JSON file.
+    moving_ego : bool
+        Of the two that ship, the one that was made for an ego that drives; for one that stands otherwise.
 
     Returns
     -------
@@ -147,12 +149,13 @@ def read_model(path: str | Path | None = None) -> Model:
 
     Examples
     --------
-    >>> read_model().signature.classes
-    ('front', 'left', 'none', 'right')
+    >>> [read_model(moving_ego=moving).domain.ego_motion for moving in (False, True)]
+    ['standing', 'moving']
     """
     if path is not None:
         return model_from_dict(read_json(path, "a model file"), path)
-    with as_file(files("worldstate") / "data" / "default_model.json") as default:
+    name = "moving_model.json" if moving_ego else "default_model.json"
+    with as_file(files("worldstate") / "data" / name) as default:
         return model_from_dict(read_json(default, "a model file"), default.name)
 
 

@@ -22,6 +22,7 @@ from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError
+from worldstate.ground.serialisation import encode
 from worldstate.measurement.measurement import Bearing
 from worldstate.state.context import Context
 
@@ -145,13 +146,22 @@ def test_uncalibrated_listening_states_no_budget(alone: Path) -> None:
     assert not json.loads(next(listen(alone, settings=chosen)).to_json())["calibrated"]
 
 
-def test_a_moving_ego_is_flagged_where_the_model_stood(alone: Path, tmp_path: Path) -> None:
+def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Path, tmp_path: Path) -> None:
     folder = tmp_path / "DA1" / "left" / "1_05_0000"
     folder.mkdir(parents=True)
     (folder / "out_multi.wav").symlink_to(alone)
-    assert open_source(folder).policy.alpha == 0.0
-    assert open_source(alone, context=Context(ego_speed_mps=8.0)).policy.alpha == 0.0
-    assert open_source(alone, context=Context(ego_speed_mps=0.0)).policy.alpha == 0.02
+    standing, moving = read_model(), read_model(moving_ego=True)
+    drives, stands = Context(ego_speed_mps=8.0), Context(ego_speed_mps=0.0)
+    for source, model in (
+        (open_source(folder), moving),
+        (open_source(alone, context=drives), moving),
+        (open_source(alone, context=stands), standing),
+        (open_source(alone), standing),
+    ):
+        assert encode(source.model) == encode(model.signature) and source.policy.alpha == 0.02
+    # One that is given stays, and states no budget where the ego does otherwise than it was made for.
+    assert open_source(folder, model=standing).policy.alpha == 0.0
+    assert open_source(alone, context=stands, model=moving).policy.alpha == 0.0
 
 
 def test_another_rate_or_feature_is_refused() -> None:

@@ -6,7 +6,10 @@ import pytest
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.site_reference import SMALLEST_LEVEL
 from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
+from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.model_file import read_model
+from worldstate.cli.main import execute
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.open_field import (
@@ -89,6 +92,27 @@ def test_along_a_stream_posteriors_are_those_of_the_running_model():
     ratio = np.log(found[:, 1] / found[:, 3])
     prior = np.log(model.class_prior[1] / model.class_prior[3])
     np.testing.assert_allclose(ratio - prior, [left - right for left, right in by_hop], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_command_learns_streams_and_the_card_counts_their_classes(tmp_path):
+    rng = np.random.default_rng(5)
+    both = stream(("light", "left", 30.0), ("light", "right", 30.5), ("light", "left", 50.0), rng=rng)
+    both.save(tmp_path / "heard.npz")
+    n, names = 240, np.tile(["front", "left", "none", "right"], 60)
+    keys, sites = np.arange(n).astype(str), np.tile(["SA1", "SB1"], n // 2)
+    write_features(
+        tmp_path / "real.csv",
+        FeatureTable(rng.uniform(0.05, 0.9, (n, 60)), names, keys, sites, keys, (None,) * n),
+    )
+    words = ["train", tmp_path / "real.csv", "--streams", tmp_path / "heard.npz", "--out", tmp_path / "m"]
+    assert execute([*map(str, words), "--method", "worldstate"]) == 0
+    model = read_model(tmp_path / "m")
+    assert model.signature.classes == WINDOW_CLASSES
+    assert "180 direct" in model.provenance.classifier and " both" in model.provenance.classifier
+    # Policies are of the explanations: hidden on either side, in view, none.
+    assert len(model.policies.policies[0].reference_prior) == 4
+    assert sum(model.policies.policies[0].reference_prior) == pytest.approx(1.0)
 
 
 RING = MicrophoneArray(

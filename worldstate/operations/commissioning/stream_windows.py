@@ -35,7 +35,7 @@ class CuttingSettings:
     """Which hops become windows."""
 
     every_s: float = 0.5  # Apart at least, while somebody is hidden; windows overlap
-    rest_every_s: float = 4.0  # Apart at least otherwise: most of a stream is empty
+    rest_every_s: float = 10.0  # Apart at least otherwise: most of a stream is empty
     # Of a hidden window, beside a real one of weight 1; all in view, and all empty, weigh as all hidden.
     weight: float = 0.3
 

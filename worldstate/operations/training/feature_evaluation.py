@@ -24,6 +24,8 @@ from .window_calibration import MISS_RATES, FitMap, WindowCalibration, between, 
 MakeClassifier = Callable[[np.random.Generator], Classifier]
 # Posteriors of the chosen rows of the table that is evaluated, shape (rows, 4).
 Ask = Callable[[Classifier, BoolArray], FloatArray]
+# From a table and a generator to how its rows are asked for.
+Asking = Callable[[FeatureTable, np.random.Generator], Ask]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +56,11 @@ class Predictions:
         return most_probable
 
 
+def asked_plainly(table: FeatureTable, rng: np.random.Generator) -> Ask:
+    """Ask for rows as the table holds them; nothing is drawn."""
+    return lambda classifier, rows: classifier.predict_proba(table.features[rows])
+
+
 def cross_validate(
     table: FeatureTable,
     split: Split,
@@ -64,6 +71,7 @@ def cross_validate(
     inner_splits: Sequence[Split] = (),
     fit_map: FitMap = fit_isotonic,
     ask: Ask | None = None,
+    inner_asking: Asking = asked_plainly,
     on_fold: Callable[[], None] = lambda: None,
 ) -> dict[float, Predictions]:
     """Predict every window once, by classifier, threshold and map that never saw its fold.
@@ -86,8 +94,10 @@ def cross_validate(
     fit_map : callable
         Fits the risk map.
     ask : callable, optional
-        Asks the classifier about held-out rows, where those are asked otherwise than the inner folds: with
-        another reference.
+        Asks the classifier about held-out rows, where they are asked otherwise than the table holds them:
+        with another reference.
+    inner_asking : callable, optional
+        The same for the rows of inner folds.
     on_fold : callable
         Called after each outer fold, for progress.
 
@@ -111,13 +121,15 @@ def cross_validate(
     >>> bool(alarms[table.hazards].mean() > alarms[table.hazard_free].mean())
     True
     """
-    folds, ask = split(table, rng), ask or _plainly(table)
+    folds, ask = split(table, rng), ask or asked_plainly(table, rng)
     predictions = {beta: Predictions.blank(folds) for beta in MISS_RATES}
     for fold in np.unique(folds):
         held_out = folds == fold
         train = table.select(~held_out)
         probabilities = ask(_trained(make, train, rng), held_out)
-        inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits or (split,)]
+        inner = [
+            out_of_fold(train, one(train, rng), make, rng, inner_asking) for one in inner_splits or (split,)
+        ]
         for beta, prediction in predictions.items():
             prediction.fill(held_out, probabilities, _calibration(train, inner, alpha, beta, fit_map))
         on_fold()
@@ -142,7 +154,7 @@ def transfer(
         raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")
     inner = [out_of_fold(train, one(train, rng), make, rng) for one in inner_splits]
     everything = np.ones(len(test), dtype=np.bool_)
-    probabilities = (ask or _plainly(test))(_trained(make, train, rng), everything)
+    probabilities = (ask or asked_plainly(test, rng))(_trained(make, train, rng), everything)
     predictions = {}
     for beta in MISS_RATES:
         calibration = _calibration(train, inner, alpha, beta, fit_map)
@@ -155,14 +167,19 @@ def transfer(
 
 
 def out_of_fold(
-    table: FeatureTable, folds: TextArray, make: MakeClassifier, rng: np.random.Generator
+    table: FeatureTable,
+    folds: TextArray,
+    make: MakeClassifier,
+    rng: np.random.Generator,
+    asking: Asking = asked_plainly,
 ) -> FloatArray:
     """Return posteriors of each window from a classifier trained on the other folds, shape (n, 4)."""
     probabilities = np.empty((len(table), len(CLASSES)))
+    # A generator of its own: what is drawn to ask moves no fold.
+    ask = asking(table, rng.spawn(1)[0])
     for fold in np.unique(folds):
         held_out = folds == fold
-        classifier = _trained(make, table.select(~held_out), rng)
-        probabilities[held_out] = classifier.predict_proba(table.features[held_out])
+        probabilities[held_out] = ask(_trained(make, table.select(~held_out), rng), held_out)
     return probabilities
 
 
@@ -173,10 +190,6 @@ def predict_with(
     predictions = Predictions.blank(np.full(len(table), fold))
     predictions.fill(np.ones(len(table), dtype=np.bool_), probabilities, calibration)
     return predictions
-
-
-def _plainly(table: FeatureTable) -> Ask:
-    return lambda classifier, rows: classifier.predict_proba(table.features[rows])
 
 
 def _trained(make: MakeClassifier, table: FeatureTable, rng: np.random.Generator) -> Classifier:

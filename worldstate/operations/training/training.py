@@ -19,8 +19,8 @@ from worldstate.adapters.files.model_file import Model, Provenance
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 
-from .feature_evaluation import MakeClassifier, out_of_fold
-from .methods import method_of
+from .feature_evaluation import out_of_fold
+from .methods import WindowMethod, method_of
 from .splits import N_FOLDS, folds_by_recording, junction_folds
 from .window_calibration import (
     ABSENT_MISS_RATE,
@@ -122,8 +122,9 @@ def train_model(
     (('front', 'left', 'none', 'right'), 'made up')
     """
     rng = np.random.default_rng(settings.seed)
-    inputs, make = method_of(settings.method).prepare(table), method_of(settings.method, simulated).make
-    levels = _out_of_fold_levels(table, inputs, make, settings, rng, on_step)
+    method = method_of(settings.method, simulated)
+    inputs = method.prepare(table)
+    levels = _out_of_fold_levels(inputs, method, settings, rng, on_step)
     signature = replace(fit_signature(inputs, settings.method, rng, simulated), domain=_domain(table))
     on_step()
     provenance = Provenance(
@@ -150,21 +151,20 @@ def _classifier(method: TrainingMethod, simulated: SimulatedWindows | None) -> s
 
 
 def _out_of_fold_levels(
-    table: FeatureTable,
     inputs: FeatureTable,
-    make: MakeClassifier,
+    method: WindowMethod,
     settings: TrainingSettings,
     rng: np.random.Generator,
     on_step: Callable[[], None],
 ) -> list[list[FloatArray]]:
     """Posteriors of windows not trained on, from the most careful folds to the boldest: see `between`."""
-    passes = []
+    passes, make, asking = [], method.make, method.inner_asking
     for _ in range(settings.repeats):
-        passes.append(out_of_fold(inputs, folds_by_recording(table, rng), make, rng))
+        passes.append(out_of_fold(inputs, folds_by_recording(inputs, rng), make, rng, asking))
         on_step()
-    if settings.method != "worldstate" or len(np.unique(table.environments)) < 2:
+    if settings.method != "worldstate" or len(np.unique(inputs.environments)) < 2:
         return [passes]
-    return [[out_of_fold(inputs, junction_folds(table), make, rng)], passes]
+    return [[out_of_fold(inputs, junction_folds(inputs), make, rng, asking)], passes]
 
 
 def _domain(table: FeatureTable) -> ModelDomain | None:
