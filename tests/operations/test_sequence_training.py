@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
@@ -12,7 +10,6 @@ from worldstate.operations.commissioning.sequence_training import (
     LabelledStream,
     calibrated_margin_s,
     exported,
-    rounded_up,
     train_sequence,
 )
 from worldstate.operations.commissioning.stream_labels import StreamTruth
@@ -30,12 +27,6 @@ def test_exported_trees_say_what_the_classifier_says(seed: int) -> None:
     said = exponent / exponent.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(said[:, [0, 3, 14]], machine.predict_proba(fresh), atol=1e-6)
     assert said[:, 1].max() < 1e-9
-
-
-@given(st.floats(-1e4, 1e4).filter(lambda value: abs(value) > 1e-6))
-def test_a_rounded_threshold_stays_on_its_side_of_the_value_it_was_taken_from(value: float) -> None:
-    (up,) = rounded_up(np.array([value]))
-    assert value <= up <= value + 2e-6 * abs(value)
 
 
 def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:

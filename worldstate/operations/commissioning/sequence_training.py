@@ -1,7 +1,7 @@
 """Training of a sequence model on streams: boosted trees from scikit-learn, kept as arrays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,28 +73,21 @@ def exported(machine: object, check: FloatArray) -> BoostedTrees:
     for row, (_, nodes) in enumerate(found):
         inner = ~nodes["is_leaf"].astype(bool)
         at = np.flatnonzero(inner)
-        # A threshold may be a value of the training set itself, which must stay on its side of it.
-        split[row, at], threshold[row, at] = nodes["feature_idx"][at], rounded_up(nodes["num_threshold"][at])
+        split[row, at], threshold[row, at] = nodes["feature_idx"][at], nodes["num_threshold"][at]
         yes[row, at], no[row, at] = nodes["left"][at], nodes["right"][at]
-        value[row, : len(nodes)] = _rounded(np.where(inner, 0.0, nodes["value"]))
+        value[row, : len(nodes)] = np.where(inner, 0.0, nodes["value"])
     # Groups that no hop belonged to keep no chance.
     baseline = np.full(len(GROUPS), -30.0)
     baseline[classes] = np.ravel(machine._baseline_prediction)  # type: ignore[attr-defined]
     trees = BoostedTrees(split, threshold, yes, no, value, classes[[k for k, _ in found]], baseline)
-    if not np.allclose(trees.scores(check)[:, classes], machine.decision_function(check), atol=1e-4):  # type: ignore[attr-defined]
+    if not np.allclose(trees.scores(check)[:, classes], machine.decision_function(check), atol=1e-6):  # type: ignore[attr-defined]
         raise WorldstateError("scikit-learn keeps its trees in another way than 1.5 to 1.9 did: not exported")
-    return trees
-
-
-def rounded_up(values: FloatArray) -> FloatArray:
-    """Return values of seven figures, none below its own."""
-    near = _rounded(values)
-    return np.where(near < values, _rounded(near + 1e-6 * np.abs(near)), near)
+    return replace(trees, threshold=_rounded(trees.threshold), value=_rounded(trees.value))
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    """Return values of seven figures: files half as long, and posteriors the same to 1e-6."""
-    return np.array([float(f"{value:.7g}") for value in values.tolist()])
+    """Return values of seven figures: files are half as long, no input is known better."""
+    return np.array([float(f"{value:.7g}") for value in values.ravel().tolist()]).reshape(values.shape)
 
 
 def calibrated_margin_s(model: SequenceModel, streams: Sequence[LabelledStream]) -> float:
