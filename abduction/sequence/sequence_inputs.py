@@ -69,6 +69,8 @@ class HopEvidence:
 INPUTS = (
     *("this", "this_above", "this_1s", "this_2s", "this_before", "this_highest"),
     *("other", "other_above", "other_1s", "other_2s", "other_highest"),
+    # One hop hardly tells the sides apart; what it leans to over seconds does.
+    *("this_mean", "other_mean", "lean", "lean_1s", "lean_3s"),
     *("visible", "visible_above", "visible_1s", "visible_2s", "visible_highest"),
     *("level", "level_1s", "level_2s"),
     *("loudness", "loudness_1s", "loudness_2s"),
@@ -94,6 +96,7 @@ _EVERY = (
     *(f"{name}_highest" for name in COLUMNS[:_HIGHEST]),
     *("prominence", "prominence_1s", "approach", "approach_std"),
     *("bearing", "bearing_1s", "bearing_spread"),
+    *("left_mean", "right_mean", "lean", "lean_1s", "lean_3s"),
 )
 
 
@@ -104,7 +107,7 @@ def _of_side(this: str, other: str) -> list[int]:
 
 _OWN = [COLUMNS.index(name) for name in USUAL]
 _ORDER = (_of_side("left", "right"), _of_side("right", "left"))
-_MIRRORED = np.where(np.isin(INPUTS, ("bearing", "bearing_1s")), -1.0, 1.0)
+_MIRRORED = np.where(np.isin(INPUTS, ("bearing", "bearing_1s", "lean", "lean_1s", "lean_3s")), -1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +120,8 @@ class _Columns:
     three: FloatArray
     highest: FloatArray  # shape (n, 3): Of both sides and the visible, over three seconds
     swing: FloatArray  # shape (n,): Of the bearing, over one
+    mean_1s: FloatArray  # shape (n, 2): Of the sides, over one second and over three
+    mean_3s: FloatArray
     usual: FloatArray  # shape (n, 5): `level` and `loudness` of the quiet street, then usual evidence
 
     def inputs(self) -> FloatArray:
@@ -128,7 +133,9 @@ class _Columns:
         changes = [(now - one)[:, :_CHANGING] for one in (second, self.two)]
         before = (second - self.three)[:, : len(SIDES)]
         above = streets_own(now) - self.usual
+        leans = [side[:, :1] - side[:, 1:2] for side in (now, self.mean_1s, self.mean_3s)]
         parts = [now[:, :_HIGHEST], above, *changes, before, self.highest, np.stack(rest, axis=1)]
+        parts += [self.mean_3s, *leans]
         every = np.concatenate(parts, axis=1)
         left, right = (every[:, order] for order in _ORDER)
         return np.stack([left, right * _MIRRORED], axis=1)
@@ -170,6 +177,8 @@ def sequence_inputs(evidence: HopEvidence) -> FloatArray:
         three=ago(columns, _THREE),
         highest=np.stack([highest(one, _THREE) for one in columns[:, :_HIGHEST].T], axis=1),
         swing=highest(azimuth, _SECOND) + highest(-azimuth, _SECOND),
+        mean_1s=mean(evidence.sides, _SECOND),
+        mean_3s=mean(evidence.sides, _THREE),
         usual=np.stack(usual, axis=1),
     ).inputs()
 
@@ -194,6 +203,8 @@ def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
         three=before(_THREE),
         highest=recent[:, :_HIGHEST].max(axis=0)[None],
         swing=(swing.max() + (-swing).max())[None],
+        mean_1s=recent[-1 - _SECOND :, : len(SIDES)].mean(axis=0)[None],
+        mean_3s=recent[:, : len(SIDES)].mean(axis=0)[None],
         usual=np.concatenate(usual)[None],
     ).inputs()
 
@@ -214,6 +225,19 @@ def ago(values: FloatArray, hops: int) -> FloatArray:
     """
     before = np.maximum(np.arange(len(values)) - hops, 0)
     return np.asarray(values[before])
+
+
+def mean(values: FloatArray, hops: int) -> FloatArray:
+    """Return the means of each row and those up to so many hops before it, of fewer where there are fewer.
+
+    Examples
+    --------
+    >>> mean(np.array([[3.0], [1.0], [2.0]]), 1).ravel()
+    array([3. , 2. , 1.5])
+    """
+    padded = np.concatenate([np.zeros((hops, values.shape[1])), values])
+    sums = np.lib.stride_tricks.sliding_window_view(padded, hops + 1, axis=0).sum(axis=-1)
+    return np.asarray(sums / np.minimum(np.arange(len(values)) + 1, hops + 1)[:, None])
 
 
 def highest(values: FloatArray, hops: int) -> FloatArray:
