@@ -44,7 +44,7 @@ _CALIBRATED_S = (1.0, 2.0, 3.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Approach:
+class StreamApproach:
     """Vehicles that belong together, the first to come into view first."""
 
     flow: str  # "single", "both" or "queue"
@@ -68,7 +68,7 @@ class ExaminedStream:
     alarm: SequenceAlarm
 
 
-def approaches(heard: HeardStream) -> list[Approach]:
+def approaches(heard: HeardStream) -> list[StreamApproach]:
     """Collect the approaches of a stream by the flows that its vehicles arrived in."""
     vehicles = heard.vehicles
     order = np.argsort(vehicles.entry_s)
@@ -83,7 +83,7 @@ def approaches(heard: HeardStream) -> list[Approach]:
         left = [i for i in left if i not in with_it]
         every = [first, *with_it]
         found.append(
-            Approach(
+            StreamApproach(
                 flow if flow in ("both", "queue") else "single",
                 tuple(vehicles.entry_s[every].tolist()),
                 tuple(SIDES.index(arm) for arm in vehicles.arm[every]),
@@ -135,7 +135,7 @@ def examine(streams: Sequence[ExaminedStream]) -> dict[str, float | int | None]:
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    approach: Approach
+    approach: StreamApproach
     lead_s: float  # 0 where missed
     own_side: bool
     other_side: bool
