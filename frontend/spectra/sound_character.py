@@ -34,6 +34,7 @@ _HEIGHTS = (4.0, 8.0)  # Nats above the floor: a line that noise hardly has, and
 _PAUSE, _LAG, _SMOOTH = 0.7, 5, 5  # Nats below the median; frames between two levels, and in a mean
 _QUANTILES = (0.05, 0.5, 0.95)
 _FORGET_LINES, _FORGET_PEAKS = 0.1, 0.05  # A hop: means over one and over two seconds
+_STILL = 1e-6  # Modulation of a level that stays, far below that of any noise
 _LEAST = 1e-14  # Power of a silent band, far below a 24-bit converter's
 
 MEASURES = (
@@ -105,7 +106,9 @@ class _Lines:
         self._left = np.maximum(np.arange(count) - half, 0)
         self._right = np.minimum(np.arange(count) + half + 1, count)
         self._taper = np.hanning(count + 2)[1:-1]
-        low, high = (round(period * 2 * count * self._step_hz) for period in _COMB_S)
+        # Twice as long as the band: what lies at its ends is no neighbour.
+        self._comb_size = next_fast_len(2 * count, real=True)
+        low, high = (round(period * self._comb_size * self._step_hz) for period in _COMB_S)
         self._combs = slice(low, high)
         self._excess, self._ratio = np.zeros(count), np.ones(count)
         self._peaks: FloatArray = np.zeros(len(self._starts))
@@ -148,7 +151,7 @@ class _Lines:
     def _combed(self, excess: FloatArray) -> float:
         """Log of the highest line of the spectrum of the spectrum, over its mean."""
         clipped = np.clip(excess, *_EXCESS) * self._taper
-        power = _power(rfft(clipped, 2 * len(clipped)))
+        power = _power(rfft(clipped, self._comb_size))
         return 0.5 * float(np.log((power[self._combs].max() + _LEAST) / (power.mean() + _LEAST)))
 
 
@@ -158,14 +161,11 @@ def _modulation(levels: FloatArray) -> FloatArray:
     .. math:: m_r = \ln \langle |E_b(f)|^2 \rangle_{b, f \in r}, \qquad
               c_r = \ln \frac{\sum_{f \in r} |\sum_b E_b(f)|^2}{\sum_{f \in r} \sum_b |E_b(f)|^2}
     """
-    spectrum = rfft((levels - levels.mean(axis=0)) * _TAPER[:, None], axis=0)
-    power = _power(spectrum)
-    high = power[:, _HIGH:].sum(axis=1)
-    low = power[:, :_HIGH].sum(axis=1) / _HIGH
-    each = np.stack([low, high / (power.shape[1] - _HIGH)])
-    together = _TOGETHER @ np.stack([_power(spectrum[:, _HIGH:].sum(axis=1)), high], axis=1)
-    shared = np.log(together[:, 0] + _LEAST) - np.log(together[:, 1] + _LEAST)
-    return np.concatenate([np.log(each @ _RATES.T + 1e-6).ravel(), shared])
+    spectrum = rfft((levels - levels.mean(axis=0)).T * _TAPER)
+    low, high = _power(spectrum[:_HIGH]).mean(axis=0), _power(spectrum[_HIGH:]).mean(axis=0)
+    all_bands = _power(spectrum[_HIGH:].sum(axis=0)) / (len(spectrum) - _HIGH)
+    shared = np.log((_TOGETHER @ all_bands + _LEAST) / (_TOGETHER @ high + _LEAST))
+    return np.concatenate([np.log(_RATES @ low + _STILL), np.log(_RATES @ high + _STILL), shared])
 
 
 def _swings(levels: FloatArray) -> FloatArray:

@@ -30,6 +30,7 @@ COMMANDS = (
     "studies.evaluate",
     "studies.evaluate_features",
     "studies.evaluate_signatures",
+    "studies.foreign_sounds",
     "users.extract_features",
     "studies.realism",
     "studies.ablations",
