@@ -15,7 +15,7 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.site_reference import KINDS
-from worldstate.abduction.signature.window_classes import BOTH, side_ratios
+from worldstate.abduction.signature.window_classes import BOTH, side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.model_file import Model
@@ -65,14 +65,12 @@ def _heard(array: MicrophoneArray, folder: Path, settings: StreamSettings) -> He
 def stream_evidence(model: EnsembleModel, heard: HeardStream) -> HopEvidence:
     """Return what a window model says along a stream, and what else the front-end heard."""
     hops, posteriors = heard.hops, posteriors_along(model, heard.hops.feature)
-    ratios = np.log(posteriors / model.class_prior)
-    front, none = (ratios[:, model.classes.index(name)] for name in ("front", "none"))
-    return HopEvidence(
-        sides=side_ratios(posteriors, model.classes, model.class_prior),
-        visible=front - none,
-        level=np.log(hops.feature).mean(axis=1, dtype=np.float64),
-        loudness=hops.band_log_energy.mean(axis=1, dtype=np.float64),
-        prominence=np.log(hops.prominence),
+    return HopEvidence.heard(
+        side_ratios(posteriors, model.classes, model.class_prior),
+        visible_ratios(posteriors, model.class_prior),
+        feature=hops.feature,
+        band_log_energy=hops.band_log_energy,
+        prominence=hops.prominence,
         looming_hz=hops.looming_hz,
         looming_std_hz=hops.looming_std_hz,
         bearing_rad=hops.bearing_rad,
