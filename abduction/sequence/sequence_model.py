@@ -81,10 +81,15 @@ class SequenceAlarm:
         return np.stack([held(side) for side in over.T], axis=1)
 
 
+def soon_log_odds(posterior: SequencePosterior) -> FloatArray:
+    """Return the log-odds of coming into view within three seconds at every hop, shape (n, 2)."""
+    within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
+    return np.asarray(np.log(within) - np.log1p(-within))
+
+
 def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
     """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
-    within = np.clip(posterior.within()[..., HORIZONS_S.index(3.0)], _SMALLEST, 1.0 - _SMALLEST)
-    log_odds = np.log(within) - np.log1p(-within)
+    log_odds = soon_log_odds(posterior)
     padded = np.concatenate([np.repeat(log_odds[:1], SMOOTHED_HOPS - 1, axis=0), log_odds])
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, SMOOTHED_HOPS, axis=0).mean(axis=-1))
 

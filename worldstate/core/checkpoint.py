@@ -15,10 +15,12 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
+from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Priors
 
 from .memory import Memory
+from .sequence_memory import SequenceMemory
 
 Logs = tuple[float, ...]
 
@@ -56,6 +58,8 @@ class _Memory:
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
     bearing: Bearing | None = field(default=None, metadata=ADDED)
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)
+    sequence: SequenceMemory | None = field(default=None, metadata=ADDED)
+    no_sequence: NotUsable | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +88,8 @@ class FilterRecord:
             for row in rows:
                 if len(row) != length:
                     raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
+        if memory.sequence is not None:
+            memory.sequence.check()
         if not beliefs:
             raise InvalidArgumentError("memory.trail.beliefs: expected at least one")
         if memory.rule_run > self.policy.sustain_hops or any(track.side >= k for track in memory.tracks):
@@ -109,6 +115,8 @@ def memory_record(memory: Memory) -> _Memory:
         threshold=memory.threshold,
         bearing=memory.bearing,
         domain=memory.domain,
+        sequence=memory.sequence,
+        no_sequence=memory.no_sequence,
     )
 
 
@@ -132,6 +140,8 @@ def memory_of(record: FilterRecord) -> Memory:
         threshold=kept.threshold,
         bearing=kept.bearing,
         domain=kept.domain,
+        sequence=kept.sequence,
+        no_sequence=kept.no_sequence,
     )
 
 

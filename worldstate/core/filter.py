@@ -13,6 +13,8 @@ from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import PlattMap
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.ground.checks import in_range
@@ -33,6 +35,7 @@ from .step import (
     update_advisories,
     update_entities,
     update_evidence,
+    update_sequence,
     update_sightings,
     weights_of,
 )
@@ -45,6 +48,7 @@ _KINDS: dict[str, Any] = {
     "co_evidence": CoEvidence,
     "bearing": Bearing | NotUsable,
     "approach": Approach | NotUsable,
+    "sequence": SequenceReading | NotUsable | None,
 }
 
 
@@ -174,6 +178,7 @@ class WorldFilter:
             calibrated=self.policy.alpha > 0.0,
             bearing=memory.bearing,
             domain=memory.domain,
+            no_sequence=memory.no_sequence,
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":
@@ -221,6 +226,7 @@ class WorldFilter:
         memory = update_evidence(memory, measurement, weights, model)
         memory = update_sightings(memory, measurement, weights, model)
         memory = update_advisories(memory, measurement, model)
+        memory = update_sequence(memory, measurement, weights, model)
         return replace(world, memory=update_entities(memory, measurement, model))
 
     def to_dict(self) -> dict[str, Any]:
@@ -276,6 +282,8 @@ def _checked(measurement: Measurement, context: Context, last_ns: dict[str, int]
         raise InvalidArgumentError(
             f"signature: expected the directions {context.directions}, got {measurement.signature.directions}"
         )
+    if isinstance(measurement.sequence, SequenceReading) and context.directions != SIDES:
+        raise InvalidArgumentError(f"sequence: expected the directions {SIDES}, got {context.directions}")
     stamp_ns, before_ns = _integer_ns("stamp_ns", measurement.stamp_ns), last_ns.get(measurement.source)
     if before_ns is not None and stamp_ns < before_ns:
         raise InvalidArgumentError(

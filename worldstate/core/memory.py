@@ -9,8 +9,11 @@ from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.track import Track
+from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Priors
+
+from .sequence_memory import SequenceMemory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +37,8 @@ class Memory:
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
     bearing: Bearing | None = None  # Of the last measurement
     domain: DomainVerdict | None = None  # Of the last measurement
+    sequence: SequenceMemory | None = None  # Who comes into view and when; None without such a model
+    no_sequence: NotUsable | None = None  # Why the last one that should have said so could not
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

@@ -3,6 +3,9 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.motion import MotionBelief
@@ -13,6 +16,7 @@ from worldstate.state import Classification, Context, Entity, Relation, RiskCue,
 from worldstate.state.relation import EGO
 
 from .memory import Memory, priors_of
+from .sequence_memory import SequenceMemory
 from .step import FilterModel
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
@@ -105,6 +109,9 @@ def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: 
     motion = model.site.prior(k) if track is None else track.motion
     # The floor only matters where P(hidden) has underflowed; then no direction has a share.
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
+    arrival_s = None if track is None else time_to_arrival(track)
+    within, times_s = _times(memory.sequence, k, named)
+    own_alarm = memory.sequence is not None and memory.sequence.alarm is not None
     return RiskCue(
         direction=side.label,
         azimuth_rad=motion.azimuth_rad,
@@ -115,10 +122,29 @@ def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: 
         log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
         hypotheses=priors_of(explanation),
         advisory=named,
-        alpha=model.policy.alpha or None,
+        alpha=None if own_alarm else model.policy.alpha or None,
         entity_id=None if track is None else track.id,
-        horizon_s=None if track is None else time_to_arrival(track),
+        horizon_s=arrival_s if times_s is None else times_s[1],
+        within=within,
+        time_to_visible_s=times_s,
     )
+
+
+def _times(
+    kept: SequenceMemory | None, k: int, named: bool
+) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
+    """Return the probabilities of coming into view, and the time to it where somebody is expected."""
+    if kept is None:
+        return None, None
+    posterior = kept.posterior
+    # A sum of probabilities may exceed one by rounding, which readers of a snapshot refuse.
+    probabilities = np.minimum(posterior.within()[0, k], 1.0).tolist()
+    within = dict(zip((f"{end_s:g}" for end_s in HORIZONS_S), probabilities, strict=True))
+    # The times are those of whoever comes: of a street where nobody does they would say nothing.
+    if not named and posterior.groups[0, k, : COMING_S.index(LONGEST_S) + 1].sum() <= 0.5:
+        return within, None
+    low, best, high = posterior.time_to_visible_s()[0, k].tolist()
+    return within, (low, best, high)
 
 
 def _range(motion: MotionBelief, hidden: bool) -> float | None:

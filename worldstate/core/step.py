@@ -13,6 +13,7 @@ from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
+from worldstate.belief.sequence_chain import LOOK_INTERVAL_S
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import predict_track
@@ -22,6 +23,7 @@ from worldstate.measurement.measurement import Measurement
 from worldstate.state import Context
 
 from .memory import Memory, priors_of
+from .sequence_memory import carried, informed
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
@@ -42,6 +44,7 @@ class Weights:
 
     sound: float
     look: float
+    sequence_look: float  # Of the groups of a sequence, which are forgotten slower than entities
 
 
 def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry:
@@ -60,7 +63,8 @@ def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings
     """
     before_ns = dict(memory.last_ns).get(measurement.source, start_ns)
     elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
-    return Weights(min(elapsed_s / settings.window_s, 1.0), min(elapsed_s / settings.look_interval_s, 1.0))
+    intervals_s = (settings.window_s, settings.look_interval_s, LOOK_INTERVAL_S)
+    return Weights(*(min(elapsed_s / interval_s, 1.0) for interval_s in intervals_s))
 
 
 def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
@@ -75,6 +79,7 @@ def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
         stamp_ns=stamp_ns,
         explanation=explanation.predict(model.context.rates.values_hz, step_ns),
         tracks=surviving(tracks, model.site.settings),
+        sequence=memory.sequence and carried(memory.sequence, step_ns, model.context),
     )
 
 
@@ -151,6 +156,18 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, model.policy))
 
 
+def update_sequence(memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel) -> Memory:
+    """Return the memory after what a sequence model and the camera say of who comes into view, and when."""
+    said = measurement.sequence
+    refused = said if isinstance(said, NotUsable) else None
+    return replace(
+        memory,
+        sequence=informed(memory.sequence, measurement, weights.sequence_look, model.context),
+        # Other sources do not speak of it: what was said last holds.
+        no_sequence=memory.no_sequence if said is None else refused,
+    )
+
+
 def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThreshold:
     """Return the adaptive threshold after this window."""
     if policy.adaptive is None:
@@ -166,7 +183,13 @@ def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThr
 
 
 def alarmed(memory: Memory) -> tuple[bool, ...]:
-    """Return for each side whether an advisory names it: the likeliest side, or all in a tie."""
+    """Return for each side whether an advisory names it: the likeliest side, or all in a tie.
+
+    With the alarm of a sequence model each side is named by itself.
+    """
+    sequence = memory.sequence
+    if sequence is not None and sequence.alarm is not None:
+        return sequence.alarmed(memory.stamp_ns)
     hidden = memory.explanation.hidden
     least = max(hidden) * (1.0 - _TIE)
     return tuple(memory.rule.alarm and p >= least for p in hidden)

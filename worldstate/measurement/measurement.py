@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.values import NotUsable
 
@@ -104,6 +105,8 @@ class Measurement:
         All that the co-evidence channel reports, in the queried sector or not.
     domain : Familiar, Foreign, WarningSignal or None
         Whether the model was made for what was heard; None where nothing tells.
+    sequence : SequenceReading, NotUsable or None
+        What the last seconds say of who comes into view, and when; None of a modality that has no such model.
     source : str
         Name of the modality.
 
@@ -124,6 +127,7 @@ class Measurement:
     approach: Approach | NotUsable
     sightings: tuple[Sighting, ...] = ()
     domain: DomainVerdict | None = None
+    sequence: SequenceReading | NotUsable | None = None
     # Overlap is discounted within a source and evidence multiplied across sources: two with one name would
     # count as one that repeats itself.
     source: str = "acoustic"

@@ -1,9 +1,10 @@
 """Predictive cues: the calibrated, direction-resolved risk of a hidden road user."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from worldstate.ground.serialisation import Layout, Probability
+from worldstate.ground.serialisation import ADDED, Layout, Probability
 
 from .context import Priors
 
@@ -34,13 +35,21 @@ class RiskCue:
     hypotheses : Priors
         Filtered P(hidden), P(visible), P(none).
     advisory : bool
-        Whether the sustained rule is in alarm and names this direction.
+        Whether the sustained rule is in alarm and names this direction; with the alarm of a sequence model,
+        whether it is raised for it.
     alpha : float or None
-        False-positive budget that the rule was calibrated for; None for an uncalibrated policy.
+        False-positive budget that the rule was calibrated for; None for an uncalibrated policy, and where the
+        alarm of a sequence model stands in for the rule, which has a budget of onsets an hour.
     entity_id : str or None
         The hidden entity that it speaks of, if one was born.
     horizon_s : float or None
-        Time to arrival of that entity; None where unknown.
+        Best time to visible where one is stated, else time to arrival of that entity; None where unknown.
+    within : mapping of str to float, or None
+        Probability that somebody comes into view from there within so many seconds ("0.5", "1", "2", "3");
+        None without a sequence model.
+    time_to_visible_s : (float, float, float) or None
+        Low, best and high; the interval holds nine of ten. None where no advisory names the direction and it
+        is likelier than not that nobody comes within five seconds.
 
     Examples
     --------
@@ -66,3 +75,5 @@ class RiskCue:
     alpha: Probability | None = None
     entity_id: str | None = None
     horizon_s: float | None = None
+    within: Mapping[str, Probability] | None = field(default=None, metadata=ADDED)
+    time_to_visible_s: tuple[float, float, float] | None = field(default=None, metadata=ADDED)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
+from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
@@ -49,6 +50,8 @@ class WorldState:
     domain : Familiar, Foreign, WarningSignal or None
         Whether the model was made for what was heard last. Of a foreign sound it gives the reason, and the
         evidence of that hop counts little; a warning signal comes from a vehicle.
+    no_sequence : NotUsable or None
+        Why the cues state no times although the model could.
 
     Examples
     --------
@@ -57,7 +60,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.3.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.4.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -70,6 +73,7 @@ class WorldState:
     calibrated: bool = field(default=False, metadata=ADDED)
     bearing: Bearing | None = None
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)
+    no_sequence: NotUsable | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.

@@ -1,0 +1,215 @@
+"""The reading of a sequence in the filter: its laws, its alarm, and what the snapshot says of it."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Context, Measurement, WorldFilter, WorldState
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import NotUsable
+from worldstate.state import Priors, blind_corner
+
+SEEDS = st.integers(0, 2**32 - 1)
+NOBODY = SignatureEvidence(("left", "right"), (-1.0, -1.0), -1.0, 1.0)
+SILENT = NotUsable("not scripted")
+UNASKED = Unqueried("no camera")
+COMING = len(COMING_S)
+
+
+# One for all: a chain is made once for each.
+SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
+
+
+def drawn(rng: np.random.Generator, hops: int, alarm: SequenceAlarm | None = None) -> list[SequenceReading]:
+    groups = 0.999 * rng.dirichlet(np.full(len(GROUPS), 0.2), (hops, 2)) + 0.001 / len(GROUPS)
+    return [SequenceReading(one, SHARE, 0.1, alarm) for one in groups]
+
+
+def heard(
+    hop: float,
+    said: SequenceReading | NotUsable | None,
+    answer: CoEvidence = UNASKED,
+    source: str = "acoustic",
+) -> Measurement:
+    return Measurement(*(round(hop * 1e8), NOBODY, answer, SILENT, SILENT), source=source, sequence=said)
+
+
+def run(world: WorldFilter, measured: Sequence[Measurement]) -> list[WorldFilter]:
+    return [world := world.update(one) for one in measured]
+
+
+def belief(world: WorldFilter) -> np.ndarray:
+    assert world.memory is not None and world.memory.sequence is not None
+    return world.memory.sequence.sides.belief
+
+
+def looks(rng: np.random.Generator, hops: int) -> list[CoEvidence]:
+    answers = [Absent(0.04, 0.01), Present(0.04, 0.01), UNASKED]
+    return [answers[one] for one in rng.integers(0, 3, hops)]
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_without_anything_else_it_believes_what_the_sequence_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said = drawn(rng, 12)
+    hop = np.cumsum(rng.integers(1, 30, 12))
+    worlds = run(WorldFilter(), [heard(at, one) for at, one in zip(hop, said, strict=True)])
+    for world, one in zip(worlds, said, strict=True):
+        np.testing.assert_allclose(belief(world), one.groups, rtol=1e-6, atol=1e-9)
+
+
+@given(SEEDS, st.floats(0.0, 1.0))
+@settings(max_examples=5)
+def test_a_context_moves_the_odds_of_those_who_come_and_never_far(seed: int, hidden: float) -> None:
+    said = drawn(np.random.default_rng(seed), 1)[0]
+    context = Context(priors=Priors(hidden, 0.0, 1.0 - hidden))
+    moved = belief(run(WorldFilter(context), [heard(1, said)])[0])
+    coming = [one[:, :COMING].sum(axis=1) for one in (moved, said.groups)]
+    shift = np.subtract(*(np.log(one) - np.log1p(-one) for one in coming))
+    assert (shift > -0.5 - 1e-6).all() and (shift < 2.0 + 1e-6).all()
+    np.testing.assert_allclose(shift[0], shift[1], atol=1e-6)
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_the_mirrored_world_has_the_mirrored_belief(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said, seen = drawn(rng, 15, SequenceAlarm(0.0, 15.0)), looks(rng, 15)
+    here = [heard(hop, one, look) for hop, (one, look) in enumerate(zip(said, seen, strict=True), 1)]
+    there = [replace(one, sequence=replace(one.sequence, groups=one.sequence.groups[::-1])) for one in here]
+    for one, other in zip(run(WorldFilter(), here), run(WorldFilter(), there), strict=True):
+        np.testing.assert_array_equal(belief(one), belief(other)[::-1])
+        cues = {cue.direction: cue for cue in other.state.cues}
+        for cue in one.state.cues:
+            mirrored = cues["right" if cue.direction == "left" else "left"]
+            assert (cue.advisory, cue.within) == (mirrored.advisory, mirrored.within)
+            assert cue.time_to_visible_s == mirrored.time_to_visible_s
+
+
+@given(SEEDS, st.integers(1, 400), st.integers(1, 400))
+@settings(max_examples=5)
+def test_silence_in_two_parts_is_silence_in_one_and_ends_at_the_share(seed: int, one: int, two: int) -> None:
+    rng = np.random.default_rng(seed)
+    said = drawn(rng, 3)
+    measured = [heard(hop, reading, Absent(0.04, 0.01)) for hop, reading in enumerate(said, 1)]
+    world = run(WorldFilter(), measured)[-1]
+    parts, whole = world.predict(one / 100).predict(two / 100), world.predict((one + two) / 100)
+    np.testing.assert_allclose(belief(parts), belief(whole), atol=1e-9)
+    np.testing.assert_allclose(belief(world.predict(1000.0))[0], said[0].share, atol=1e-3)
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_sources_that_speak_at_once_may_speak_in_either_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    before, now = drawn(rng, 2)
+    world = run(WorldFilter(), [heard(1, before, Present(0.04, 0.01))])[0]
+    pair = [heard(2, now), heard(2, None, Absent(0.04, 0.01), source="camera")]
+    one, other = run(world, pair)[-1], run(world, pair[::-1])[-1]
+    np.testing.assert_allclose(belief(one), belief(other), atol=1e-12)
+
+
+@given(SEEDS, st.integers(1, 14))
+@settings(max_examples=5)
+def test_a_checkpoint_goes_on_to_the_bit(seed: int, cut: int) -> None:
+    rng = np.random.default_rng(seed)
+    said, seen = drawn(rng, 15, SequenceAlarm(0.0, 15.0)), looks(rng, 15)
+    measured = [heard(hop, one, look) for hop, (one, look) in enumerate(zip(said, seen, strict=True), 1)]
+    worlds = run(WorldFilter(), measured)
+    written = json.dumps(worlds[cut - 1].to_dict(), allow_nan=False)
+    last = run(WorldFilter.from_dict(json.loads(written)), measured[cut:])[-1]
+    np.testing.assert_array_equal(belief(last), belief(worlds[-1]))
+    assert last.state.to_json() == worlds[-1].state.to_json()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_alarm_is_that_of_the_stream_side_by_side(seed: int) -> None:
+    alarm = SequenceAlarm(0.5, 15.0)
+    said = drawn(np.random.default_rng(seed), 40, alarm)
+    expected = alarm.raised(SequencePosterior(np.stack([one.groups for one in said]), 0.1))
+    # A mean over three hops needs three, and an alarm of the two before is held for a second.
+    worlds = run(WorldFilter(), [heard(hop, one) for hop, one in enumerate(said, 1)])
+    raised = [[cue.advisory for cue in world.state.cues] for world in worlds]
+    assert raised[13:] == expected[13:].tolist()
+    assert all(cue.alpha is None for cue in worlds[-1].state.cues)
+
+
+def test_the_alarm_is_held_for_a_second_whatever_the_hop() -> None:
+    said = drawn(np.random.default_rng(3), 1, SequenceAlarm(2.0, 15.0))[0]
+    chances = np.full((2, 2, len(GROUPS)), 1e-6)
+    chances[0, 0, 0], chances[0, 1, -1], chances[1, :, -1] = 1.0, 1.0, 1.0
+    chances /= chances.sum(axis=-1, keepdims=True)
+    coming, over = (replace(said, groups=one) for one in chances)
+    world = run(WorldFilter(), [heard(hop, coming) for hop in range(1, 5)])[-1]
+    for step in (0.5, 1.0, 2.0):
+        hops = np.arange(5, 20, step)
+        states = [one.state for one in run(world, [heard(hop, over) for hop in hops])]
+        named = [[cue.direction for cue in state.cues if cue.advisory] for state in states]
+        off = hops[named.index([])]
+        # The mean of .3 s falls below the threshold at once where one hop brings down three.
+        assert {tuple(one) for one in named} == {("left",), ()} and 14 <= off <= 17
+    assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
+
+
+def test_looks_say_whether_somebody_is_in_view_and_as_much_in_a_second_as_one() -> None:
+    said = replace(drawn(np.random.default_rng(1), 1)[0], groups=np.full((2, len(GROUPS)), 1 / len(GROUPS)))
+    seen = GROUPS.index("seen")
+    beliefs = [
+        belief(run(WorldFilter(), [heard(hop, said, look) for hop in range(1, 11)])[-1])[:, seen]
+        for look in (Present(0.04, 0.01), UNASKED, Absent(0.04, 0.01))
+    ]
+    assert (np.diff(beliefs, axis=0) < -0.01).all()
+    once = belief(run(WorldFilter(), [heard(10, said, Absent(0.04, 0.01))])[-1])[:, seen]
+    # Of ten looks in a second each counts a tenth, less what was forgotten since.
+    assert (beliefs[2] > once - 1e-9).all() and (beliefs[2] < beliefs[1]).all()
+
+
+def test_without_a_sequence_nothing_is_said_of_times_and_the_rule_alarms() -> None:
+    alone = run(WorldFilter(), [heard(hop, None) for hop in range(1, 5)])[-1].state
+    refused = NotUsable("the model was made for a standing ego, this one moves")
+    silent = run(WorldFilter(), [heard(hop, refused) for hop in range(1, 5)])[-1].state
+    assert {(cue.within, cue.time_to_visible_s) for cue in alone.cues} == {(None, None)}
+    assert (alone.no_sequence, silent.no_sequence) == (None, refused)
+    assert WorldState.from_json(silent.to_json()) == silent
+    assert replace(silent, no_sequence=None) == alone
+
+
+def test_the_snapshot_states_times_where_somebody_is_expected() -> None:
+    said = drawn(np.random.default_rng(2), 1)[0]
+    groups = np.full((2, len(GROUPS)), 1e-3)
+    groups[0, GROUPS.index("coming_1.5s")], groups[1, -1] = 1.0, 1.0
+    said = replace(said, groups=groups / groups.sum(axis=1, keepdims=True))
+    state = run(WorldFilter(), [heard(1, said)])[0].state
+    left, right = state.cues
+    assert left.time_to_visible_s is not None and right.time_to_visible_s is None
+    low, best, high = left.time_to_visible_s
+    assert low < 1.25 < high and best == left.horizon_s == pytest.approx(1.25, abs=0.05)
+    assert left.within is not None and list(left.within) == ["0.5", "1", "2", "3"]
+    assert left.within["1"] < 0.01 < 0.98 < left.within["2"] <= left.within["3"]
+    assert WorldState.from_json(state.to_json()) == state
+
+
+def test_readings_that_do_not_fit_are_refused() -> None:
+    said = drawn(np.random.default_rng(2), 1)[0]
+    with pytest.raises(InvalidArgumentError, match="groups"):
+        replace(said, groups=said.groups[:1])
+    with pytest.raises(InvalidArgumentError, match=r"sequence: expected .*NotUsable"):
+        WorldFilter().update(heard(1, 0.5))  # type: ignore[arg-type]
+    one_sided = WorldFilter(Context(occluders=(blind_corner("right", -1), blind_corner("left", 1))))
+    turned = replace(heard(1, said), signature=replace(NOBODY, directions=("right", "left")))
+    with pytest.raises(InvalidArgumentError, match="sequence: expected the directions"):
+        one_sided.update(turned)
+    damaged = run(WorldFilter(), [heard(1, said)])[0].to_dict()
+    damaged["memory"]["sequence"]["share"] = [2.0] * len(GROUPS)
+    with pytest.raises(InvalidArgumentError, match=r"sequence\.share"):
+        WorldFilter.from_dict(damaged)

@@ -1,0 +1,107 @@
+"""What the filter believes of who comes into view and when: the sequence's reading with everything else."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.sequence.sequence_model import (
+    GROUPS,
+    SequenceAlarm,
+    SequencePosterior,
+    soon_log_odds,
+)
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
+from worldstate.belief.sequence_chain import context_prior, group_transition, look_log_likelihoods
+from worldstate.ground.checks import finite_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+from worldstate.measurement.measurement import Measurement
+from worldstate.state import Context
+
+# In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
+_SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceMemory:
+    """Belief of both sides, and the alarm that goes by it."""
+
+    sides: SequenceBelief
+    share: FloatArray  # shape (groups,): Prior that the model was trained at
+    margin_s: float
+    alarm: SequenceAlarm | None
+    # Stamps of the last .3 s with the log-odds of coming into view within three seconds, left and right.
+    recent: tuple[tuple[int, float, float], ...] = ()
+    over_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When each side was last above the threshold
+
+    def check(self) -> None:
+        """Refuse what a file cannot have been written with."""
+        groups, sides = (len(GROUPS),), (len(SIDES), len(GROUPS))
+        for name, array, shape in (
+            ("share", self.share, groups),
+            ("belief", self.sides.belief, sides),
+            ("alone", self.sides.alone, sides),
+        ):
+            finite_array(f"memory.sequence.{name}", array, shape)
+            if (array < 0.0).any() or not np.allclose(array.sum(axis=-1), 1.0, atol=1e-3):
+                raise InvalidArgumentError(f"memory.sequence.{name}: expected probabilities")
+        if len(self.over_ns) != len(SIDES):
+            got = len(self.over_ns)
+            raise InvalidArgumentError(f"memory.sequence.over_ns: expected {len(SIDES)}, got {got}")
+
+    @property
+    def posterior(self) -> SequencePosterior:
+        """The belief, as one hop of a stream."""
+        return SequencePosterior(self.sides.belief[None], self.margin_s)
+
+    def alarmed(self, stamp_ns: int) -> tuple[bool, ...]:
+        """Return for each side whether it was above the threshold within the last second."""
+        last_ns = stamp_ns - _HELD_NS - _SLACK_NS
+        return tuple(over_ns is not None and over_ns >= last_ns for over_ns in self.over_ns)
+
+
+def carried(kept: SequenceMemory, step_ns: int, context: Context) -> SequenceMemory:
+    """Return the belief some time on, with nothing heard."""
+    chain = group_transition(_prior(kept.share, context), step_ns)
+    return replace(kept, sides=next_belief(kept.sides, None, chain))
+
+
+def informed(
+    kept: SequenceMemory | None, measurement: Measurement, look_weight: float, context: Context
+) -> SequenceMemory | None:
+    """Return the belief at a measurement after its reading and its look; None before the first reading."""
+    reading = measurement.sequence
+    said = None
+    if isinstance(reading, SequenceReading):
+        said = at_prior(reading.groups, reading.share, _prior(reading.share, context))
+        sides = first_belief(said) if kept is None else kept.sides
+        recent, over_ns = ((), (None,) * len(SIDES)) if kept is None else (kept.recent, kept.over_ns)
+        kept = SequenceMemory(sides, reading.share, reading.margin_s, reading.alarm, recent, over_ns)
+    if kept is None:
+        return None
+    prior = _prior(kept.share, context)
+    look = look_weight * look_log_likelihoods(measurement.co_evidence, prior)
+    # The chain of the hops since then was taken when the belief was carried here.
+    sides = next_belief(kept.sides, said, np.eye(len(GROUPS)), look)
+    return _alerted(replace(kept, sides=sides), measurement.stamp_ns)
+
+
+def _prior(share: FloatArray, context: Context) -> FloatArray:
+    priors = context.priors
+    return context_prior(share, None if priors is None else priors.hidden / len(SIDES))
+
+
+def _alerted(kept: SequenceMemory, stamp_ns: int) -> SequenceMemory:
+    """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
+    left, right = soon_log_odds(kept.posterior)[0].tolist()
+    since_ns = stamp_ns - _SMOOTHED_NS + _SLACK_NS
+    recent = (*(one for one in kept.recent if one[0] > since_ns), (stamp_ns, left, right))
+    kept = replace(kept, recent=recent)
+    if kept.alarm is None:
+        return kept
+    means = np.mean([one[1:] for one in recent], axis=0)
+    over = (means >= kept.alarm.threshold_nats).tolist()
+    over_ns = tuple(stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
+    return replace(kept, over_ns=over_ns)
