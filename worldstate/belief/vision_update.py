@@ -1,6 +1,7 @@
 """Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from .track import Track, entity_id, merged, relabelled
 # deviations. A parked one has none, but zero would make the covariance singular.
 _NEW_RATE_STD = (0.5, 0.5)
 _PARKED_RATE_STD = (1e-3, 1e-3)
+# All that tells two sightings apart: one that moves and one parked at the same place are two.
+_BY_ALL = attrgetter("azimuth_rad", "label", "score", "std_rad", "width_rad", "moving")
 # A detection by a channel said to miss everything would carry no information; its miss rate is capped here.
 _MOST_MISSES = 0.99
 
@@ -51,7 +54,7 @@ def vision_update(
 ) -> VisionUpdate:
     """Return tracks and explanations after one look; `born` counts the entities born in view so far."""
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
-    sightings = tuple(sorted(measurement.sightings, key=lambda s: (s.azimuth_rad, s.label, s.score)))
+    sightings = tuple(sorted(measurement.sightings, key=_BY_ALL))
     known = match_visible(tracks, sightings, site.settings)
     new = tuple((j, s) for j, s in enumerate(sightings) if j not in known.values())
     emerging = match_hidden(tracks, new, site)
