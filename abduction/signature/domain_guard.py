@@ -140,9 +140,9 @@ class DomainGuard:
     kinds_of_signals: tuple[str, ...]
     centres: FloatArray
     whitening: FloatArray
-    # Without end it costs .64 of the detections of vehicles that come while a foreign sound is as loud as
-    # they are, with 2 nats .28; both leave alarms in .02 of the hops of foreign sounds alone, .11 before (25
-    # sounds at five sites, each of a kind and at a site never heard).
+    # Foreign sounds alone alarm in .14 of their hops; less 2 nats in .06, less all in .04. Of vehicles that
+    # come while one is as loud as they are, .84, .63 and .42 are detected (43 sounds at five sites, kind and
+    # site never heard): docs/foreign_sounds.md.
     margin: float = 2.0
 
     def __post_init__(self) -> None:

@@ -47,9 +47,9 @@ def test_an_exam_leaves_out_what_it_asks_for() -> None:
     # On orthogonal axes nothing learned of one kind tells another: a guard that had heard it would.
     found = {(one.without, one.kind): one for one in guard_exam(made_up_rows(3))}
     known, unknown = found["nothing", "voice"], found["voice", "voice"]
-    assert known.foreign > 0.95
+    assert known.foreign > 0.85
     assert unknown.foreign + unknown.signal < 0.5
-    assert found["nothing", "siren"].signal > 0.8
+    assert found["nothing", "siren"].signal > 0.7
     assert {one for one, _ in found} == {"nothing", *FOREIGN, "ringing", "tools", "impacts"}
     assert all(found["nothing", label].foreign < 0.1 for label in STREET)
 
