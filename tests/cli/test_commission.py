@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import soundfile
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
@@ -32,3 +34,12 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()} == heard
     assert out.read_bytes() == before
+    quiet = tmp_path / "night.wav"
+    noise = np.random.default_rng(1).standard_normal((6000 * 25, 4)) * 0.01
+    soundfile.write(quiet, noise, 6000, subtype="FLOAT")
+    assert main([*command, "--no-exam", "--quiet", str(quiet)]) == 2
+    assert "expected 0.15 hours" in capsys.readouterr().err
+    assert main([*command, "--no-exam", "--quiet", str(quiet), "--onsets", "600"]) == 0
+    told = read_model(out).sequence
+    assert told is not None and told.alarm is not None and told.alarm.onsets_per_hour == 600.0
+    assert told.alarm.threshold_nats != model.sequence.alarm.threshold_nats

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 EXAMPLE = """\
 examples:
   worldstate commission --array mics.csv --out my_model.json --streams streams --jobs 2
+  worldstate commission --array mics.csv --out my_model.json --streams streams --quiet night.wav
   worldstate commission --array mics.csv --out try.json --quick"""
 
 
@@ -37,6 +38,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--streams", type=Path, metavar="DIR", help=streams)
     windows = "labelled windows of this array at real junctions, learned too: feat0..feat59, Class, ..."
     add("--labelled", type=Path, metavar="CSV", help=windows)
+    quiet = "recordings in which nobody came: the alarm is set on them"
+    add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add("--onsets", type=float, default=20.0, metavar="N", help="alarms an hour allowed (default: 20)")
     add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
     add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
@@ -67,7 +70,15 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     # Streams take nearly all of the time; what is learned from them counts as a few more.
     steps = len(learned_streams(settings)) + LEARNING_STEPS
     with progress_bar("commissioning", steps) as bar:
-        model = commission(array, settings, folder, table=table, jobs=arguments.jobs, on_step=bar.advance)
+        model = commission(
+            array,
+            settings,
+            folder,
+            table=table,
+            quiet=arguments.quiet,
+            jobs=arguments.jobs,
+            on_step=bar.advance,
+        )
     save_model(arguments.out, model)
     report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": not settings.quick}
     if arguments.exam:

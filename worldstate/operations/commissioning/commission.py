@@ -23,20 +23,22 @@ from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.parallel import in_processes
+from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.training.training import TrainingSettings, train_model
 
 from .guard_training import train_guard
-from .heard_stream import HeardStream, hear_stream
+from .heard_stream import HeardStream, hear_recording, hear_stream
 from .open_field import N_OPEN, open_field_features, open_field_windows
 from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
-from .stream_exam import ExaminedStream, alarm_for
+from .stream_exam import HOP_S, ExaminedStream, alarm_for
 from .stream_labels import stream_truth
 from .stream_windows import stream_windows
 from .window_model import posteriors_along, window_model
 
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 2
+LEAST_ONSETS = 3.0
 SIMULATED, UNFIT = "simulated streets", "simulated streets, a few minutes: unfit for use"
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
@@ -154,10 +156,14 @@ def commission(
     folder: Path,
     *,
     table: FeatureTable | None = None,
+    quiet: Sequence[Path] = (),
     jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
-    """Make a model for an array from simulated streets, and from labelled windows where there are any."""
+    """Make a model for an array from simulated streets, and from labelled windows where there are any.
+
+    Recordings in which nobody came set the alarm in place of the simulated streets without hazards.
+    """
     streams, rng = [], np.random.default_rng(settings.seed)
     for one in heard_streams(learned_streams(settings), array, folder, jobs):
         streams.append(one)
@@ -186,7 +192,31 @@ def commission(
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out.
     guard = None if settings.quick else train_guard(array, streams, rng)
-    return replace(model, sequence=learned.model, guard=guard)
+    made = replace(model, sequence=learned.model, guard=guard)
+    return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
+
+
+def with_quiet_alarm(
+    model: Model, array: MicrophoneArray, quiet: Sequence[Path], onsets_per_hour: float
+) -> Model:
+    """Return a model whose alarm is set on recordings in which nobody came."""
+    windows, sequence = _parts(model)
+    heard = [hear_recording(path, array) for path in quiet]
+    hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR
+    # Where fewer onsets than these are to be expected, a threshold is set by chance alone.
+    if hours * onsets_per_hour < LEAST_ONSETS:
+        raise InvalidArgumentError(
+            f"quiet: expected {LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets an "
+            f"hour, got {hours:.2f}: more sound, or more onsets allowed"
+        )
+    said = [sequence.posterior(stream_evidence(windows, one)) for one in heard]
+    return replace(model, sequence=replace(sequence, alarm=alarm_for(said, onsets_per_hour)))
+
+
+def _parts(model: Model) -> tuple[EnsembleModel, SequenceModel]:
+    if model.sequence is None or not isinstance(model.signature, EnsembleModel):
+        raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
+    return model.signature, model.sequence
 
 
 def _windows_learned(
@@ -235,12 +265,12 @@ def exam_of(
     on_step: Callable[[], None] = lambda: None,
 ) -> list[ExaminedStream]:
     """Let a model hear streams of the five junctions with a name, which it has not learned."""
-    sequence = model.sequence
-    if sequence is None or sequence.alarm is None or not isinstance(model.signature, EnsembleModel):
-        raise InvalidArgumentError("model: expected one with a sequence and its alarm, as `commission` makes")
+    windows, sequence = _parts(model)
+    if sequence.alarm is None:
+        raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
     examined = []
     for one in heard_streams(exam_streams(settings), array, folder, jobs):
-        posterior = sequence.posterior(stream_evidence(model.signature, one))
+        posterior = sequence.posterior(stream_evidence(windows, one))
         examined.append(ExaminedStream(one, stream_truth(one), posterior, sequence.alarm))
         on_step()
     return examined

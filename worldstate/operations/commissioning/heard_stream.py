@@ -3,15 +3,18 @@
 The sound itself is not kept: an hour of 56 channels at 6 kHz is 5 GB, what is heard in it 50 MB.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.simulation.stream.drawn_stream import DrawnStream, draw_stream
+from worldstate.adapters.simulation.stream.rendering import Block
 from worldstate.adapters.simulation.stream.settings import StreamSettings
+from worldstate.adapters.simulation.stream.truth import VehicleTruth
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ, ToneReading
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -19,6 +22,7 @@ from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 
@@ -48,23 +52,52 @@ class HeardStream:
 
 def hear_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream:
     """Render a stream and listen to it, block by block."""
-    stream = draw_stream(settings, array)
-    front_end = FrontEnd(array, settings.sample_rate_hz, listening_settings(settings.sample_rate_hz))
-    frames: list[AcousticFrame] = []
-    middle: list[Float32Array] = []
-    loudness: dict[int, FloatArray] = {}
-    with closing(stream.blocks()) as blocks:
-        for block in blocks:
-            samples = stream.recorded(block)
-            middle.append(samples[:, stream.scene.microphones.middle].copy())
-            frames += front_end.process(samples)
-            loudness |= block.loudness_db
+    stream, loudness = draw_stream(settings, array), dict[int, FloatArray]()
     about = {
         **{"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
         "sample_rate_hz": settings.sample_rate_hz,
     }
-    hops = HopTable(_columns(frames, np.concatenate(middle)), name=_name(settings), about=about)
-    return HeardStream(hops, _vehicles(stream), _rows(stream, loudness))
+    with closing(stream.blocks()) as blocks:
+        samples = _recorded(stream, blocks, loudness)
+        hops = _heard_hops(samples, array, settings.sample_rate_hz, _name(settings), about)
+    return HeardStream(hops, _vehicles(stream.vehicles), _rows(stream.vehicles, loudness))
+
+
+def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
+    """Listen to a recording in which nobody is known to come."""
+    with open_sound(sound, array.n_microphones) as audio:
+        about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
+        blocks = audio.blocks(round(audio.sample_rate_hz))
+        hops = _heard_hops(blocks, array, audio.sample_rate_hz, sound.name, about)
+    return HeardStream(hops, _vehicles(()), _rows((), {}))
+
+
+def _recorded(
+    stream: DrawnStream, blocks: Iterable[Block], loudness_db: dict[int, FloatArray]
+) -> Iterator[Float32Array]:
+    """Yield what the converters make of the blocks, and keep how loud the events were."""
+    for block in blocks:
+        loudness_db |= block.loudness_db
+        yield stream.recorded(block)
+
+
+def _heard_hops(
+    blocks: Iterable[Float32Array],
+    array: MicrophoneArray,
+    sample_rate_hz: float,
+    name: str,
+    about: Mapping[str, object],
+) -> HopTable:
+    front_end = FrontEnd(array, sample_rate_hz, listening_settings(sample_rate_hz))
+    nearest = int(np.linalg.norm(array.centred_m, axis=1).argmin())
+    frames: list[AcousticFrame] = []
+    middle: list[Float32Array] = []
+    for samples in blocks:
+        middle.append(samples[:, nearest].copy())
+        frames += front_end.process(samples)
+    if not frames:
+        raise InvalidArgumentError(f"{name}: expected more than a second of sound")
+    return HopTable(_columns(frames, np.concatenate(middle)), name=name, about=about)
 
 
 def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
@@ -108,9 +141,8 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
     return np.array([pcm[end - length : end] for end in ends], np.int16)
 
 
-def _vehicles(stream: DrawnStream) -> HopTable:
+def _vehicles(every: Sequence[VehicleTruth]) -> HopTable:
     # Typed column by column: of no vehicles at all rows would make columns of floats.
-    every = stream.vehicles
     motions = [one.event.manoeuvre for one in every]
     return HopTable(
         {
@@ -124,8 +156,7 @@ def _vehicles(stream: DrawnStream) -> HopTable:
     )
 
 
-def _rows(stream: DrawnStream, loudness_db: dict[int, FloatArray]) -> HopTable:
-    every = stream.vehicles
+def _rows(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> HopTable:
     azimuth, distance = (_joined([getattr(one, name) for one in every]) for name in ("axle_rad", "axle_m"))
     return HopTable(
         {
