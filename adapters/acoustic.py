@@ -68,7 +68,7 @@ class AcousticSettings:
 
     min_prominence: float = 1.0
     # Up to there nine of ten simulated vehicles in view lie in the sector that the camera is asked about.
-    coarse_std_rad: float = math.radians(20.0)
+    coarse_std_rad: float = math.radians(25.0)
 
     def __post_init__(self) -> None:
         in_range("min_prominence", self.min_prominence, 1.0, math.inf)

@@ -13,7 +13,7 @@ wave among many is taken at random from all directions with probability p:
           + (1 - p) \int_{\theta \notin L} (\theta - \hat\theta)^2 q\, d\theta + p\, \frac{\Delta^2}{12},
           \qquad p = \min\Big(\frac12 \Big(\frac{w_0}{\hat P - \bar P}\Big)^2, 1\Big)
 
-with the span Delta of the search, the share :math:`\hat P - \bar P` of the plane wave, w_0 = .06, and the
+with the span Delta of the search, the share :math:`\hat P - \bar P` of the plane wave, w_0 = .08, and the
 error sigma_0 of a lone source at broadside. A peak no higher than that of noise (`noise_floor`) says nothing:
 Delta / sqrt(12).
 """
@@ -28,9 +28,9 @@ from worldstate.ground.typing import FloatArray
 from .peaks import Peak
 
 # Exponent and share were set on simulated streets (docs/bearing.md): of vehicles in view the error over the
-# stated deviation has a root mean square of 1.0 to 1.5 with 56, 14, 7 and 4 microphones. The exponent 2
+# stated deviation has a root mean square of .9 to 1.4 with 56, 14, 7 and 4 microphones. The exponent 2
 # states twice too much with 4.
-_REVERBERANT_SHARE = 0.06
+_REVERBERANT_SHARE = 0.08
 # Beyond 78 degrees from broadside the law 1/cos is cut: it has no meaning within a beamwidth of endfire.
 _MIN_COSINE = 0.2
 
