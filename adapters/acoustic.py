@@ -7,6 +7,7 @@ from typing import Protocol
 from worldstate.abduction.bearing_vote import with_bearing_vote
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.files.acoustic_domain import feature_order
@@ -24,6 +25,7 @@ from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel, MeasurementAdapter, Side
 
 from .acoustic_grounding import Grounding, observe
+from .acoustic_sequence import LEVEL_BAND_HZ, read_hop
 
 
 class Signature(Protocol):
@@ -100,6 +102,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
 
     guard : DomainGuard, optional
         Tells foreign sounds and warning signals; evidence of a foreign one counts by what exceeds its margin.
+    sequence : SequenceReader or NotUsable, optional
+        Reads from seconds of the model's evidence who comes into view, and when; or why nothing does.
     uncalibrated : bool
         Go on with another array, rate or band than the model was made for. Give the filter a policy of
         alpha 0 then, which states no budget.
@@ -145,6 +149,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         front_end_settings: FrontEndSettings | None = None,
         grounding: Grounding | None = None,
         guard: DomainGuard | None = None,
+        sequence: SequenceReader | NotUsable | None = None,
         uncalibrated: bool = False,
     ) -> None:
         front_end_settings = front_end_settings or FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
@@ -156,6 +161,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             if guard.measures != MEASURES:
                 raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
             front_end_settings = replace(front_end_settings, character=True)
+        if isinstance(sequence, SequenceReader):
+            front_end_settings = replace(front_end_settings, level_band_hz=LEVEL_BAND_HZ)
         self.source = "acoustic"
         self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
         self.last_frame: AcousticFrame | None = None
@@ -164,6 +171,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self._settings = settings or AcousticSettings()
         self._grounding = grounding
         self._guard = guard
+        self._sequence = sequence
 
     def measure(self, block: Float32Array, /) -> list[Measurement]:
         """Take the next samples; return a measurement for each hop that ends in them.
@@ -211,7 +219,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         half of the street the peak is in, not where the vehicle is: then the side is the signature's.
         """
         self.last_frame = frame
-        signature = self._model.evidence(frame.feature)
+        heard = signature = self._model.evidence(frame.feature)
         bearing, looming = _bearing(frame, self._settings), frame.looming
         approach = (
             looming if isinstance(looming, NotUsable) else Approach(looming.inverse_tta_hz, looming.std_hz)
@@ -223,7 +231,10 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         domain = self._judged(frame)
         if isinstance(domain, Foreign) and self._guard is not None:
-            signature = neutral(signature, self._guard.margin)
+            signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
+        # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
+        reader = self._sequence
+        sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
         return Measurement(
             stamp_ns=frame.stamp_ns,
             signature=signature,
@@ -231,6 +242,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             bearing=bearing,
             approach=approach,
             domain=domain,
+            sequence=sequence,
             sightings=self._vision.sightings(frame.stamp_ns) if self._vision else (),
             source=self.source,
         )

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.sequence.sequence_model import SequenceModel
+from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
@@ -36,13 +38,14 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import nanoseconds, seconds
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
 
 from .acoustic import AcousticAdapter, Signature
 from .acoustic_grounding import Grounding
+from .acoustic_sequence import sequence_of
 
 BLOCKS_PER_SECOND = 20
 
@@ -171,6 +174,10 @@ class Source:
         Of the own vehicle, whose lines are then cancelled together with its learned noise.
     guard : DomainGuard or None
         Tells sounds that the model was not made for.
+    sequence : SequenceModel, NotUsable or None
+        Reads who comes into view and when; or why the model's cannot be used here.
+    history : SequenceHistory or None
+        What it has heard beforehand, from a checkpoint.
 
     Examples
     --------
@@ -203,6 +210,8 @@ class Source:
     start_ns: int = 0
     engine: EngineSpeed | None = None
     guard: DomainGuard | None = None
+    sequence: SequenceModel | NotUsable | None = None
+    history: SequenceHistory | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -221,6 +230,11 @@ class Source:
         if site is None or not isinstance(self.model, EnsembleModel):
             return self.model
         return SiteSignature(self.model, site, estimate=self.site)
+
+    def reader(self) -> SequenceReader | NotUsable | None:
+        """Return the sequence model as it is at the start of the recording, or why it cannot be used."""
+        known = self.sequence
+        return SequenceReader(known, self.history) if isinstance(known, SequenceModel) else known
 
     def camera_channel(self) -> VisionQuery:
         """Return the camera as the channel that is asked for co-evidence."""
@@ -250,6 +264,8 @@ class Step:
         The belief after it; `state` is its snapshot.
     site : SiteEstimate or None
         What is known of the site after it; None where no site is learned.
+    history : SequenceHistory or None
+        What a sequence model has heard up to it; None without one.
 
     Examples
     --------
@@ -269,6 +285,7 @@ class Step:
     measurement: Measurement
     world: WorldFilter
     site: SiteEstimate | None = None
+    history: SequenceHistory | None = None
 
     @property
     def state(self) -> WorldState:
@@ -363,6 +380,7 @@ def open_source(
     return replace(
         source,
         site=None if before is None else before.site,
+        history=None if before is None else before.history,
         resume=None if before is None else before.world,
         start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)),
         engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
@@ -394,6 +412,7 @@ def _heard(
         t0_s=recording.t0_s if recording else None,
         hazard_free=recording is not None and recording.label == "none",
         guard=model.guard,
+        sequence=sequence_of(model, moves, settings.uncalibrated),
     )
     return source, recording
 
@@ -553,18 +572,20 @@ def listen_steps(source: Source) -> Iterator[Step]:
     ...     [step.frame.feature.shape for step in listen_steps(open_source(path))]
     [(60,), (60,), (60,)]
     """
-    world, signature = source.world(), source.signature()
-    measured = measure_steps(source, lambda: world.explanation.none, signature)
+    world, signature, reader = source.world(), source.signature(), source.reader()
+    measured = measure_steps(source, lambda: world.explanation.none, signature, reader)
     for frame, measurement in measured:
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         site = signature.estimate if isinstance(signature, SiteSignature) else None
-        yield Step(frame, measurement, world, site)
+        history = reader.history if isinstance(reader, SequenceReader) else None
+        yield Step(frame, measurement, world, site, history)
 
 
 def measure_steps(
     source: Source,
     none_probability: Callable[[], float] | None = None,
     signature: Signature | None = None,
+    reader: SequenceReader | NotUsable | None = None,
 ) -> Iterator[tuple[AcousticFrame, Measurement]]:
     """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
 
@@ -577,6 +598,8 @@ def measure_steps(
         without it none is learned.
     signature : Signature, optional
         `source.signature()`, for those who want to know what it has learned.
+    reader : SequenceReader or NotUsable, optional
+        `source.reader()`, likewise.
 
     Yields
     ------
@@ -610,6 +633,7 @@ def measure_steps(
             vision=source.camera_channel(),
             grounding=source.settings.grounding,
             guard=source.guard,
+            sequence=reader or source.reader(),
             front_end_settings=source.settings.front_end(source.array, audio.sample_rate_hz),
             uncalibrated=source.settings.uncalibrated,
         )

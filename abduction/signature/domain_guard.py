@@ -10,7 +10,7 @@ Above a threshold on lambda, held on streets never heard, the sound is not the s
 signal where the softmax says so and x lies within reach of a kind of signal, :math:`|A (x - \mu_k)| \le 1`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -196,6 +196,12 @@ def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
     (1.0, 0.5)
     """
     ratios = np.array(evidence.hidden) - evidence.none
-    left = np.sign(ratios) * np.maximum(np.abs(ratios) - margin, 0.0)
-    hidden = tuple((evidence.none + left).tolist())
-    return SignatureEvidence(evidence.directions, hidden, evidence.visible, evidence.none)
+    hidden = tuple((evidence.none + _beyond(ratios, margin)).tolist())
+    sides = evidence.sides
+    if sides is not None:
+        sides = replace(sides, log_ratios=tuple(_beyond(np.array(sides.log_ratios), margin).tolist()))
+    return SignatureEvidence(evidence.directions, hidden, evidence.visible, evidence.none, sides)
+
+
+def _beyond(ratios: FloatArray, margin: float) -> FloatArray:
+    return np.asarray(np.sign(ratios) * np.maximum(np.abs(ratios) - margin, 0.0))

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: the filter's memory and the site estimate."""
+"""Checkpoints on disk: the filter's memory, the site estimate and the history of a sequence."""
 
 import json
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from worldstate.abduction.sequence.sequence_reader import SequenceHistory
 from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.serialisation import decode, encode
@@ -24,6 +25,8 @@ class Checkpoint:
         The belief.
     site : SiteEstimate or None
         `SiteSignature.estimate`; None where no site is learned.
+    history : SequenceHistory or None
+        `SequenceReader.history`; None without a sequence model.
 
     Examples
     --------
@@ -35,14 +38,16 @@ class Checkpoint:
 
     world: WorldFilter
     site: SiteEstimate | None = None
+    history: SequenceHistory | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values: the filter's checkpoint with the site beside its memory."""
-        return self.world.to_dict() | {"site": None if self.site is None else encode(self.site)}
+        """Return JSON-able values: the filter's checkpoint with site and history beside its memory."""
+        beside = {"site": self.site, "history": self.history}
+        return self.world.to_dict() | {k: None if v is None else encode(v) for k, v in beside.items()}
 
     @classmethod
     def from_dict(cls, data: object) -> "Checkpoint":
-        """Return what `to_dict` wrote; the filter's own checkpoint reads as one without a site.
+        """Return what `to_dict` wrote; the filter's own checkpoint reads as one without site and history.
 
         Raises
         ------
@@ -52,8 +57,12 @@ class Checkpoint:
             If a value is missing, of the wrong type or out of range; the message says where.
         """
         world = WorldFilter.from_dict(data)
-        site = data.get("site") if isinstance(data, Mapping) else None
-        return cls(world, None if site is None else decode(SiteEstimate, site, "site"))
+        site, history = (data.get(key) if isinstance(data, Mapping) else None for key in ("site", "history"))
+        return cls(
+            world,
+            None if site is None else decode(SiteEstimate, site, "site"),
+            None if history is None else decode(SequenceHistory, history, "history"),
+        )
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:

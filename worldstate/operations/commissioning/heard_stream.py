@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.simulation.stream.drawn_stream import DrawnStream, draw_stream
 from worldstate.adapters.simulation.stream.rendering import Block
@@ -27,7 +28,6 @@ from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 
 HOPS, VEHICLES, ROWS = "hops", "vehicles", "rows"
-LEVEL_BAND_HZ = (50.0, 2700.0)
 _PCM = 32767.0
 
 

@@ -141,7 +141,7 @@ def run_recording(
             write_state(step.state)
             log.add(step)
             on_hop(step)
-            end = Checkpoint(step.world, step.site)
+            end = Checkpoint(step.world, step.site, step.history)
     elapsed_s = time.perf_counter() - started
     hops = HopTable.of_rows(_COLUMNS, log.rows)
     return RecordingReport(

@@ -1,0 +1,52 @@
+"""The evidence of one hop for a sequence model, and whether the model may be used at all."""
+
+import numpy as np
+
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_inputs import HopEvidence
+from worldstate.abduction.sequence.sequence_model import SequenceModel
+from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
+from worldstate.adapters.files.model_file import Model
+from worldstate.frontend.frame import AcousticFrame
+from worldstate.ground.values import NotUsable
+
+# Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
+LEVEL_BAND_HZ = (50.0, 2700.0)
+
+
+def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable | None:
+    """Return the sequence model of a file where it was made for what is heard, else why it is not used."""
+    if model.sequence is None:
+        return None
+    if uncalibrated:
+        return NotUsable("uncalibrated: times are stated of the array that the model was made for")
+    if model.domain is None:
+        return NotUsable("the model names no array that it was made for")
+    motion = "moving" if moving_ego else "standing"
+    if model.domain.ego_motion not in (motion, "any"):
+        return NotUsable(f"the model was made for a {model.domain.ego_motion} ego, this one is {motion}")
+    return model.sequence
+
+
+def read_hop(
+    reader: SequenceReader, signature: SignatureEvidence, frame: AcousticFrame
+) -> SequenceReading | NotUsable:
+    """Return what a sequence says after one more hop, from what its window model and the front-end say."""
+    sides = signature.sides
+    if sides is None:
+        return NotUsable("the model says nothing of single sides")
+    looming = frame.looming
+    rate_hz = std_hz = np.nan
+    if not isinstance(looming, NotUsable):
+        rate_hz, std_hz = looming.inverse_tta_hz, looming.std_hz
+    evidence = HopEvidence.heard(
+        np.array([sides.log_ratios]),
+        np.array([sides.visible]),
+        feature=frame.feature[None],
+        band_log_energy=frame.band_log_energy[None],
+        prominence=np.array([frame.prominence]),
+        looming_hz=np.array([rate_hz]),
+        looming_std_hz=np.array([std_hz]),
+        bearing_rad=np.array([frame.bearing_rad]),
+    )
+    return reader.read(evidence)

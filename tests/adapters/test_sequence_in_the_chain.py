@@ -1,0 +1,103 @@
+"""A model file with a sequence, from sound to snapshot: as streams on disk say it, across a checkpoint."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from made_up_sequence import sequence_model
+
+from worldstate import Context, MicrophoneArray
+from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.abduction.sequence.sequence_model import SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.signature.domain_guard import neutral
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.expert import Expert
+from worldstate.abduction.signature.site_reference import SiteReference
+from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
+from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
+from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
+from worldstate.adapters.files.model_file import Model, read_model, save_model
+from worldstate.adapters.listen import ListenSettings, Step, listen_steps, open_source
+from worldstate.frontend.approach.looming import Looming
+from worldstate.ground.values import NotUsable
+from worldstate.operations.commissioning.commission import stream_evidence
+from worldstate.operations.commissioning.heard_stream import HeardStream
+from worldstate.operations.recordings.hop_table import HopTable
+
+RATE_HZ = 6000
+ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four seconds of noise that swells, and a made-up model of it with a sequence."""
+    place, rng = tmp_path_factory.mktemp("sequence"), np.random.default_rng(0)
+    swelling = 0.01 * np.exp(np.sin(np.arange(4 * RATE_HZ) / RATE_HZ))[:, None]
+    soundfile.write(place / "sound.wav", swelling * rng.standard_normal((4 * RATE_HZ, 3)), RATE_HZ)
+    expert = Expert("mean", np.zeros(60), np.ones(60), 0.2 * rng.normal(size=(6, 60)), np.zeros(6))
+    windows = EnsembleModel(
+        *((expert,), np.full(6, 1 / 6), SiteReference(*np.zeros((3, 60))), np.zeros(60)),
+        domain=domain_of(ARRAY, [RATE_HZ], ["S1"]),
+        classes=WINDOW_CLASSES,
+    )
+    shipped = read_model()
+    model = Model(
+        *(windows, shipped.policies, shipped.provenance),
+        sequence=sequence_model(rng, SequenceAlarm(0.0, 15.0)),
+    )
+    save_model(place / "model.json", model)
+    return place
+
+
+def steps(folder: Path, **options: object) -> list[Step]:
+    source = open_source(folder / "sound.wav", model=folder / "model.json", **options)  # type: ignore[arg-type]
+    return list(listen_steps(source))
+
+
+def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path) -> None:
+    heard, model = steps(folder), read_model(folder / "model.json")
+    frames = [step.frame for step in heard]
+    looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
+    columns = {
+        name: np.array([getattr(one, name) for one in frames])
+        for name in ("feature", "band_log_energy", "prominence", "bearing_rad")
+    }
+    columns["looming_hz"] = np.array([np.nan if one is None else one.inverse_tta_hz for one in looming])
+    columns["looming_std_hz"] = np.array([np.nan if one is None else one.std_hz for one in looming])
+    stream = HeardStream(HopTable(columns), HopTable({}), HopTable({}))
+    assert isinstance(model.signature, EnsembleModel) and model.sequence is not None
+    said = model.sequence.posterior(stream_evidence(model.signature, stream)).groups
+    readings = [step.measurement.sequence for step in heard]
+    assert [isinstance(one, NotUsable) for one in readings] == [True] * 9 + [False] * 22
+    for reading, expected in zip(readings[9:], said[9:], strict=True):
+        assert isinstance(reading, SequenceReading)
+        np.testing.assert_allclose(reading.groups, expected, atol=1e-9)
+    assert all(cue.within is not None for cue in heard[-1].state.cues)
+    assert len(frames[0].band_log_energy) == 16 and LEVEL_BAND_HZ[1] == 0.45 * RATE_HZ
+
+
+def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path) -> None:
+    whole = steps(folder)
+    cut = whole[17]
+    save_checkpoint(folder / "half.json", Checkpoint(cut.world, cut.site, cut.history))
+    rest = steps(folder, resume=read_checkpoint(folder / "half.json"))
+    assert [one.state.to_json() for one in rest] == [one.state.to_json() for one in whole[18:]]
+
+
+def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path) -> None:
+    moving = steps(folder, context=Context(ego_speed_mps=5.0))[-1].state
+    assert moving.no_sequence == NotUsable("the model was made for a standing ego, this one is moving")
+    other = replace(ARRAY, positions_m=1.1 * ARRAY.positions_m)
+    free = steps(folder, array=other, settings=ListenSettings(uncalibrated=True))[-1].state
+    assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")
+    assert {cue.within for cue in (*moving.cues, *free.cues)} == {None}
+
+
+def test_foreign_sounds_say_as_little_of_each_side_as_of_both() -> None:
+    sides = SideEvidence(("left", "right"), (3.0, -1.0), 0.1, 0.1, 0.5)
+    heard = neutral(SignatureEvidence(("left", "right"), (3.0, -1.0), -2.0, 0.5, sides), margin=2.0)
+    assert heard.sides == replace(sides, log_ratios=(1.0, 0.0))
