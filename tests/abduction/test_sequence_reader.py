@@ -21,7 +21,7 @@ def _hops(whole: HopEvidence) -> list[HopEvidence]:
 
 # Longer and shorter than the minute that is kept.
 @given(st.integers(0, 2**32 - 1), st.sampled_from([15, 60, 620]))
-@settings(max_examples=5)
+@settings(max_examples=4)
 def test_hop_by_hop_it_says_what_the_model_says_of_the_whole_stream(seed: int, hops: int) -> None:
     rng = np.random.default_rng(seed)
     model, whole = sequence_model(rng), evidence_of(rng, hops)
@@ -36,12 +36,12 @@ def test_hop_by_hop_it_says_what_the_model_says_of_the_whole_stream(seed: int, h
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=10)
+@settings(max_examples=3)
 def test_a_history_from_a_file_goes_on_to_the_bit(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    model, hops = sequence_model(rng), _hops(evidence_of(rng, 50))
+    model, hops = sequence_model(rng), _hops(evidence_of(rng, 40))
     reader = SequenceReader(model)
-    cut = int(rng.integers(0, 40))
+    cut = int(rng.integers(0, 30))
     for hop in hops[:cut]:
         reader.read(hop)
     written = json.dumps(encode(reader.history), allow_nan=False)

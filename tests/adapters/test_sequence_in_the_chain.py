@@ -1,5 +1,6 @@
 """A model file with a sequence, from sound to snapshot: as streams on disk say it, across a checkpoint."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,10 +35,10 @@ ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "t
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds of noise that swells, and a made-up model of it with a sequence."""
+    """Three seconds of noise that swells, and a made-up model of it with a sequence."""
     place, rng = tmp_path_factory.mktemp("sequence"), np.random.default_rng(0)
-    swelling = 0.01 * np.exp(np.sin(np.arange(4 * RATE_HZ) / RATE_HZ))[:, None]
-    soundfile.write(place / "sound.wav", swelling * rng.standard_normal((4 * RATE_HZ, 3)), RATE_HZ)
+    swelling = 0.01 * np.exp(np.sin(np.arange(3 * RATE_HZ) / RATE_HZ))[:, None]
+    soundfile.write(place / "sound.wav", swelling * rng.standard_normal((3 * RATE_HZ, 3)), RATE_HZ)
     expert = Expert("mean", np.zeros(60), np.ones(60), 0.2 * rng.normal(size=(6, 60)), np.zeros(6))
     windows = EnsembleModel(
         *((expert,), np.full(6, 1 / 6), SiteReference(*np.zeros((3, 60))), np.zeros(60)),
@@ -53,13 +54,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def steps(folder: Path, **options: object) -> list[Step]:
+def steps(folder: Path, **options: object) -> Iterator[Step]:
     source = open_source(folder / "sound.wav", model=folder / "model.json", **options)  # type: ignore[arg-type]
-    return list(listen_steps(source))
+    return listen_steps(source)
 
 
-def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path) -> None:
-    heard, model = steps(folder), read_model(folder / "model.json")
+@pytest.fixture(scope="module")
+def whole(folder: Path) -> list[Step]:
+    return list(steps(folder))
+
+
+def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path, whole: list[Step]) -> None:
+    heard, model = whole, read_model(folder / "model.json")
     frames = [step.frame for step in heard]
     looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
     columns = {
@@ -72,7 +78,7 @@ def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path) -> None:
     assert isinstance(model.signature, EnsembleModel) and model.sequence is not None
     said = model.sequence.posterior(stream_evidence(model.signature, stream)).groups
     readings = [step.measurement.sequence for step in heard]
-    assert [isinstance(one, NotUsable) for one in readings] == [True] * 9 + [False] * 22
+    assert [isinstance(one, NotUsable) for one in readings] == [True] * 9 + [False] * 12
     for reading, expected in zip(readings[9:], said[9:], strict=True):
         assert isinstance(reading, SequenceReading)
         np.testing.assert_allclose(reading.groups, expected, atol=1e-9)
@@ -80,19 +86,18 @@ def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path) -> None:
     assert len(frames[0].band_log_energy) == 16 and LEVEL_BAND_HZ[1] == 0.45 * RATE_HZ
 
 
-def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path) -> None:
-    whole = steps(folder)
-    cut = whole[17]
+def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path, whole: list[Step]) -> None:
+    cut = whole[12]
     save_checkpoint(folder / "half.json", Checkpoint(cut.world, cut.site, cut.history))
     rest = steps(folder, resume=read_checkpoint(folder / "half.json"))
-    assert [one.state.to_json() for one in rest] == [one.state.to_json() for one in whole[18:]]
+    assert [one.state.to_json() for one in rest] == [one.state.to_json() for one in whole[13:]]
 
 
 def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path) -> None:
-    moving = steps(folder, context=Context(ego_speed_mps=5.0))[-1].state
+    moving = next(steps(folder, context=Context(ego_speed_mps=5.0))).state
     assert moving.no_sequence == NotUsable("the model was made for a standing ego, this one is moving")
     other = replace(ARRAY, positions_m=1.1 * ARRAY.positions_m)
-    free = steps(folder, array=other, settings=ListenSettings(uncalibrated=True))[-1].state
+    free = next(steps(folder, array=other, settings=ListenSettings(uncalibrated=True))).state
     assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")
     assert {cue.within for cue in (*moving.cues, *free.cues)} == {None}
 

@@ -58,7 +58,7 @@ def looks(rng: np.random.Generator, hops: int) -> list[CoEvidence]:
 
 
 @given(SEEDS)
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_without_anything_else_it_believes_what_the_sequence_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     said = drawn(rng, 12)
@@ -69,7 +69,7 @@ def test_without_anything_else_it_believes_what_the_sequence_says(seed: int) -> 
 
 
 @given(SEEDS, st.floats(0.0, 1.0))
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_a_context_moves_the_odds_of_those_who_come_and_never_far(seed: int, hidden: float) -> None:
     said = drawn(np.random.default_rng(seed), 1)[0]
     context = Context(priors=Priors(hidden, 0.0, 1.0 - hidden))
@@ -81,7 +81,7 @@ def test_a_context_moves_the_odds_of_those_who_come_and_never_far(seed: int, hid
 
 
 @given(SEEDS)
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_the_mirrored_world_has_the_mirrored_belief(seed: int) -> None:
     rng = np.random.default_rng(seed)
     said, seen = drawn(rng, 15, SequenceAlarm(0.0, 15.0)), looks(rng, 15)
@@ -97,7 +97,7 @@ def test_the_mirrored_world_has_the_mirrored_belief(seed: int) -> None:
 
 
 @given(SEEDS, st.integers(1, 400), st.integers(1, 400))
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_silence_in_two_parts_is_silence_in_one_and_ends_at_the_share(seed: int, one: int, two: int) -> None:
     rng = np.random.default_rng(seed)
     said = drawn(rng, 3)
@@ -109,7 +109,7 @@ def test_silence_in_two_parts_is_silence_in_one_and_ends_at_the_share(seed: int,
 
 
 @given(SEEDS)
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_sources_that_speak_at_once_may_speak_in_either_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     before, now = drawn(rng, 2)
@@ -120,7 +120,7 @@ def test_sources_that_speak_at_once_may_speak_in_either_order(seed: int) -> None
 
 
 @given(SEEDS, st.integers(1, 14))
-@settings(max_examples=5)
+@settings(max_examples=3)
 def test_a_checkpoint_goes_on_to_the_bit(seed: int, cut: int) -> None:
     rng = np.random.default_rng(seed)
     said, seen = drawn(rng, 15, SequenceAlarm(0.0, 15.0)), looks(rng, 15)
