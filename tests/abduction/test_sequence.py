@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sequence import evidence_of
 
@@ -23,6 +23,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 @given(SEEDS)
+@settings(max_examples=20)
 def test_no_hop_knows_what_comes_after_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
     whole = evidence_of(rng, 80)
@@ -31,6 +32,7 @@ def test_no_hop_knows_what_comes_after_it(seed: int) -> None:
 
 
 @given(SEEDS)
+@settings(max_examples=20)
 def test_the_mirrored_street_exchanges_the_sides(seed: int) -> None:
     here = evidence_of(np.random.default_rng(seed), 60)
     there = HopEvidence(
@@ -40,6 +42,7 @@ def test_the_mirrored_street_exchanges_the_sides(seed: int) -> None:
 
 
 @given(SEEDS)
+@settings(max_examples=20)
 def test_three_seconds_are_all_that_is_kept_but_for_the_streets_own_level(seed: int) -> None:
     whole = evidence_of(np.random.default_rng(seed), 70)
     levels = np.array([name in ("level", "loudness") or name.endswith("_above") for name in INPUTS])
