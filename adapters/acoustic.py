@@ -238,7 +238,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         return Measurement(
             stamp_ns=frame.stamp_ns,
             signature=signature,
-            co_evidence=self._ask(frame.stamp_ns, bearing, signature),
+            co_evidence=_answer(self._vision, self._settings, frame.stamp_ns, bearing, signature),
             bearing=bearing,
             approach=approach,
             domain=domain,
@@ -252,12 +252,27 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             return None
         return self._guard.judge(frame.character)
 
-    def _ask(self, stamp_ns: int, bearing: Bearing | NotUsable, signature: SignatureEvidence) -> CoEvidence:
-        if self._vision is None:
-            return Unqueried("no camera")
-        if isinstance(bearing, Bearing) and bearing.std_rad <= self._settings.coarse_std_rad:
-            return self._vision.ask(stamp_ns, bearing)
-        return self._vision.ask(stamp_ns, NotUsable("coarse bearing"), side=_likelier_side(signature))
+
+def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
+    """Return a measurement with the answers of another camera; what was heard stays as it is."""
+    stamp_ns = measurement.stamp_ns
+    answer = _answer(vision, AcousticSettings(), stamp_ns, measurement.bearing, measurement.signature)
+    sightings = vision.sightings(stamp_ns) if vision else ()
+    return replace(measurement, co_evidence=answer, sightings=sightings)
+
+
+def _answer(
+    vision: CoEvidenceChannel | None,
+    settings: AcousticSettings,
+    stamp_ns: int,
+    bearing: Bearing | NotUsable,
+    signature: SignatureEvidence,
+) -> CoEvidence:
+    if vision is None:
+        return Unqueried("no camera")
+    if isinstance(bearing, Bearing) and bearing.std_rad <= settings.coarse_std_rad:
+        return vision.ask(stamp_ns, bearing)
+    return vision.ask(stamp_ns, NotUsable("coarse bearing"), side=_likelier_side(signature))
 
 
 def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotUsable:

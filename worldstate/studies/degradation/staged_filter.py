@@ -1,20 +1,17 @@
 """Filter one recording in every condition: its sound heard dry and in the rain, its camera as it was seen."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.camera_health import DegradationLog
 from worldstate.adapters.camera.detector import overlaps
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings, moving_boxes
 from worldstate.adapters.listen import Source, measure_steps, unoccluded_sector
 from worldstate.core.filter import WorldFilter
-from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.measurement.measurement import Measurement
@@ -27,8 +24,7 @@ from .looks import READINGS, StagedDetector, degradation_in, detections_in
 from .rain import level_rms, rained
 
 # Changes whenever the same sound and looks would give other beliefs.
-VERSION = 1
-Heard = tuple[AcousticFrame, Measurement]
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +76,8 @@ def filter_in_conditions(
 
     with one_blas_thread():
         levels = sorted({state.sound_level for state in conditions})
-        heard = {level: list(measure_steps(at(level))) for level in levels}
-        reference = _reference(source, [frame.stamp_ns for frame, _ in next(iter(heard.values()))])
+        heard = {level: [measured for _, measured in measure_steps(at(level))] for level in levels}
+        reference = _reference(source, [one.stamp_ns for one in next(iter(heard.values()))])
         return {
             one.detector.name: joined(
                 _filtered(source, one, heard[state.sound_level], reference, state) for state in conditions
@@ -106,18 +102,18 @@ def by_condition(filtered: HopTable) -> dict[str, HopTable]:
 def _filtered(
     source: Source,
     camera: Camera,
-    measured: Sequence[Heard],
+    measured: Sequence[Measurement],
     reference: Sequence[FloatArray],
     state: Condition,
 ) -> HopTable:
-    stamps_ns = [frame.stamp_ns for frame, _ in measured]
+    stamps_ns = [one.stamp_ns for one in measured]
     query, found, d = None, np.zeros(len(measured), bool), np.ones(len(measured))
     if state.family != OFF:
         read = degradation_in(camera.readings, state.camera.name, camera.rates)
         query = camera.look(source, state.camera.name, read)
         found, d = _found(reference, query, stamps_ns), np.array([read(stamp_ns) for stamp_ns in stamps_ns])
-    asked = list(_asked(source, measured, query))
-    there = [any(sighting.moving for sighting in m.sightings) for _, m in measured]
+    asked = [asked_again(one, query) for one in measured]
+    there = [any(sighting.moving for sighting in m.sightings) for m in measured]
     return hop_stream(asked, name=state.name, there=there).replace(
         presence=np.array(_presence(source, asked)),
         found=found,
@@ -141,23 +137,6 @@ def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Seque
         (overlaps(there, boxes) >= least).any() for there, boxes in zip(reference, detected, strict=True)
     ]
     return np.array(found, dtype=bool)
-
-
-class _Again:
-    """Repeats the evidence of every hop in the same order."""
-
-    def __init__(self, measured: Sequence[Heard]) -> None:
-        self._said = iter([measurement.signature for _, measurement in measured])
-
-    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
-        return next(self._said)
-
-
-def _asked(source: Source, measured: Sequence[Heard], query: VisionQuery | None) -> Iterator[Measurement]:
-    """Query the camera again at every hop."""
-    # Frames are only interpreted, so the rate of the sound does not matter here.
-    adapter = AcousticAdapter(source.array, 48_000.0, _Again(measured), vision=query)
-    return (adapter.interpret(frame) for frame, _ in measured)
 
 
 def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float]:
