@@ -208,8 +208,8 @@ DRAWN_ONLY = (Phase.explicit, Phase.reuse, Phase.generate)  # each takes half a 
 @given(st.floats(1.2, 1.8), st.floats(3.0, 4.5), st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
 def test_level_has_no_steps_from_behind_the_ego_through_the_mouth_into_an_arm(beside, beyond, side, arm):
     """1.5 m/s: small ones until the corner's shadow falls on the array, which is a steep edge itself."""
-    # Draws have .8 to 1.1 dB at most, one in many had 1.54: with steps half as long it was gone, where a click
-    # would have stayed.
+    # Draws have .8 to 1.1 dB at most, one in many had 1.54: with steps half as long it was gone, where a
+    # click would have stayed.
     across, lane = side * beside, STREET.corner_ahead_m + beyond
     turn = (lane - 0.4, across + arm * 0.2), (lane, arm * 3.2)
     points = ((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0))
