@@ -84,6 +84,11 @@ class MicrophoneArray:
         return np.asarray(self.positions_m - self.positions_m.mean(axis=0))
 
     @property
+    def middle(self) -> int:
+        """Channel nearest to the centre."""
+        return int(np.linalg.norm(self.centred_m, axis=1).argmin())
+
+    @property
     def aperture_m(self) -> FloatArray:
         """Extent along x, y and z, shape (3,), metres."""
         return np.asarray(np.ptp(self.positions_m, axis=0))

@@ -36,6 +36,19 @@ class NotUsable:
     reason: str
 
 
+def significant(values: FloatArray, figures: int) -> FloatArray:
+    """Round to so many significant figures: what a file of coefficients need not hold.
+
+    Examples
+    --------
+    >>> significant(np.array([1234.5678, 0.00012345678]), 3)
+    array([1.23e+03, 1.23e-04])
+    """
+    return np.array([float(f"{value:.{figures}g}") for value in values.ravel().tolist()]).reshape(
+        values.shape
+    )
+
+
 def wrap_angle(angle_rad: AngleT) -> AngleT:
     """Wrap an angle in radians into (-pi, pi].
 

@@ -20,11 +20,6 @@ class Microphones:
     gains: FloatArray  # shape (M,): About 1
     sample_rate_hz: float
 
-    @property
-    def middle(self) -> int:
-        """Number of the one nearest to the middle of all."""
-        return int(np.linalg.norm(self.positions_m - self.positions_m.mean(axis=0), axis=1).argmin())
-
 
 def draw_microphones(
     settings: StreamSettings, array: MicrophoneArray, rng: np.random.Generator

@@ -69,6 +69,11 @@ class StreamSettings:
             )
 
     @property
+    def name(self) -> str:
+        """Site, traffic and seed."""
+        return f"{self.site.name}-{self.traffic.name}-{self.seed}"
+
+    @property
     def duration_s(self) -> float:
         """Length in seconds."""
         return 60.0 * self.minutes

@@ -102,7 +102,7 @@ def write_stream(
     """
     in_range("jobs", jobs, 1, 256)
     folder = Path(root)
-    target = folder / f"{settings.site.name}-{settings.traffic.name}-{settings.seed}"
+    target = folder / settings.name
     refuse_foreign(target)
     folder.mkdir(parents=True, exist_ok=True)
     stream = draw_stream(settings, ovad_array() if array is None else array)
@@ -133,7 +133,7 @@ def _write_sound(
     with sound_writer(path, settings.samples, channels, rate) as file:
         for block in blocks:
             file.write(stream.recorded(block))
-            heard.add(block.pressure_pa[microphones.middle])
+            heard.add(block.pressure_pa[stream.array.middle])
             loudness |= block.loudness_db
             if progress is not None:
                 progress(block.pressure_pa.shape[1] / rate)

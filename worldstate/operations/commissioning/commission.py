@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.parallel import in_processes
 from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
+from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
 
 from .guard_training import train_guard
@@ -31,7 +32,7 @@ from .heard_stream import HeardStream, hear_recording, hear_stream
 from .open_field import N_OPEN, open_field_features, open_field_windows
 from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
-from .stream_exam import HOP_S, ExaminedStream, alarm_for
+from .stream_exam import ExaminedStream, alarm_for
 from .stream_labels import stream_truth
 from .stream_windows import stream_windows
 from .window_model import posteriors_along, window_model
@@ -58,7 +59,7 @@ def _heard(array: MicrophoneArray, folder: Path, settings: StreamSettings) -> He
     # Whatever else is heard under the same name, by another array or preset, is another file.
     made_with = json.dumps([asdict(settings), array.positions_m.tolist()], default=str, sort_keys=True)
     digest = hashlib.sha256(made_with.encode()).hexdigest()[:12]
-    path = folder / f"{settings.site.name}-{settings.traffic.name}-{settings.seed}-{digest}.npz"
+    path = folder / f"{settings.name}-{digest}.npz"
     if not path.is_file():
         hear_stream(settings, array).save(path)
     return HeardStream.load(path)
@@ -79,21 +80,13 @@ def stream_evidence(model: EnsembleModel, heard: HeardStream) -> HopEvidence:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LearnedSequence:
-    """A sequence model, its alarm, and what it scored on streams of junctions that it had not learned."""
-
-    model: SequenceModel
-    examined: tuple[ExaminedStream, ...]
-
-
 def learn_sequence(
     streams: Sequence[HeardStream],
     fit_windows: FitWindows,
     onsets_per_hour: float,
     rng: np.random.Generator,
     on_step: Callable[[], None] = lambda: None,
-) -> LearnedSequence:
+) -> SequenceModel:
     """Train a sequence model on streams, junction by junction out of fold.
 
     `fit_windows` makes a window model of some of the streams. Evidence of a stream always comes from one that
@@ -109,23 +102,18 @@ def learn_sequence(
                 evidence = stream_evidence(windows, one)
                 labelled[number] = LabelledStream(evidence, stream_truth(one), weights[number])
         on_step()
-    margins, left_out = [], []
+    margins, quiet = [], []
     for fold in sorted(set(folds)):
-        inside = [labelled[i] for i, at in enumerate(folds) if at != fold]
+        model = train_sequence([labelled[i] for i, at in enumerate(folds) if at != fold], rng)
         outside = [i for i, at in enumerate(folds) if at == fold]
-        model = train_sequence(inside, rng)
         margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
-        left_out += [(i, model.posterior(labelled[i].evidence)) for i in outside]
+        free = [i for i in outside if streams[i].hops.about["traffic"] == HAZARD_FREE]
+        quiet += [model.posterior(labelled[i].evidence) for i in free]
         on_step()
-    quiet = [posterior for i, posterior in left_out if streams[i].hops.about["traffic"] == HAZARD_FREE]
     alarm, margin_s = alarm_for(quiet, onsets_per_hour), float(np.mean(margins))
-    final = replace(train_sequence(list(labelled.values()), rng), margin_s=margin_s, alarm=alarm)
+    final = train_sequence(list(labelled.values()), rng)
     on_step()
-    examined = [
-        ExaminedStream(streams[i], labelled[i].truth, replace(posterior, margin_s=margin_s), alarm)
-        for i, posterior in sorted(left_out, key=lambda one: one[0])
-    ]
-    return LearnedSequence(final, tuple(examined))
+    return replace(final, margin_s=margin_s, alarm=alarm)
 
 
 def _folds(streams: Sequence[HeardStream]) -> list[int]:
@@ -175,16 +163,12 @@ def commission(
     rate_hz = streams[0].hops.about["sample_rate_hz"]
     domain = domain_of(array, [rate_hz], [_site(one) for one in streams])
     fit = partial(_windows_learned, real, open_field, domain)
-    learned = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
+    sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1, method="worldstate"),
-        dataset=UNFIT
-        if settings.quick
-        else SIMULATED
-        if real is None
-        else f"{SIMULATED} and labelled windows",
+        dataset=_learned_from(settings, real),
         group="static",
         excluded_lists=settings.leave_out,
         simulated=beside,
@@ -192,7 +176,7 @@ def commission(
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out.
     guard = None if settings.quick else train_guard(array, streams, rng)
-    made = replace(model, sequence=learned.model, guard=guard)
+    made = replace(model, sequence=sequence, guard=guard)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
 
 
@@ -217,6 +201,12 @@ def _parts(model: Model) -> tuple[EnsembleModel, SequenceModel]:
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
         raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
     return model.signature, model.sequence
+
+
+def _learned_from(settings: CommissionSettings, real: FeatureTable | None) -> str:
+    if settings.quick:
+        return UNFIT
+    return SIMULATED if real is None else f"{SIMULATED} and labelled windows"
 
 
 def _windows_learned(

@@ -8,7 +8,6 @@ import scipy.signal
 
 from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
-from worldstate.adapters.simulation.scene.junction import SITES, drawn_site, site
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.sound.receiver import standing_m
 from worldstate.adapters.simulation.stream.ambience import ambience_piece, stream_ambience
@@ -23,6 +22,7 @@ from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArr
 from worldstate.ground.values import NotUsable
 
 from .heard_stream import HeardStream
+from .plan import junction_named
 from .stream_windows import hop_labels
 
 # What the guard says of the simulator's kinds. Gusts blow at microphones that it does not hear: the monitor
@@ -69,12 +69,8 @@ def sound_rows(
     array: MicrophoneArray, site_name: str, sample_rate_hz: float, rng: np.random.Generator
 ) -> GuardRows:
     """Render a sound of every kind at a site, as the middle microphone hears it; return its audible hops."""
-    settings = StreamSettings(
-        site(site_name) if site_name in SITES else drawn_site(site_name),
-        minutes=1.0,
-        sample_rate_hz=sample_rate_hz,
-    )
-    position = standing_m(array)[np.linalg.norm(array.centred_m, axis=1).argmin()]
+    settings = StreamSettings(junction_named(site_name), minutes=1.0, sample_rate_hz=sample_rate_hz)
+    position = standing_m(array)[array.middle]
     kinds = (*FOREIGN, *SIGNALS)
     return GuardRows.joined(
         [

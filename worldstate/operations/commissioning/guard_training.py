@@ -9,6 +9,7 @@ from worldstate.abduction.signature.standardisation import standardisation
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND, MEASURES
 from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.values import significant
 
 from .foreign_sounds import FOREIGN, SIGNALS, STREET, GuardRows, sound_rows, street_rows
 from .heard_stream import HeardStream
@@ -26,7 +27,7 @@ _OF_SIGNALS_ONLY = ("line", "line varies", "line holds")
 # in .58 of its hops and a tone in .27, at .97 in .37 and .11, and every tenth hop of known sirens is foreign.
 _REACH = 0.98
 _OWN_SPREAD = 0.1  # Share of the diagonal in the covariance of the signals
-_DIGITS = 5  # Of a coefficient in a file
+_FIGURES = 5  # Of a coefficient in the file, which is a fifth as long
 
 
 def guard_rows(
@@ -78,12 +79,12 @@ def fit_guard(rows: GuardRows, threshold: float = 0.0) -> DomainGuard:
         measures=MEASURES,
         foreign=foreign,
         signals=signals,
-        weights=_rounded(weights),
-        biases=_rounded(biases),
+        weights=significant(weights, _FIGURES),
+        biases=significant(biases, _FIGURES),
         threshold=threshold,
         kinds_of_signals=tuple(SIGNALS[kind] for kind in kinds),
-        centres=_rounded(centres),
-        whitening=_rounded(whitening),
+        centres=significant(centres, _FIGURES),
+        whitening=significant(whitening, _FIGURES),
     )
 
 
@@ -132,8 +133,3 @@ def _reach(rows: GuardRows, kinds: Sequence[str]) -> tuple[FloatArray, FloatArra
 
 def _of_all() -> BoolArray:
     return ~np.isin(MEASURES, _OF_SIGNALS_ONLY)
-
-
-def _rounded(values: FloatArray) -> FloatArray:
-    """Keep the leading digits: a file is a fifth as long."""
-    return np.array([float(f"{value:.{_DIGITS}g}") for value in values.ravel()]).reshape(values.shape)

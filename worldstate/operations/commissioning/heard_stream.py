@@ -5,7 +5,7 @@ The sound itself is not kept: an hour of 56 channels at 6 kHz is 5 GB, what is h
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +59,7 @@ def hear_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream
     }
     with closing(stream.blocks()) as blocks:
         samples = _recorded(stream, blocks, loudness)
-        hops = _heard_hops(samples, array, settings.sample_rate_hz, _name(settings), about)
+        hops = _heard_hops(samples, array, settings.sample_rate_hz, settings.name, about)
     return HeardStream(hops, _vehicles(stream.vehicles), _rows(stream.vehicles, loudness))
 
 
@@ -89,11 +89,10 @@ def _heard_hops(
     about: Mapping[str, object],
 ) -> HopTable:
     front_end = FrontEnd(array, sample_rate_hz, listening_settings(sample_rate_hz))
-    nearest = int(np.linalg.norm(array.centred_m, axis=1).argmin())
     frames: list[AcousticFrame] = []
     middle: list[Float32Array] = []
     for samples in blocks:
-        middle.append(samples[:, nearest].copy())
+        middle.append(samples[:, array.middle].copy())
         frames += front_end.process(samples)
     if not frames:
         raise InvalidArgumentError(f"{name}: expected more than a second of sound")
@@ -103,28 +102,23 @@ def _heard_hops(
 def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
     """Return what streams are listened to with: everything that evidence reads, microphones trusted."""
     # Simulated microphones do not fail, and watching them takes a third of the time.
-    return replace(
-        FrontEndSettings(nfft=feature_nfft(sample_rate_hz), tone_band_hz=ENGINE_BAND_HZ),
+    return FrontEndSettings(
+        nfft=feature_nfft(sample_rate_hz),
+        tone_band_hz=ENGINE_BAND_HZ,
         level_band_hz=LEVEL_BAND_HZ,
         watch_channels=False,
     )
 
 
-def _name(settings: StreamSettings) -> str:
-    return f"{settings.site.name}-{settings.traffic.name}-{settings.seed}"
-
-
 def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.ndarray]:
     looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
     tones = [one.tone if isinstance(one.tone, ToneReading) else None for one in frames]
-    peaks = [[peak.azimuth_rad for peak in one.peaks[1:2]] or [np.nan] for one in frames]
     return {
         "time_s": np.array([one.stamp_ns for one in frames]) * 1e-9,
         "feature": np.array([one.feature for one in frames], np.float32),
         "bearing_rad": np.array([one.bearing_rad for one in frames]),
         "bearing_std_rad": np.array([one.bearing_std_rad for one in frames]),
         "prominence": np.array([one.prominence for one in frames]),
-        "second_rad": np.array(peaks)[:, 0],
         "band_log_energy": np.array([one.band_log_energy for one in frames], np.float32),
         "looming_hz": np.array([np.nan if one is None else one.inverse_tta_hz for one in looming]),
         "looming_std_hz": np.array([np.nan if one is None else one.std_hz for one in looming]),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from worldstate.adapters.simulation.scene.junction import SITES, drawn_site, site
+from worldstate.adapters.simulation.scene.junction import SITES, Site, drawn_site, site
 from worldstate.adapters.simulation.scene.settings import rate_for
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.adapters.simulation.stream.traffic import traffic_named
@@ -90,11 +90,16 @@ def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     ]
 
 
+def junction_named(name: str) -> Site:
+    """Return one of the five junctions, or the drawn one of another name."""
+    return site(name) if name in SITES else drawn_site(name)
+
+
 def _stream(
     name: str, traffic: str, minutes: float, seed: int, settings: CommissionSettings
 ) -> StreamSettings:
     return StreamSettings(
-        site(name) if name in SITES else drawn_site(name),
+        junction_named(name),
         minutes,
         seed,
         traffic_named(traffic),

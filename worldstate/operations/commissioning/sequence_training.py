@@ -10,6 +10,7 @@ from worldstate.abduction.sequence.sequence_inputs import HopEvidence, sequence_
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S, SequenceModel
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import significant
 
 from .stream_labels import StreamTruth
 
@@ -19,6 +20,7 @@ ROUNDS, LEAVES, RATE, RIDGE, INPUTS_EACH = 60, 8, 0.1, 20.0, 0.3
 SMALLEST_LEAF = 300
 EVERY_HOPS = 3  # Neighbours say the same thing
 COVERAGE = 0.9
+_FIGURES = 7  # Of a number in the file: it is half as long, and no input is known better
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,12 +84,8 @@ def exported(machine: object, check: FloatArray) -> BoostedTrees:
     trees = BoostedTrees(split, threshold, yes, no, value, classes[[k for k, _ in found]], baseline)
     if not np.allclose(trees.scores(check)[:, classes], machine.decision_function(check), atol=1e-6):  # type: ignore[attr-defined]
         raise WorldstateError("scikit-learn keeps its trees in another way than 1.5 to 1.9 did: not exported")
-    return replace(trees, threshold=_rounded(trees.threshold), value=_rounded(trees.value))
-
-
-def _rounded(values: FloatArray) -> FloatArray:
-    """Return values of seven figures: files are half as long, no input is known better."""
-    return np.array([float(f"{value:.7g}") for value in values.ravel().tolist()]).reshape(values.shape)
+    threshold, value = (significant(one, _FIGURES) for one in (trees.threshold, trees.value))
+    return replace(trees, threshold=threshold, value=value)
 
 
 def calibrated_margin_s(model: SequenceModel, streams: Sequence[LabelledStream]) -> float:

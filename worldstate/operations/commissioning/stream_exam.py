@@ -32,11 +32,11 @@ from worldstate.operations.recordings.advisories import (
     SLACK_S,
     rising_edges,
 )
+from worldstate.operations.recordings.hop_stream import HOP_S
 
 from .heard_stream import HeardStream
 from .stream_labels import StreamTruth
 
-HOP_S = 0.1
 TOGETHER_S, FOLLOWING_S, AFTER_S = 4.0, 6.0, 6.0
 # Hardly heard before they are seen; told apart, with no target of their own.
 QUIET_KINDS = ("bicycle", "scooter", "electric")
