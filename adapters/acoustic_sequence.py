@@ -6,6 +6,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
+from worldstate.adapters.files.acoustic_domain import UNFIT
 from worldstate.adapters.files.model_file import Model
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.ground.values import NotUsable
@@ -20,6 +21,8 @@ def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceM
         return None
     if uncalibrated:
         return NotUsable("uncalibrated: times are stated of the array that the model was made for")
+    if not model.provenance.fit_for_use:
+        return NotUsable(UNFIT)
     if model.domain is None:
         return NotUsable("the model names no array that it was made for")
     motion = "moving" if moving_ego else "standing"

@@ -400,7 +400,7 @@ def _heard(
     model = given if isinstance(given, Model) else read_model(given, moving_ego=moves)
     policy = _policy(model, settings.alpha)
     heard_by = _array(sound, array, model, settings)
-    stated = not settings.uncalibrated and states_budget(model.domain, heard_by, moves)
+    stated = not settings.uncalibrated and states_budget(model, heard_by, moves)
     source = Source(
         sound=recording.audio_path if recording else sound,
         array=heard_by,

@@ -21,10 +21,13 @@ from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import IndexArray
 
 from .array_match import array_difference, microphone_order
+from .model_file import Model
 
 # Only `run` goes on with a model of another array; the other commands have no such option to name.
 TRAIN = "Train a model for it (extract-features, train)"
 WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
+
+UNFIT = "the model says that it is unfit for use"
 
 _LOG = logging.getLogger(__name__)
 
@@ -71,7 +74,7 @@ def array_of(domain: ModelDomain) -> MicrophoneArray:
     return MicrophoneArray(domain.positions_m, domain.array)
 
 
-def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego: bool) -> bool:
+def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> bool:
     """Return whether a model's thresholds hold for an array and the ego's motion; a word where not.
 
     Raises
@@ -79,6 +82,7 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
     OutOfDomainError
         If the model was made for another array.
     """
+    domain = model.domain
     if domain is None:
         _LOG.warning("the model names no array that it was made for: no budget is stated")
         return False
@@ -87,7 +91,9 @@ def states_budget(domain: ModelDomain | None, array: MicrophoneArray, moving_ego
         does, made_for = "moves" if moving_ego else "stands", domain.ego_motion
         _LOG.warning("the model was made for a %s ego, this one %s: no budget is stated", made_for, does)
         return False
-    return True
+    if not model.provenance.fit_for_use:
+        _LOG.warning("%s: no budget is stated", UNFIT)
+    return model.provenance.fit_for_use
 
 
 def feature_order(

@@ -41,6 +41,8 @@ class Provenance:
         Names of the lists whose recordings were left out.
     figures : mapping of str to float
         What out-of-fold windows scored during training.
+    fit_for_use : bool
+        False of a model that was made to try a command out: no budget is stated with it.
 
     Examples
     --------
@@ -56,6 +58,7 @@ class Provenance:
     training_recordings: tuple[str, ...]
     excluded_lists: tuple[str, ...] = ()
     figures: Mapping[str, float] = field(default_factory=dict)
+    fit_for_use: bool = field(default=True, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +84,7 @@ class Model:
     """
 
     LAYOUT: ClassVar = Layout(
-        "worldstate.Model", "1.4.0", order="provenance signature policies sequence guard"
+        "worldstate.Model", "1.5.0", order="provenance signature policies sequence guard"
     )
 
     signature: AnySignature

@@ -146,6 +146,21 @@ def test_uncalibrated_listening_states_no_budget(alone: Path) -> None:
     assert not json.loads(next(listen(alone, settings=chosen)).to_json())["calibrated"]
 
 
+def test_a_model_unfit_for_use_states_no_budget_and_keeps_saying_so(
+    alone: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, path = read_model(), tmp_path / "quick.json"
+    save_model(path, replace(model, provenance=replace(model.provenance, fit_for_use=False)))
+    state = next(listen(alone, model=path))
+    assert not state.calibrated and [cue.alpha for cue in state.cues] == [None, None]
+    assert "unfit for use" in caplog.text
+    assert main(["model", str(path)]) == 0
+    assert "unfit for use" in capsys.readouterr().out
+    # Nor is it taken for another array than its own.
+    with pytest.raises(OutOfDomainError):
+        open_source(alone, model=path, array=roof_array_56())
+
+
 def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Path, tmp_path: Path) -> None:
     folder = tmp_path / "DA1" / "left" / "1_05_0000"
     folder.mkdir(parents=True)

@@ -99,7 +99,11 @@ def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path)
     other = replace(ARRAY, positions_m=1.1 * ARRAY.positions_m)
     free = next(steps(folder, array=other, settings=ListenSettings(uncalibrated=True))).state
     assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")
-    assert {cue.within for cue in (*moving.cues, *free.cues)} == {None}
+    model = read_model(folder / "model.json")
+    unfit = replace(model, provenance=replace(model.provenance, fit_for_use=False))
+    quick = next(listen_steps(open_source(folder / "sound.wav", model=unfit))).state
+    assert quick.no_sequence == NotUsable("the model says that it is unfit for use")
+    assert {cue.within for cue in (*moving.cues, *free.cues, *quick.cues)} == {None}
 
 
 def test_foreign_sounds_say_as_little_of_each_side_as_of_both() -> None:

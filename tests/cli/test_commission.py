@@ -26,7 +26,7 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     model = read_model(out)
     assert model.sequence is not None and model.sequence.alarm is not None
     assert model.domain is not None and len(model.domain.positions_m) == 4
-    assert "unfit" in model.provenance.dataset
+    assert not model.provenance.fit_for_use
     told = json.loads(report.read_text())
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
     heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}

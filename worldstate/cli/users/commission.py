@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             on_step=bar.advance,
         )
     save_model(arguments.out, model)
-    report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": not settings.quick}
+    report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": model.provenance.fit_for_use}
     if arguments.exam:
         with progress_bar("exam", len(exam_streams(settings))) as bar:
             examined = exam_of(array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance)

@@ -40,7 +40,7 @@ from .window_model import posteriors_along, window_model
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 2
 LEAST_ONSETS = 3.0
-SIMULATED, UNFIT = "simulated streets", "simulated streets, a few minutes: unfit for use"
+SIMULATED = "simulated streets"
 # Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
 
@@ -168,7 +168,7 @@ def commission(
     model = train_model(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1, method="worldstate"),
-        dataset=_learned_from(settings, real),
+        dataset=SIMULATED if real is None else f"{SIMULATED} and labelled windows",
         group="static",
         excluded_lists=settings.leave_out,
         simulated=beside,
@@ -176,7 +176,8 @@ def commission(
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out.
     guard = None if settings.quick else train_guard(array, streams, rng)
-    made = replace(model, sequence=sequence, guard=guard)
+    provenance = replace(model.provenance, fit_for_use=not settings.quick)
+    made = replace(model, provenance=provenance, sequence=sequence, guard=guard)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
 
 
@@ -201,12 +202,6 @@ def _parts(model: Model) -> tuple[EnsembleModel, SequenceModel]:
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
         raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
     return model.signature, model.sequence
-
-
-def _learned_from(settings: CommissionSettings, real: FeatureTable | None) -> str:
-    if settings.quick:
-        return UNFIT
-    return SIMULATED if real is None else f"{SIMULATED} and labelled windows"
 
 
 def _windows_learned(

@@ -1,5 +1,6 @@
 """The card of a model: what it was made of, what it was made for, and what it was not."""
 
+from worldstate.adapters.files.acoustic_domain import UNFIT
 from worldstate.adapters.files.model_file import Model
 
 # Of the coefficients that ship; the data that a user trains on has a licence of its own.
@@ -58,9 +59,9 @@ def _made_for(model: Model) -> dict[str, object]:
 
 def _limits(model: Model) -> list[str]:
     """Say what the model was not made for."""
-    domain = model.domain
+    domain, unfit = model.domain, [] if model.provenance.fit_for_use else [f"{UNFIT}: no budget is stated"]
     if domain is None:
-        return [UNNAMED]
+        return [*unfit, UNNAMED]
     low, high = domain.sample_rate_hz
     limits = [
         "another array: refused; microphones more than 1 mm elsewhere count as another",
@@ -71,4 +72,4 @@ def _limits(model: Model) -> list[str]:
     if domain.ego_motion != "any":
         other = "moving" if domain.ego_motion == "standing" else "standing"
         limits.insert(2, f"a {other} ego: no budget is stated")
-    return limits
+    return [*unfit, *limits]
