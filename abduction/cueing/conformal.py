@@ -89,6 +89,27 @@ def conformal_threshold(
     return _smallest_threshold(losses, allowed)
 
 
+def risk_controlling(losses: FloatArray, alpha: float, largest: float) -> int:
+    r"""Return how many of ever lower thresholds keep the expected loss of a unit not yet seen within alpha.
+
+    .. math:: \max \Big\{ k : \frac{1}{n + 1} \Big( L + \sum_{j=1}^n \max_{i \le k} \min(L_{ji}, L) \Big)
+              \le \alpha \Big\}
+
+    Shapes: losses (n, thresholds), of unit j at threshold i, counted up to the largest, L.
+
+    Source: A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. (4).
+
+    Examples
+    --------
+    >>> losses = np.array([[0.0, 1.0, 4.0], [0.0, 0.0, 1.0]])
+    >>> [risk_controlling(losses, alpha, largest=3.0) for alpha in (0.9, 1.0, 1.5, 3.0)]
+    [0, 1, 2, 3]
+    """
+    # Onsets are no monotone loss, since alarms that grow together are one: what counts is the worst so far.
+    worst = np.maximum.accumulate(np.minimum(losses, largest), axis=1)
+    return int(np.sum(worst.sum(axis=0) + largest <= alpha * (len(losses) + 1) * (1.0 + 1e-9)))
+
+
 def recordings_needed(alpha: float, confidence: float | None = None) -> int:
     r"""Return the fewest hazard-free recordings from which a conformal threshold is finite.
 

@@ -2,13 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_exam import (
+    LOUDEST,
     ExaminedStream,
+    alarm_elsewhere,
     alarm_for,
     approaches,
     auroc_before,
@@ -107,6 +110,21 @@ def test_figures_are_those_counted_by_hand() -> None:
     assert figures["lead_missed_as_0_s"] == pytest.approx(0.75 * float(figures["lead_s"] or 0.0))
 
 
+def test_the_worst_junction_stands_beside_the_mean() -> None:
+    good = [examined(heard(VEHICLES[:2]), [(8.0, 9.9, 0), (20.0, 21.9, 1)]), examined(heard([]), [])]
+    bad = [
+        examined(heard(VEHICLES[:2], site="SA1"), [(8.0, 9.9, 0)]),
+        examined(heard([], site="SA1"), [(20.0, 20.5, 1)]),
+    ]
+    figures = examine([*good, *bad])
+    assert (figures["detected"], figures["detected_worst_junction"]) == (0.75, 0.5)
+    assert figures["onsets_per_hour_worst_junction"] == pytest.approx(
+        2.0 * float(figures["onsets_per_hour"] or 0)
+    )
+    none = examine(good[:1])
+    assert none["onsets_per_hour_worst_junction"] is None and none["detected_worst_junction"] == 1.0
+
+
 def test_curves_say_who_is_warned_by_then() -> None:
     streams = [examined(heard(VEHICLES[:2]), [(7.0, 9.9, 0), (21.0, 21.9, 1)]), examined(heard([]), [])]
     before_s = np.array([0.0, 0.5, 2.0, 4.0])
@@ -114,15 +132,38 @@ def test_curves_say_who_is_warned_by_then() -> None:
     np.testing.assert_allclose(auroc_before(streams, before_s), [1.0, 1.0, 0.75, 0.5], atol=0.01)
 
 
+def _made_up(rng: np.random.Generator, streams: int) -> list[SequencePosterior]:
+    """Return hazard-free streams of half a minute, at some junctions louder ones."""
+    peaks = rng.uniform(0.05, 0.5, streams)
+    return [SequencePosterior(rng.dirichlet(np.full(len(GROUPS), peak), (300, 2)), 0.0) for peak in peaks]
+
+
+def _onsets_per_hour(alarm: SequenceAlarm, stream: SequencePosterior) -> float:
+    raised = alarm.raised(stream).any(axis=1)
+    return int((raised & ~np.concatenate([[False], raised[:-1]])).sum()) * 120.0
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 6), st.floats(60.0, 1200.0))
+def test_an_alarm_set_at_other_junctions_keeps_the_onsets_it_was_set_for(
+    seed: int, junctions: int, rate: float
+) -> None:
+    # Whatever the streams, over all ways to leave one out, which is what exchangeable junctions are.
+    streams = _made_up(np.random.default_rng(seed), junctions)
+    left_out = [(alarm_elsewhere(streams[:i] + streams[i + 1 :], rate), streams[i]) for i in range(junctions)]
+    onsets = [min(_onsets_per_hour(alarm, stream), LOUDEST * rate) for alarm, stream in left_out]
+    assert np.mean(onsets) <= rate * (1.0 + 1e-9)
+
+
+def test_one_junction_sets_no_alarm_for_others() -> None:
+    with pytest.raises(InvalidArgumentError, match="2 junctions at least, got 1"):
+        alarm_elsewhere(_made_up(np.random.default_rng(0), 1), 20.0)
+
+
 @given(st.integers(0, 2**32 - 1), st.floats(5.0, 200.0))
 def test_an_alarm_keeps_the_onsets_it_was_set_for_on_the_streams_it_was_set_on(
     seed: int, rate: float
 ) -> None:
-    rng = np.random.default_rng(seed)
-    quiet = [SequencePosterior(rng.dirichlet(np.full(len(GROUPS), 0.2), (600, 2)), 0.0) for _ in range(3)]
+    quiet = _made_up(np.random.default_rng(seed), 3)
     alarm = alarm_for(quiet, rate)
-    onsets = 0
-    for one in quiet:
-        raised = alarm.raised(one).any(axis=1)
-        onsets += int((raised & ~np.concatenate([[False], raised[:-1]])).sum())
-    assert onsets <= rate * 1800 * 0.1 / 3600.0
+    assert np.mean([_onsets_per_hour(alarm, one) for one in quiet]) <= rate

@@ -32,7 +32,7 @@ from .heard_stream import HeardStream, hear_recording, hear_stream
 from .open_field import N_OPEN, open_field_features, open_field_windows
 from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
-from .stream_exam import ExaminedStream, alarm_for
+from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
 from .stream_labels import stream_truth
 from .stream_windows import stream_windows
 from .window_model import posteriors_along, window_model
@@ -110,7 +110,7 @@ def learn_sequence(
         free = [i for i in outside if streams[i].hops.about["traffic"] == HAZARD_FREE]
         quiet += [model.posterior(labelled[i].evidence) for i in free]
         on_step()
-    alarm, margin_s = alarm_for(quiet, onsets_per_hour), float(np.mean(margins))
+    alarm, margin_s = alarm_elsewhere(quiet, onsets_per_hour), float(np.mean(margins))
     final = train_sequence(list(labelled.values()), rng)
     on_step()
     return replace(final, margin_s=margin_s, alarm=alarm)
