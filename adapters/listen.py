@@ -32,7 +32,7 @@ from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, feature_nfft
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
@@ -73,7 +73,8 @@ class ListenSettings:
         Weighs the model's scores with bearing, approach and engine line, eq. (5); off where not given.
     ego_noise : bool or EgoNoiseSettings
         Learn the own vehicle's noise while the filter believes that nothing is there, and hear past it:
-        spatial spectrum, bearing and prominence. The signature hears what it was trained with.
+        spatial spectrum, bearing and prominence. The signature hears what it was trained with: a model that
+        was trained on windows without that noise hears such.
     boxes : DetectionFilter
         Which of the camera's boxes count: classes, score, height.
     uncalibrated : bool
@@ -398,6 +399,7 @@ def _heard(
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
     model = given if isinstance(given, Model) else read_model(given, moving_ego=moves)
+    settings = _as_trained(settings, model)
     policy = _policy(model, settings.alpha)
     heard_by = _array(sound, array, model, settings)
     stated = not settings.uncalibrated and states_budget(model, heard_by, moves)
@@ -415,6 +417,14 @@ def _heard(
         sequence=sequence_of(model, moves, settings.uncalibrated),
     )
     return source, recording
+
+
+def _as_trained(settings: ListenSettings, model: Model) -> ListenSettings:
+    """Return settings that take ego-noise out of the feature, too, where the model was trained without it."""
+    cleaned = model.domain is not None and model.domain.feature == CLEANED_FEATURE_VERSION
+    if settings.ego_noise is True and cleaned:
+        return replace(settings, ego_noise=EgoNoiseSettings(feature=True))
+    return settings
 
 
 def _with_camera(

@@ -6,7 +6,13 @@ import numpy as np
 
 from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
-from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, FEATURE_NFFT, FEATURE_SEGMENTS
+from worldstate.frontend.direction.feature import (
+    CLEANED_FEATURE_VERSION,
+    FEATURE_BAND_HZ,
+    FEATURE_NFFT,
+    FEATURE_SEGMENTS,
+    FEATURE_VERSION,
+)
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
@@ -142,6 +148,12 @@ class FrontEndSettings:
         in_range("elevation_span_deg: last", highest, lowest, 90.0)
         in_range("elevation_step_deg", self.elevation_step_deg, 0.01, 180.0)
         _divides("elevation_step_deg", self.elevation_step_deg, highest - lowest)
+
+    @property
+    def feature_version(self) -> str:
+        """Which feature is computed, as a model names what it was trained on."""
+        cleaned = self.ego_noise is not None and self.ego_noise.feature
+        return CLEANED_FEATURE_VERSION if cleaned else FEATURE_VERSION
 
     def azimuths_rad(self) -> FloatArray:
         """Return the grid of azimuths, ascending from right to left.

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -11,7 +13,10 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.csv_rows import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import published_feature
+from worldstate.frontend.direction.feature import FEATURE_VERSION, feature_nfft, published_feature
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 
@@ -48,7 +53,9 @@ def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
     return windows
 
 
-def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> Iterator[FloatArray]:
+def extract_features(
+    windows: list[LabelledWindow], array: MicrophoneArray, *, ego_noise: bool = False
+) -> Iterator[FloatArray]:
     """Yield the published feature of each window, shape (60,).
 
     Parameters
@@ -57,6 +64,9 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
         From `read_labels`.
     array : MicrophoneArray
         In the order of the channels.
+    ego_noise : bool
+        Listen to every file from its beginning, learn the noise of the own vehicle on the way and take it out
+        of the spectra.
 
     Yields
     ------
@@ -80,8 +90,31 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
     ...     [feature.shape for feature in extract_features([window], array)]
     [(60,)]
     """
+    if ego_noise:
+        for path, here in groupby(windows, key=attrgetter("path")):
+            yield from _cleaned_features(path, list(here), array)
+        return
     for samples, rate_hz in read_windows(windows, array.n_microphones):
         yield published_feature(samples, array, rate_hz)
+
+
+def _cleaned_features(
+    path: Path, windows: list[LabelledWindow], array: MicrophoneArray
+) -> Iterator[FloatArray]:
+    """Yield the features of windows of one file, of the last hop that ends within each."""
+    with open_audio(path, array.n_microphones) as source:
+        rate = source.sample_rate_hz
+        ends = [_ends_at(source, window) for window in windows]
+        settings = FrontEndSettings(nfft=feature_nfft(rate), ego_noise=EgoNoiseSettings(feature=True))
+        front_end = FrontEnd(array, rate, settings)
+        # Nobody says here when a source is near. Only what comes from below the horizon is learned, which a
+        # vehicle in the street is not.
+        front_end.learn_ego_noise(1.0)
+        heard: dict[int, FloatArray] = {}
+        for block in source.blocks(rate):
+            heard |= {frame.sample_index: frame.feature for frame in front_end.process(block)}
+        # A hop ends at the nearest sample: its window may end half a sample after the one that was asked for.
+        yield from (heard[max(at for at in heard if at <= end + 1)] for end in ends)
 
 
 def read_windows(
@@ -94,7 +127,10 @@ def read_windows(
 
 
 def feature_table(
-    windows: list[LabelledWindow], features: list[FloatArray], array: MicrophoneArray
+    windows: list[LabelledWindow],
+    features: list[FloatArray],
+    array: MicrophoneArray,
+    version: str = FEATURE_VERSION,
 ) -> FeatureTable:
     """Return windows and features, in the same order, as a table that names the array which heard them.
 
@@ -104,7 +140,7 @@ def feature_table(
     labels, ids, environments, recordings = (np.array(column) for column in columns)
     t0_frames = tuple(w.t0_frame for w in windows)
     rates = {source_rate_hz(path) for path in {w.path for w in windows}}
-    domain = domain_of(array, sorted(rates), environments.tolist())
+    domain = domain_of(array, sorted(rates), environments.tolist(), version)
     return FeatureTable(np.array(features), labels, ids, environments, recordings, t0_frames, domain)
 
 
@@ -116,13 +152,22 @@ def source_rate_hz(path: Path) -> int:
 
 def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
     """Return the second before the end of the window, shape (n, M)."""
+    length = _second(source)
+    return source.span(_ends_at(source, window) - length, length)
+
+
+def _ends_at(source: AudioSource, window: LabelledWindow) -> int:
+    """Return the sample that a window of a second ends before."""
     rate = source.sample_rate_hz
     end = source.frames if window.end_s is None else round(window.end_s * rate)
-    start = end - round(WINDOW_S * rate)
-    if end > source.frames or start < 0:
+    if end > source.frames or end < _second(source):
         at = "" if window.end_s is None else f" before {window.end_s:g} s"
         raise InputFileError(source.path, f"expected a second of sound{at}, got {source.duration_s:.3g} s")
-    return source.span(start, end - start)
+    return end
+
+
+def _second(source: AudioSource) -> int:
+    return round(WINDOW_S * source.sample_rate_hz)
 
 
 def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:

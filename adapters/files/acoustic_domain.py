@@ -32,12 +32,17 @@ UNFIT = "the model says that it is unfit for use"
 _LOG = logging.getLogger(__name__)
 
 
-def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
+def domain_of(
+    array: MicrophoneArray,
+    rates_hz: Sequence[float],
+    environments: Sequence[str],
+    feature: str = FEATURE_VERSION,
+) -> ModelDomain:
     """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
     alike = [_rate_of_long_frames(rate, feature_nfft(rate)) for rate in rates_hz]
     low, high = (1.0 - RATE_TOLERANCE) * min(alike), (1.0 + RATE_TOLERANCE) * max(alike)
     motion = ego_motion_of(environments)
-    return ModelDomain(array.name, array.positions_m, (low, high), FEATURE_BAND_HZ, FEATURE_VERSION, motion)
+    return ModelDomain(array.name, array.positions_m, (low, high), FEATURE_BAND_HZ, feature, motion)
 
 
 def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
@@ -120,7 +125,7 @@ def feature_order(
             f"sample rate: {expected}, or a half, a quarter or an eighth of both, got {got}. {way_out}"
         )
     made_with = _feature(domain.feature, domain.band_hz)
-    got = _feature(FEATURE_VERSION, settings.feature_band_hz)
+    got = _feature(settings.feature_version, settings.feature_band_hz)
     if got != made_with:
         raise OutOfDomainError(f"feature: the model was made with {made_with}, got {got}. {way_out}")
     order = check_array(domain, array, way_out)

@@ -1,5 +1,6 @@
 """Ego-noise where people listen: the filter's belief opens and shuts the gate, end to end."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +9,18 @@ import scipy.signal
 import soundfile
 
 from worldstate.adapters.acoustic import AcousticAdapter
+from worldstate.adapters.datasets.feature_table import read_features
+from worldstate.adapters.files.acoustic_domain import check_tables
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listen import ListenSettings, Source, listen_steps, measure_steps, open_source
 from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
 
 RATE, SECONDS, APPEARS_S = 16_000, 6.0, 4.5
 ARRAY = roof_array_56()
@@ -80,6 +85,42 @@ def test_the_signature_hears_what_it_was_trained_with(recording: Path) -> None:
     plain, learned = (list(listen_steps(opened(recording, ego))) for ego in (False, True))
     for a, b in zip(plain, learned, strict=True):
         assert a.measurement.signature == b.measurement.signature
+
+
+def test_a_model_trained_without_ego_noise_hears_none_and_no_other_model_does(
+    recording: Path, tmp_path: Path
+) -> None:
+    """What `extract-features --ego-noise` writes, a model names and `run --ego-noise` hears."""
+    few, short = MicrophoneArray(ARRAY.positions_m[::4], "few"), tmp_path / "short.wav"
+    soundfile.write(short, soundfile.read(recording, frames=3 * RATE)[0][:, ::4], RATE, subtype="FLOAT")
+    rows = {"1": "left,D1,1,short.wav,2.5", "2": "none,D2,2,short.wav,"}
+    labels = tmp_path / "labels.csv"
+    header = "ID,Class,Environment,Recording ID,File,End"
+    labels.write_text("\n".join([header, *(f"{name},{row}" for name, row in rows.items())]))
+    write_array_xml(tmp_path / "few.xml", few)
+    tables = []
+    for name, options in (("raw", []), ("cleaned", ["--ego-noise"])):
+        words = [str(tmp_path), "--labels", str(labels), "--array", str(tmp_path / "few.xml")]
+        assert main(["extract-features", *words, "--out", str(tmp_path / f"{name}.csv"), *options]) == 0
+        tables.append(read_features(tmp_path / f"{name}.csv"))
+    raw, cleaned = tables
+    with pytest.raises(OutOfDomainError, match="ego-noise whitened"):
+        check_tables(raw.domain, cleaned.domain)
+    # White noise has no direction: of the loudest one's lead over the median little is left.
+    lead = [np.log(table.features[0].reshape(2, 30)).max(axis=1) for table in tables]
+    assert (lead[1] < lead[0] - 0.5).all()
+
+    shipped = read_model()
+    models = [replace(shipped, signature=replace(shipped.signature, domain=one.domain)) for one in tables]
+    heard = open_source(short, array=few, model=models[1], settings=ListenSettings(ego_noise=True))
+    frames = [frame for frame, _ in measure_steps(heard, lambda: 1.0)]
+    # There the first second is not learned, and what was learned is not quite the same.
+    apart = [np.abs(frames[-1].feature - table.features[1]).mean() for table in tables]
+    assert apart[1] < 0.3 * apart[0]
+    for model, asked in ((models[1], False), (models[0], EgoNoiseSettings(feature=True))):
+        source = open_source(short, array=few, model=model, settings=ListenSettings(ego_noise=asked))
+        with pytest.raises(OutOfDomainError, match="ego-noise whitened"):
+            next(measure_steps(source))
 
 
 def test_settings_of_one_s_own(recording: Path) -> None:

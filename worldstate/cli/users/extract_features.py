@@ -35,6 +35,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
+    ego_noise = "take the own vehicle's noise out, learned from each file's beginning (default: off)"
+    parser.add_argument("--ego-noise", action="store_true", help=ego_noise)
     add_array_options(parser)
 
 
@@ -45,16 +47,21 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table
     from worldstate.adapters.datasets.feature_table import write_features
+    from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_VERSION
 
     check_outputs(arguments, "out")
     array = choose_array(arguments.dataset, given_array(arguments))
     windows, left_out = _windows(arguments)
-    features = list(track(extract_features(windows, array), "extracting", len(windows)))
-    table = feature_table(windows, features, array)
+    cleaned = arguments.ego_noise
+    extracted = extract_features(windows, array, ego_noise=cleaned)
+    features = list(track(extracted, "extracting", len(windows)))
+    version = CLEANED_FEATURE_VERSION if cleaned else FEATURE_VERSION
+    table = feature_table(windows, features, array, version)
     write_features(arguments.out, table)
     summary = {
         "out": str(arguments.out),
         "array": stance(array),
+        "feature": version,
         "n_windows": len(table),
         "n_left_out": left_out,
         "n_recordings": len(np.unique(table.recording_keys)),
