@@ -29,13 +29,22 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
     from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.operations.commissioning.heard_stream import HeardStream
+    from worldstate.operations.commissioning.open_field import (
+        N_OPEN,
+        open_field_features,
+        open_field_windows,
+    )
     from worldstate.operations.commissioning.window_model import learned_beside
+    from worldstate.operations.training.site_references import simulated_beside
 
     tables = [read_features(path).group(arguments.group) for path in arguments.simulated or ()]
     streams = [HeardStream.load(path) for path in arguments.streams or ()]
+    if not streams:
+        return simulated_beside(tables) if tables else None
     # A table that does not say, as the released one, is OVAD's.
     array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
-    return learned_beside(tables, streams, array, np.random.default_rng(0))
+    in_the_open = open_field_windows(open_field_features(array, N_OPEN, np.random.default_rng(0)))
+    return learned_beside(streams, in_the_open, tables)
 
 
 def add_which_windows(parser: argparse.ArgumentParser, of: str) -> None:

@@ -14,8 +14,9 @@ from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.model_domain import ModelDomain
+from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.site_reference import KINDS
-from worldstate.abduction.signature.window_classes import BOTH, side_ratios, visible_ratios
+from worldstate.abduction.signature.window_classes import side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.model_file import Model
@@ -34,8 +35,7 @@ from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
 from .stream_labels import stream_truth
-from .stream_windows import stream_windows
-from .window_model import posteriors_along, window_model
+from .window_model import learned_beside, posteriors_along, window_model
 
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 2
@@ -220,24 +220,23 @@ def _table_and_beside(
     streams: Sequence[HeardStream],
 ) -> tuple[FeatureTable, SimulatedWindows]:
     """Return the windows that a model is trained on, and what it learns beside them."""
-    cut = stream_windows(streams)
+    learned = learned_beside(streams, open_field)
     if real is not None:
-        return real, SimulatedWindows.joined([cut, open_field])
-    # Without real windows the streams' own take their place; both sides at once stay beside them.
-    both = cut.y == BOTH
-    n_features = cut.X.shape[1] // (1 + len(KINDS))
-    numbers = np.arange(len(both)).astype(np.str_)[~both]
+        return real, learned
+    # Without real windows the streams' own take their place; classes that these do not know stay beside.
+    own = np.isin(learned.y, CLASSES)
+    n_features = learned.X.shape[1] // (1 + len(KINDS))
+    numbers = np.arange(len(own)).astype(np.str_)[own]
     table = FeatureTable(
-        cut.X[~both, :n_features],
-        cut.y[~both],
+        learned.X[own, :n_features],
+        learned.y[own],
         numbers,
-        cut.sites[~both],
+        learned.sites[own],
         numbers,
         (None,) * len(numbers),
         domain,
     )
-    beside = SimulatedWindows(*(getattr(cut, one.name)[both] for one in fields(SimulatedWindows)))
-    return table, SimulatedWindows.joined([beside, open_field])
+    return table, SimulatedWindows(*(getattr(learned, one.name)[~own] for one in fields(SimulatedWindows)))
 
 
 def exam_of(

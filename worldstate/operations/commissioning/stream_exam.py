@@ -36,14 +36,12 @@ from worldstate.operations.recordings.advisories import (
 from worldstate.operations.recordings.hop_stream import HOP_S
 
 from .heard_stream import HeardStream
-from .stream_labels import StreamTruth
+from .stream_labels import QUIET_KINDS, StreamTruth
 
 TOGETHER_S, FOLLOWING_S, AFTER_S = 4.0, 6.0, 6.0
 # A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at
 # 20 an hour leave .22, .17, .13 and .08 of other junctions above that, and detect .888, .881, .870 and .849.
 LOUDEST = 3.0
-# Hardly heard before they are seen; told apart, with no target of their own.
-QUIET_KINDS = ("bicycle", "scooter", "electric")
 _CALIBRATED_S = (1.0, 2.0, 3.0)
 
 
@@ -58,7 +56,7 @@ class StreamApproach:
 
     @property
     def quiet(self) -> bool:
-        """Whether any of them is a quiet road user."""
+        """Whether any of them is a quiet road user, which has no target of its own."""
         return any(kind in QUIET_KINDS for kind in self.kinds)
 
 

@@ -17,6 +17,7 @@ from worldstate.abduction.signature.window_classes import BOTH
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 
 from .heard_stream import HeardStream
+from .stream_labels import SILENT_KINDS
 
 UNUSED = ""
 # Hidden: a second or less before it comes into view. Of two, the later one is as loud as that within 2.5 s.
@@ -26,8 +27,6 @@ HIDDEN_S, SECOND_S = 1.0, 2.5
 FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
 # Empty: nobody comes for so long, as nobody does in the second before.
 CALM_S = 5.0
-# Hardly heard before they are seen: as hidden windows they would be wrong labels, as empty ones too.
-QUIET_KINDS = ("bicycle", "scooter")
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +103,7 @@ def _thinned(rows: IndexArray, time_s: FloatArray, apart_s: float) -> IndexArray
 def _comes_within(stream: HeardStream, seconds: float, side: str = "", *, quiet: bool = False) -> BoolArray:
     """Tell when a vehicle, or a quiet one, out of a hidden arm comes into view so soon, shape (n,)."""
     vehicles = stream.vehicles
-    asked = vehicles.hazard & (np.isin(vehicles.kind, QUIET_KINDS) == quiet)
+    asked = vehicles.hazard & (np.isin(vehicles.kind, SILENT_KINDS) == quiet)
     entries = vehicles.entry_s[asked & ((vehicles.arm == side) | (side == ""))]
     left_s = entries[None, :] - stream.hops.time_s[:, None]
     return np.asarray(((left_s >= 0.0) & (left_s <= seconds)).any(axis=1))

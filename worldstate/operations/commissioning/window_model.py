@@ -11,26 +11,19 @@ from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstim
 from worldstate.abduction.signature.site_reference import log_levels
 from worldstate.abduction.signature.site_signature import HOP_S
 from worldstate.adapters.datasets.feature_table import FeatureTable
-from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.training.site_references import simulated_beside, with_site_references
 
 from .heard_stream import HeardStream
-from .open_field import N_OPEN, open_field_features, open_field_windows
 from .stream_windows import stream_windows
 
 
 def learned_beside(
-    tables: Sequence[FeatureTable],
-    streams: Sequence[HeardStream],
-    array: MicrophoneArray,
-    rng: np.random.Generator,
-) -> SimulatedWindows | None:
-    """Return all that a window model learns beside real windows; sources in the open only beside streams."""
-    parts = [simulated_beside(tables)] if tables else []
-    if streams:
-        parts += [stream_windows(streams), open_field_windows(open_field_features(array, N_OPEN, rng))]
-    return SimulatedWindows.joined(parts) if parts else None
+    streams: Sequence[HeardStream], open_field: SimulatedWindows, tables: Sequence[FeatureTable] = ()
+) -> SimulatedWindows:
+    """Return windows of streams, of sources in the open and of simulated recordings together."""
+    recordings = [simulated_beside(tables)] if tables else []
+    return SimulatedWindows.joined([*recordings, stream_windows(streams), open_field])
 
 
 def window_model(
