@@ -1,5 +1,7 @@
 """Eight octave bands that add up to the whole signal again."""
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.fft import irfft, rfft, rfftfreq
 
@@ -40,11 +42,18 @@ def split_octaves(signal: Float32Array, sample_rate_hz: float, oversampling: int
     """
     n = len(signal)
     spectrum = rfft(signal)
-    masks = octave_masks(rfftfreq(n, 1.0 / sample_rate_hz)).astype(np.float32) * np.float32(oversampling)
-    bands = np.empty((len(OCTAVES_HZ), n * oversampling), np.float32)
-    for band, mask in zip(bands, masks, strict=True):
-        band[:] = irfft(spectrum * mask, n * oversampling)
+    bands = np.zeros((len(OCTAVES_HZ), n * oversampling), np.float32)
+    for band, mask in zip(bands, _masks_for(n, sample_rate_hz), strict=True):
+        # Above half the rate there is nothing.
+        if mask.any():
+            band[:] = irfft(spectrum * (mask * np.float32(oversampling)), n * oversampling)
     return bands
+
+
+# The sources of one vehicle are as long as each other, seven of them.
+@lru_cache(maxsize=2)
+def _masks_for(samples: int, sample_rate_hz: float) -> Float32Array:
+    return octave_masks(rfftfreq(samples, 1.0 / sample_rate_hz)).astype(np.float32)
 
 
 def resample_whole(signal: Float32Array, oversampling: int) -> Float32Array:

@@ -1,6 +1,7 @@
 """A vehicle on its way: where it is, and how loud it is by itself."""
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -239,6 +240,7 @@ def _pressure(power_level_db: FloatArray) -> FloatArray:
     return np.asarray(REFERENCE_PA * 10.0 ** ((power_level_db + POWER_TO_1M_DB) / 20.0))
 
 
+@cache
 def _band_shares(sample_rate_hz: float) -> FloatArray:
     """Power of white noise of unit variance in every octave band; bands beyond Nyquist stay empty."""
     masks = octave_masks(np.linspace(0.0, sample_rate_hz / 2.0, 4096))

@@ -7,6 +7,7 @@ an array's centre hears is spread over its microphones, whose delays against it 
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -69,8 +70,13 @@ class _Lines:
 
     def into(self, out: Float32Array, rows: slice) -> None:
         """Write the samples of some intervals, shape (rows, N)."""
-        ramp = np.arange(out.shape[1], dtype=np.float32) / np.float32(out.shape[1])
-        np.matmul(self._ends[rows], np.stack([np.ones_like(ramp), ramp]), out=out)
+        np.matmul(self._ends[rows], _one_and_ramp(out.shape[1]), out=out)
+
+
+@cache
+def _one_and_ramp(samples: int) -> Float32Array:
+    ramp = np.arange(samples, dtype=np.float32) / np.float32(samples)
+    return np.stack([np.ones_like(ramp), ramp])
 
 
 def _add_between_knots(

@@ -18,6 +18,7 @@ DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
 ELEVATION_RAD = 0.3
 LATE_DISTANCE_M = 8.0  # so far from the mouth a source feeds the late field half as much
+WAVES_AT_ONCE = 4
 TAIL_DECAYS = 1.0  # length of a tail in reverberation times (60 dB)
 
 
@@ -62,9 +63,14 @@ def add_late_field(
     envelope = 10.0 ** (-3.0 * np.arange(tail) / tail * TAIL_DECAYS)
     envelope /= np.sqrt((envelope**2).sum())
     waves = np.empty((len(shares), samples), np.float32)
-    for wave, share in zip(waves, shares, strict=True):
-        response = (np.sqrt(share) * envelope * rng.standard_normal(tail)).astype(np.float32)
-        wave[:] = irfft(spectrum * rfft(response, n), n)[len(dry) - samples : len(dry)]
+    # Transforms of a few are done side by side: one by one they take twice as long, all at once as well.
+    for first in range(0, len(shares), WAVES_AT_ONCE):
+        some = slice(first, first + WAVES_AT_ONCE)
+        drawn = rng.standard_normal((len(shares[some]), tail))
+        responses = (np.sqrt(shares[some])[:, None] * envelope * drawn).astype(np.float32)
+        tails = rfft(responses, n)
+        tails *= spectrum
+        waves[some] = irfft(tails, n)[:, len(dry) - samples : len(dry)]
     offsets = positions_m - positions_m.mean(axis=0)
     static.add(waves, plane_wave_delays(directions, offsets))
 

@@ -97,13 +97,16 @@ def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]
     window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(BLOCK) / BLOCK)).astype(np.float32)
     sources, samples = sum(len(one) for one in signals), signals[0].shape[1]
     blocks = _blocks(samples)
+    cut = np.empty((sources, BLOCK), np.float32)
     for start in range(0, blocks, BLOCKS_AT_ONCE):
         stop = min(start + BLOCKS_AT_ONCE, blocks)
-        cut = np.zeros((stop - start, sources, BLOCK), np.float32)
-        for i, block in enumerate(cut, start - 1):  # the first block begins one hop before the signals
-            first, last = max(i * HOP, 0), min(i * HOP + BLOCK, samples)
-            np.concatenate(
-                [one[:, first:last] for one in signals], out=block[:, first - i * HOP : last - i * HOP]
-            )
-        cut *= window
-        yield start, np.ascontiguousarray(rfft(cut, axis=-1).transpose(2, 0, 1))
+        spectra = np.empty((BINS, stop - start, sources), np.complex64)
+        for i in range(start, stop):
+            at = (i - 1) * HOP  # the first block begins one hop before the signals
+            first, last = max(at, 0), min(at + BLOCK, samples)
+            cut[:, : first - at], cut[:, last - at :] = 0.0, 0.0
+            np.concatenate([one[:, first:last] for one in signals], out=cut[:, first - at : last - at])
+            cut *= window
+            # Turned while it is in the cache: of all blocks at once that took as long as the transforms.
+            spectra[:, i - start] = rfft(cut, axis=-1).T
+        yield start, spectra
