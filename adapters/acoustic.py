@@ -7,6 +7,7 @@ from typing import Protocol
 from worldstate.abduction.bearing_vote import with_bearing_vote
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.road_users import ClassShares, RoadUserModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral
 from worldstate.abduction.signature.model_domain import ModelDomain
@@ -25,6 +26,7 @@ from worldstate.measurement.measurement import Approach, Bearing, Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel, MeasurementAdapter, Side
 
 from .acoustic_grounding import Grounding, observe
+from .acoustic_kinds import check_road_users, expected_labels, heard_kinds
 from .acoustic_sequence import LEVEL_BAND_HZ, read_hop
 
 
@@ -102,6 +104,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
 
     guard : DomainGuard, optional
         Tells foreign sounds and warning signals; evidence of a foreign one counts by what exceeds its margin.
+    road_users : RoadUserModel, optional
+        Tells which kind of road user is heard; the camera is asked for such.
     sequence : SequenceReader or NotUsable, optional
         Reads from seconds of the model's evidence who comes into view, and when; or why nothing does.
     uncalibrated : bool
@@ -122,8 +126,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     InvalidArgumentError
         If the array, the rate or a setting does not fit; see `FrontEnd`.
     OutOfDomainError
-        If the model has a `domain` and was made for another array, rate or feature, or the guard for other
-        measures.
+        If the model has a `domain` and was made for another array, rate or feature, or guard or road users
+        for other measures.
 
     Examples
     --------
@@ -149,6 +153,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         front_end_settings: FrontEndSettings | None = None,
         grounding: Grounding | None = None,
         guard: DomainGuard | None = None,
+        road_users: RoadUserModel | None = None,
         sequence: SequenceReader | NotUsable | None = None,
         uncalibrated: bool = False,
     ) -> None:
@@ -157,9 +162,11 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
             front_end_settings = replace(front_end_settings, feature_order=order)
-        if guard is not None:
-            if guard.measures != MEASURES:
-                raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
+        if guard is not None and guard.measures != MEASURES:
+            raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
+        if road_users is not None:
+            check_road_users(road_users)
+        if guard is not None or road_users is not None:
             front_end_settings = replace(front_end_settings, character=True)
         if isinstance(sequence, SequenceReader):
             front_end_settings = replace(front_end_settings, level_band_hz=LEVEL_BAND_HZ)
@@ -171,6 +178,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         self._settings = settings or AcousticSettings()
         self._grounding = grounding
         self._guard = guard
+        self._road_users = road_users
         self._sequence = sequence
 
     def measure(self, block: Float32Array, /) -> list[Measurement]:
@@ -230,6 +238,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
         domain = self._judged(frame)
+        kinds = self._heard_kinds(frame, domain)
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
         # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
@@ -238,10 +247,11 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         return Measurement(
             stamp_ns=frame.stamp_ns,
             signature=signature,
-            co_evidence=_answer(self._vision, self._settings, frame.stamp_ns, bearing, signature),
+            co_evidence=_answer(self._vision, self._settings, frame.stamp_ns, bearing, signature, kinds),
             bearing=bearing,
             approach=approach,
             domain=domain,
+            kinds=kinds,
             sequence=sequence,
             sightings=self._vision.sightings(frame.stamp_ns) if self._vision else (),
             source=self.source,
@@ -250,13 +260,19 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     def _judged(self, frame: AcousticFrame) -> DomainVerdict | None:
         if self._guard is None or isinstance(frame.character, NotUsable):
             return None
-        return self._guard.judge(frame.character)
+        return self._guard.judge(frame.character[: len(MEASURES)])
+
+    def _heard_kinds(self, frame: AcousticFrame, domain: DomainVerdict | None) -> ClassShares:
+        if self._road_users is None or isinstance(frame.character, NotUsable):
+            return ()
+        return heard_kinds(self._road_users, frame.character, domain)
 
 
 def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
     """Return a measurement with the answers of another camera; what was heard stays as it is."""
     stamp_ns = measurement.stamp_ns
-    answer = _answer(vision, AcousticSettings(), stamp_ns, measurement.bearing, measurement.signature)
+    heard = measurement.bearing, measurement.signature, measurement.kinds
+    answer = _answer(vision, AcousticSettings(), stamp_ns, *heard)
     sightings = vision.sightings(stamp_ns) if vision else ()
     return replace(measurement, co_evidence=answer, sightings=sightings)
 
@@ -267,12 +283,14 @@ def _answer(
     stamp_ns: int,
     bearing: Bearing | NotUsable,
     signature: SignatureEvidence,
+    kinds: ClassShares,
 ) -> CoEvidence:
     if vision is None:
         return Unqueried("no camera")
     if isinstance(bearing, Bearing) and bearing.std_rad <= settings.coarse_std_rad:
-        return vision.ask(stamp_ns, bearing)
-    return vision.ask(stamp_ns, NotUsable("coarse bearing"), side=_likelier_side(signature))
+        return vision.ask(stamp_ns, bearing, expected_labels(kinds))
+    side = _likelier_side(signature)
+    return vision.ask(stamp_ns, NotUsable("coarse bearing"), expected_labels(kinds), side)
 
 
 def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotUsable:

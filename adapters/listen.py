@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard
@@ -175,6 +176,8 @@ class Source:
         Of the own vehicle, whose lines are then cancelled together with its learned noise.
     guard : DomainGuard or None
         Tells sounds that the model was not made for.
+    road_users : RoadUserModel or None
+        Tells which kind of road user is heard.
     sequence : SequenceModel, NotUsable or None
         Reads who comes into view and when; or why the model's cannot be used here.
     history : SequenceHistory or None
@@ -211,6 +214,7 @@ class Source:
     start_ns: int = 0
     engine: EngineSpeed | None = None
     guard: DomainGuard | None = None
+    road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None
     history: SequenceHistory | None = None
 
@@ -414,6 +418,7 @@ def _heard(
         t0_s=recording.t0_s if recording else None,
         hazard_free=recording is not None and recording.label == "none",
         guard=model.guard,
+        road_users=model.road_users,
         sequence=sequence_of(model, moves, settings.uncalibrated),
     )
     return source, recording
@@ -643,6 +648,7 @@ def measure_steps(
             vision=source.camera_channel(),
             grounding=source.settings.grounding,
             guard=source.guard,
+            road_users=source.road_users,
             sequence=reader or source.reader(),
             front_end_settings=source.settings.front_end(source.array, audio.sample_rate_hz),
             uncalibrated=source.settings.uncalibrated,

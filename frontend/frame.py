@@ -66,9 +66,10 @@ class AcousticFrame:
         Faults of the microphones and which were left out.
     tone : ToneReading or NotUsable
         Engine line over the last `tone_hops` hops; not usable when it is off or no tone exceeds the noise.
-    character : ndarray, shape (37,), or NotUsable
+    character : ndarray, shape (49,), or NotUsable
         What the middle microphone heard in the last two seconds, whatever its level: modulation, what bands
-        have in common, tones, harmonics. A `DomainGuard` reads it.
+        have in common, tones, harmonics, which a `DomainGuard` reads; and how the level is shared between
+        twelve bands, which a `RoadUserModel` reads, too.
 
     Examples
     --------

@@ -77,7 +77,7 @@ class VisionQuery:
     - `Absent` otherwise.
 
     Its miss rate is the expectation over the sector, with 1 where the camera does not see and the mean over
-    the expected classes C,
+    the expected classes C; a class that the filter leaves out is always missed,
 
     .. math:: \beta = \frac{1}{|S|} \int_S \frac{1}{|C|} \sum_{c \in C} \beta_c(\theta, d)\, d\theta
 
@@ -140,6 +140,9 @@ class VisionQuery:
         self._view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
         self._clutter = clutter
+        # As background subtraction does: asked for a truck it would never find one.
+        named = () if detections is None else (frame.labels for frame in detections.frames)
+        self._calls_all_cars = set().union(*named) == {"car"}
         if detections is not None:
             _check_size(camera, detections)
 
@@ -159,7 +162,8 @@ class VisionQuery:
         bearing : Bearing or NotUsable
             Centre of the sector, unless `side` is given; without either everything ahead is searched.
         expected_labels : collection of str, optional
-            Classes that the signature predicts; all that the filter keeps if not given.
+            Classes that the signature predicts; all that the filter keeps if not given, or if the detector
+            calls every box a car.
         side : {"left", "right"}, optional
             Search that whole side, 0 to 90 deg, for a source whose bearing is coarse.
 
@@ -178,8 +182,10 @@ class VisionQuery:
             return Unqueried("no detections file")
         if self._frame(stamp_ns) is None:
             return Unqueried(f"no frame at {seconds(stamp_ns):.3f} s")
-        labels = self.settings.keep.labels if expected_labels is None else expected_labels
-        if not labels:
+        kept, labels = self.settings.keep.labels, expected_labels
+        if labels is None or (labels and self._calls_all_cars):
+            labels = kept
+        if not any(label in kept for label in labels):
             return Unqueried("the signature predicts no class that a camera would see")
         sector = self._sector(bearing, side)
         d = self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
@@ -249,7 +255,10 @@ class VisionQuery:
         if in_view is None:
             return None
         angles = self.camera.off_axis(in_view.midpoints(SAMPLES))
-        seen = float(np.mean([self.miss_rate.over(angles, d, label) for label in labels]))
+        kept = self.settings.keep.labels
+        seen = float(
+            np.mean([self.miss_rate.over(angles, d, one).mean() if one in kept else 1.0 for one in labels])
+        )
         share = in_view.half_width_rad / sector.half_width_rad
         return share * seen + (1.0 - share)
 

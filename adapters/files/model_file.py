@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.model_domain import ModelDomain
@@ -84,7 +85,7 @@ class Model:
     """
 
     LAYOUT: ClassVar = Layout(
-        "worldstate.Model", "1.5.0", order="provenance signature policies sequence guard"
+        "worldstate.Model", "1.6.0", order="provenance signature policies sequence guard road_users"
     )
 
     signature: AnySignature
@@ -92,6 +93,7 @@ class Model:
     provenance: Provenance
     sequence: SequenceModel | None = field(default=None, metadata=ADDED)
     guard: DomainGuard | None = field(default=None, metadata=ADDED)
+    road_users: RoadUserModel | None = field(default=None, metadata=ADDED)
 
     @property
     def domain(self) -> ModelDomain | None:

@@ -2,7 +2,8 @@ r"""What one microphone hears, in numbers that do not depend on its level: modul
 
 Band levels are read a hundred times a second; over the last two seconds their modulation spectrum, and the
 share of it that the bands have in common, tell steps, speech and blows from tyres and engines, whose bands
-fluctuate each by itself as noise does. A finer spectrum, once a hop, shows tones and combs of harmonics.
+fluctuate each by itself as noise does. A finer spectrum, once a hop, shows tones and combs of harmonics. How
+the level is shared between the bands tells a van from a car.
 """
 
 import math
@@ -21,7 +22,7 @@ from .decimator import Decimator
 HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)
 _HIGH = 4  # Bands from here on: below 450 Hz wind and engines are modulated, too
-_FRAMES, _MEMORY = 10, 200  # Levels a hop, and levels in the window
+_FRAMES, _SECOND, _MEMORY = 10, 100, 200  # Levels a hop, a second, and in the window
 _SHORT_S, _LONG_S = 0.032, 0.1706  # A syllable's onset; partials of a bell 6 Hz apart
 # Rates of modulation, Hz: swell, beats and steps, syllables (two), roughness (three).
 _RATES_HZ = (0.4, 1.3, 2.8, 6.2, 10.2, 16.2, 30.2, 50.1)
@@ -44,6 +45,8 @@ MEASURES = (
     *(f"{name} {low:g}" for name in ("steady", "tonal", "peak") for low in _TONES_HZ[:-1]),
     *("comb", "comb varies", "line", "line varies", "line holds"),
 )
+# Levels of the last second over their mean: the street's own colour is in them, so that no guard reads them.
+BANDS = tuple(f"band {low:g}" for low in EDGES_HZ[:-1])
 
 
 class SoundCharacter:
@@ -72,10 +75,12 @@ class SoundCharacter:
         self._n_hops += 1
 
     def read(self) -> FloatArray | NotUsable:
-        """Return the `MEASURES` of the last two seconds, shape (measures,)."""
+        """Return `MEASURES` of the last two seconds and `BANDS` of the last, shape (measures + bands,)."""
         if self._n_hops <= _MEMORY // _FRAMES:
             return NotUsable("needs two seconds of sound")
-        return np.concatenate([_modulation(self._levels), _swings(self._levels), self._lines.read()])
+        bands = self._levels[-_SECOND:].mean(axis=0)
+        texture = (_modulation(self._levels), _swings(self._levels), self._lines.read())
+        return np.concatenate([*texture, bands - bands.mean()])
 
 
 class _Bands:
@@ -85,11 +90,13 @@ class _Bands:
         self._window = np.hanning(length + 1)[:-1] / np.sqrt(length)
         self._size = next_fast_len(length, real=True)
         hz = np.fft.rfftfreq(self._size, 1.0 / rate_hz)
-        self._sums = np.stack([(hz >= low) & (hz < high) for low, high in _pairs(EDGES_HZ)], axis=1) * 1.0
+        inside = np.stack([(hz >= low) & (hz < high) for low, high in _pairs(EDGES_HZ)], axis=1)
+        # A mean: at another rate three bins or four lie within the same band.
+        self._means = inside / inside.sum(axis=0)
 
     def levels(self, frames: FloatArray) -> FloatArray:
         """Log-levels, shape (frames, bands)."""
-        return np.asarray(np.log(_power(rfft(frames * self._window, self._size)) @ self._sums + _LEAST))
+        return np.asarray(np.log(_power(rfft(frames * self._window, self._size)) @ self._means + _LEAST))
 
 
 class _Lines:

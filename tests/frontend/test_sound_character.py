@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import resample_poly
 
-from worldstate.frontend.spectra.sound_character import MEASURES, SoundCharacter
+from worldstate.frontend.spectra.sound_character import BANDS, MEASURES, SoundCharacter
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
 
@@ -21,7 +21,7 @@ def heard(sound: FloatArray, rate_hz: float = RATE) -> dict[str, float]:
         character.push(sound[first : first + hop])
     read = character.read()
     assert not isinstance(read, NotUsable)
-    return dict(zip(MEASURES, read.tolist(), strict=True))
+    return dict(zip((*MEASURES, *BANDS), read.tolist(), strict=True))
 
 
 def noise(rate_hz: float = RATE, seed: int = 0) -> FloatArray:
@@ -80,6 +80,13 @@ def test_another_sample_rate_measures_the_same(rate_hz: float) -> None:
     there, here = heard(resample_poly(sound, int(rate_hz / 1000), 6), rate_hz), heard(sound)
     # The one holds its band filter's length back, so that their windows differ by some milliseconds.
     assert {name: value for name, value in there.items() if abs(value - here[name]) > 0.35} == {}
+
+
+def test_bands_share_a_level_that_they_do_not_depend_on() -> None:
+    found = heard(noise() + 3.0 * np.sin(2.0 * np.pi * 650.0 * time()))
+    bands = {name: found[name] for name in BANDS}
+    assert max(bands, key=lambda name: bands[name]) == "band 580"
+    assert sum(bands.values()) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_two_seconds_are_needed() -> None:

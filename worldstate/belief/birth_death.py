@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from worldstate.abduction.road_users import UNKNOWN
 from worldstate.ground.values import NANOSECONDS_PER_SECOND
 from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
 from .site_geometry import SiteGeometry
-from .track import Track, entity_id
-
-# The signature tells no classes apart; a detector replaces this at the hand-over.
-HIDDEN_LABEL = "vehicle"
+from .track import Track, entity_id, heard_as
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +59,8 @@ def birth_death(
             # The sum of two exponentials exceeds one by rounding where nothing else is possible.
             existence = min(explanation.hidden[k] + explanation.emerged[k], 1.0)
             if existence >= settings.death_probability or alarmed[k]:
-                kept.append(replace(current, existence=existence))
+                labels = heard_as(current, measurement.kinds)
+                kept.append(replace(current, existence=existence, labels=labels))
     return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))
 
 
@@ -101,7 +100,8 @@ def _born(k: int, number: int, existence: float, measurement: Measurement, site:
         seen=False,
         existence=existence,
         motion=site.prior(k),
-        labels=((HIDDEN_LABEL, 1.0),),
+        # A detector adds to it at the hand-over.
+        labels=measurement.kinds or ((UNKNOWN, 1.0),),
         moving=True,
         sources=(measurement.source,),
         created_ns=measurement.stamp_ns,

@@ -31,6 +31,7 @@ COMMANDS = (
     "studies.evaluate_features",
     "studies.evaluate_signatures",
     "studies.foreign_sounds",
+    "studies.road_users",
     "users.extract_features",
     "studies.realism",
     "studies.ablations",

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.road_users import ClassShares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.values import NotUsable
@@ -105,6 +106,8 @@ class Measurement:
         All that the co-evidence channel reports, in the queried sector or not.
     domain : Familiar, Foreign, WarningSignal or None
         Whether the model was made for what was heard; None where nothing tells.
+    kinds : tuple of (str, float)
+        Classes of what is heard with their probabilities, sorted by name; empty where nothing tells.
     sequence : SequenceReading, NotUsable or None
         What the last seconds say of who comes into view, and when; None of a modality that has no such model.
     source : str
@@ -127,6 +130,7 @@ class Measurement:
     approach: Approach | NotUsable
     sightings: tuple[Sighting, ...] = ()
     domain: DomainVerdict | None = None
+    kinds: ClassShares = ()
     sequence: SequenceReading | NotUsable | None = None
     # Overlap is discounted within a source and evidence multiplied across sources: two with one name would
     # count as one that repeats itself.

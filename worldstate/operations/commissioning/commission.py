@@ -32,6 +32,7 @@ from .guard_training import train_guard
 from .heard_stream import HeardStream, hear_recording, hear_stream
 from .open_field import N_OPEN, open_field_features, open_field_windows
 from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams
+from .road_user_training import train_road_users
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
 from .stream_labels import stream_truth
@@ -175,9 +176,13 @@ def commission(
     )
     on_step()
     # What streets sound like is learned from several of them: two are none that are left out.
-    guard = None if settings.quick else train_guard(array, streams, rng)
+    guard = road_users = None
+    if not settings.quick:
+        guard = train_guard(array, streams, rng)
+        sites = list(dict.fromkeys(_site(one) for one in streams))
+        road_users = train_road_users(array, sites, rate_hz, rng, jobs)
     provenance = replace(model.provenance, fit_for_use=not settings.quick)
-    made = replace(model, provenance=provenance, sequence=sequence, guard=guard)
+    made = replace(model, provenance=provenance, sequence=sequence, guard=guard, road_users=road_users)
     return with_quiet_alarm(made, array, quiet, settings.onsets_per_hour) if quiet else made
 
 

@@ -11,12 +11,12 @@ from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.settings import SimulationSettings
 from worldstate.adapters.simulation.sound.receiver import standing_m
 from worldstate.adapters.simulation.stream.ambience import ambience_piece, stream_ambience
-from worldstate.adapters.simulation.stream.arrivals import SOUND_MARGIN_S, SoundEvent
+from worldstate.adapters.simulation.stream.arrivals import SOUND_MARGIN_S, Event, SoundEvent
 from worldstate.adapters.simulation.stream.event_sound import event_sound
 from worldstate.adapters.simulation.stream.microphones import Microphones
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND, MEASURES, SoundCharacter
+from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES, SoundCharacter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, TextArray
 from worldstate.ground.values import NotUsable
@@ -85,14 +85,14 @@ def _rows_of_street(stream: HeardStream) -> GuardRows:
     measures, usable = characters(middle.ravel(), float(middle.shape[1] * HOPS_A_SECOND))
     labels = hop_labels(stream)
     kinds = np.where(np.isin(labels, ("left", "right", "both")), "hidden", labels)[usable]
-    return GuardRows(measures, kinds, np.full(len(kinds), str(stream.hops.about["site"])))
+    return GuardRows(measures[:, : len(MEASURES)], kinds, np.full(len(kinds), str(stream.hops.about["site"])))
 
 
 def _rows_of_sound(
     settings: StreamSettings, kind: str, position_m: FloatArray, rng: np.random.Generator
 ) -> GuardRows:
     sound, ambience = _rendered(settings, kind, position_m, rng)
-    loud, calm = (_loudness(part, settings.sample_rate_hz) for part in (sound, ambience))
+    loud, calm = (loudness(part, settings.sample_rate_hz) for part in (sound, ambience))
     louder_half = np.sort(loud)[len(loud) // 2 :].mean() + np.finfo(float).tiny
     gain = np.sqrt(10.0 ** (rng.uniform(*SNR_DB) / 10.0) * calm.mean() / louder_half)
     measures, usable = characters(ambience + np.float32(gain) * sound, settings.sample_rate_hz)
@@ -100,26 +100,37 @@ def _rows_of_sound(
     ratio = np.convolve(gain**2 * loud, second)[: len(loud)] / np.convolve(calm, second)[: len(calm)]
     audible = ratio[usable] >= 10.0 ** (AUDIBLE_DB / 10.0)
     names = (np.full(int(audible.sum()), name) for name in (kind, settings.site.name))
-    return GuardRows(measures[audible], *names)
+    return GuardRows(measures[audible, : len(MEASURES)], *names)
 
 
 def _rendered(
     settings: StreamSettings, kind: str, position_m: FloatArray, rng: np.random.Generator
 ) -> tuple[Float32Array, Float32Array]:
     """Return a sound alone and the ambience alone, shape (samples,), of full scale 1."""
-    alone = Microphones(position_m[None], np.zeros(1), np.ones(1), settings.sample_rate_hz)
     empty = SimulationSettings(settings.site, "none", duration_s=SOUND_S)
     drawn = replace(with_sounds(empty, [kind], 1, rng).sounds[0], start_s=SOUND_MARGIN_S, duration_s=SOUND_S)
+    return event_and_ambience(settings, SoundEvent(drawn, 0.0), position_m, rng)
+
+
+def event_and_ambience(
+    settings: StreamSettings,
+    event: Event,
+    position_m: FloatArray,
+    rng: np.random.Generator,
+    lead_s: float = 0.0,
+) -> tuple[Float32Array, Float32Array]:
+    """Return an event alone and the ambience alone, which leads it, shape (samples,), of full scale 1."""
+    alone = Microphones(position_m[None], np.zeros(1), np.ones(1), settings.sample_rate_hz)
     with one_blas_thread():
-        event = SoundEvent(drawn, 0.0)
         sound = event_sound(event, settings.site, settings.preset, alone, rng).pressure_pa
-        here, samples = stream_ambience(settings, rng), sound.shape[1]
-        ambience = ambience_piece(settings, here, alone, samples, rng, begins=True)[:, :samples]
-    return sound[0] / np.float32(FULL_SCALE_PA), ambience[0] / np.float32(FULL_SCALE_PA)
+        here, samples = stream_ambience(settings, rng), sound.shape[1] + round(lead_s * alone.sample_rate_hz)
+        ambience = ambience_piece(settings, here, alone, samples, rng, begins=True)[0, :samples]
+    sound = np.pad(sound[0], (samples - sound.shape[1], 0))
+    return sound / np.float32(FULL_SCALE_PA), ambience / np.float32(FULL_SCALE_PA)
 
 
 def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, BoolArray]:
-    """Return the measures of every hop that has any, shape (n, measures), and which these are."""
+    """Return `MEASURES` and `BANDS` of every hop that has any, shape (n, 49), and which these are."""
     character, length = SoundCharacter(sample_rate_hz), round(sample_rate_hz / HOPS_A_SECOND)
     read = []
     for hop in sound[: len(sound) // length * length].reshape(-1, length):
@@ -127,11 +138,11 @@ def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, Bool
         read.append(character.read())
     usable = np.array([not isinstance(one, NotUsable) for one in read])
     return np.array([one for one in read if not isinstance(one, NotUsable)]).reshape(
-        -1, len(MEASURES)
+        -1, len(MEASURES) + len(BANDS)
     ), usable
 
 
-def _loudness(sound: Float32Array, sample_rate_hz: float) -> FloatArray:
+def loudness(sound: Float32Array, sample_rate_hz: float) -> FloatArray:
     """Mean square of every hop in the band that the guard hears, shape (hops,)."""
     band = scipy.signal.butter(4, BAND_HZ, "bandpass", fs=sample_rate_hz, output="sos")
     length = round(sample_rate_hz / HOPS_A_SECOND)

@@ -1,0 +1,57 @@
+"""Kinds of road users as a softmax says them, in the model file and as sets of classes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.special
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.abduction.road_users import RoadUserModel, likeliest, with_siren
+from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+CLASSES = ("van", "car", "unknown")
+
+
+def model(seed: int = 0) -> RoadUserModel:
+    rng = np.random.default_rng(seed)
+    return RoadUserModel(("a", "b"), CLASSES, rng.standard_normal((3, 2)), rng.standard_normal(3))
+
+
+@given(st.integers(0, 99), st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=2))
+def test_probabilities_are_those_of_a_softmax_under_their_names(seed: int, measured: list[float]) -> None:
+    one, x = model(seed), np.array(measured)
+    expected = dict(zip(CLASSES, scipy.special.softmax(one.weights @ x + one.biases), strict=True))
+    said = one.classify(x)
+    assert [name for name, _ in said] == sorted(CLASSES)
+    assert dict(said) == pytest.approx(expected, abs=1e-12)
+
+
+@given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.floats(-5.0, 5.0), st.floats(0.05, 0.999))
+def test_no_smaller_set_reaches_the_mass_and_a_siren_takes_its_own(
+    parts: list[float], log_odds: float, mass: float
+) -> None:
+    shares = tuple(zip(sorted(CLASSES), (np.array(parts) / sum(parts)).tolist(), strict=True))
+    chosen, by_name = likeliest(shares, mass), dict(shares)
+    assert sum(by_name[name] for name in chosen) >= mass - 1e-9
+    assert sum(sorted(by_name.values())[-len(chosen) + 1 :] if len(chosen) > 1 else [0.0]) < mass
+    heard = dict(with_siren(shares, log_odds))
+    assert sum(heard.values()) == pytest.approx(1.0)
+    assert np.log(heard["siren"] / (1.0 - heard["siren"])) == pytest.approx(log_odds)
+
+
+def test_a_model_file_keeps_it_and_refuses_what_does_not_fit(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    save_model(path, replace(read_model(), road_users=model()))
+    again = read_model(path).road_users
+    assert again is not None
+    np.testing.assert_array_equal(again.weights, model().weights)
+    assert read_model().road_users is None
+    path.write_text(path.read_text().replace('"unknown"', '"ghost"'))
+    with pytest.raises(InputFileError, match="unknown"):
+        read_model(path)
+    with pytest.raises(InvalidArgumentError, match="biases"):
+        RoadUserModel(("a",), CLASSES, np.zeros((3, 1)), np.zeros(2))
