@@ -46,7 +46,7 @@ SCENES = (
     "junction", "lead-vehicle", "bridge-pier", "merge", "open-road", "wide-crossing", "one-corner",
     "parked-van", "all",
 )  # fmt: skip
-KINDS = ("light", "medium", "heavy", "electric", "bicycle", "scooter", "tram")
+KINDS = ("light", "medium", "heavy", "motorcycle", "electric", "bicycle", "scooter", "tram")
 SOUNDS = (
     *("voice", "steps", "bell", "saw", "drill", "music", "birds", "siren", "wail", "horn", "beeper"),
     *("bicycle-bell", "rain", "gusts", "tone"),
