@@ -20,7 +20,7 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     (tmp_path / "mics.csv").write_text(ARRAY)
     out, figure, report = tmp_path / "model.json", tmp_path / "exam.png", tmp_path / "exam.json"
     command = ["commission", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
-    more = ["--figure", str(figure), "--report", str(report)]
+    more = ["--figure", str(figure), "--report", str(report), "--mounting-errors"]
     assert main([*command, *more]) == 0
     assert "unfit for use" in capsys.readouterr().out
     model = read_model(out)
@@ -29,6 +29,8 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert not model.provenance.fit_for_use
     told = json.loads(report.read_text())
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
+    assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}
+    assert told["mounting"]["as mounted"]["detected"] == told["detected"]
     heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}
     before = out.read_bytes()
     assert main(command) == 0

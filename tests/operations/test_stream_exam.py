@@ -160,6 +160,15 @@ def test_one_junction_sets_no_alarm_for_others() -> None:
         alarm_elsewhere(_made_up(np.random.default_rng(0), 1), 20.0)
 
 
+def test_who_is_missed_throughout_the_last_second_ranks_with_nobody() -> None:
+    streams = [examined(heard(VEHICLES[:2]), [(7.5, 9.9, 0)]), examined(heard([]), [])]
+    figures = examine(streams)
+    assert figures["auroc_last_second"] == pytest.approx(0.75, abs=0.01)
+    assert figures["auroc_1s_before"] == pytest.approx(0.75, abs=0.01)
+    assert figures["auroc_3s_before"] == pytest.approx(0.5, abs=0.01)
+    assert examine(streams[:1])["auroc_last_second"] is None
+
+
 @given(st.integers(0, 2**32 - 1), st.floats(5.0, 200.0))
 def test_an_alarm_keeps_the_onsets_it_was_set_for_on_the_streams_it_was_set_on(
     seed: int, rate: float

@@ -18,12 +18,16 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
+    from worldstate.adapters.files.model_file import Model
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.operations.commissioning.exam_report import Figures
     from worldstate.operations.commissioning.plan import CommissionSettings
 
 EXAMPLE = """\
 examples:
   worldstate commission --array mics.csv --out my_model.json --streams streams --jobs 2
   worldstate commission --array mics.csv --out my_model.json --streams streams --quiet night.wav
+  worldstate commission --array mics.csv --out my_model.json --streams streams --mounting-errors
   worldstate commission --array mics.csv --out try.json --quick"""
 
 
@@ -44,6 +48,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
     add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
     add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
+    wrong = "hear one junction of the exam with a turned array and with wrong positions, too"
+    add("--mounting-errors", action="store_true", help=wrong)
     add(
         "--quick", action="store_true", help="from minutes of sound: to try the command, not to use the model"
     )
@@ -59,8 +65,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.operations.commissioning.commission import LEARNING_STEPS, commission, exam_of
     from worldstate.operations.commissioning.exam_figure import write_exam_figure
+    from worldstate.operations.commissioning.exam_report import exam_figures, mounting_lines
     from worldstate.operations.commissioning.plan import exam_streams, learned_streams
-    from worldstate.operations.commissioning.stream_exam import examine
 
     check_outputs(arguments, "out", "report", figures=("figure",))
     settings = _settings(arguments)
@@ -84,13 +90,30 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.exam:
         with progress_bar("exam", len(exam_streams(settings))) as bar:
             examined = exam_of(array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance)
-        report |= examine(examined)
+        report |= exam_figures(examined)
         if arguments.figure is not None:
             write_exam_figure(examined, arguments.figure)
+    told, lines = dict(report), list[str]()
+    if arguments.mounting_errors:
+        mounted = _mounted(array, model, settings, folder)
+        report["mounting"] = mounted
+        lines += ["", *mounting_lines(mounted)]
     if arguments.report is not None:
         write_report(arguments.report, report)
-    lines = ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
-    return CommandResult(report, lines=lines)
+    lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
+    return CommandResult(report, told, lines)
+
+
+def _mounted(
+    array: "MicrophoneArray", model: "Model", settings: "CommissionSettings", folder: Path
+) -> "dict[str, Figures]":
+    from worldstate.operations.commissioning.commission import exam_of_mountings
+    from worldstate.operations.commissioning.exam_report import exam_figures
+    from worldstate.operations.commissioning.plan import mounting_streams
+
+    with progress_bar("mounting", len(mounting_streams(settings))) as bar:
+        heard = exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
+    return {name: exam_figures(streams) for name, streams in heard.items()}
 
 
 def _settings(arguments: argparse.Namespace) -> "CommissionSettings":

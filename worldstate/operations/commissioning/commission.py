@@ -30,8 +30,9 @@ from worldstate.operations.training.training import TrainingSettings, train_mode
 
 from .guard_training import train_guard
 from .heard_stream import HeardStream, hear_recording, hear_stream
+from .mounting import mountings
 from .open_field import N_OPEN, open_field_features, open_field_windows
-from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams
+from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams, mounting_streams
 from .road_user_training import train_road_users
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
@@ -53,17 +54,27 @@ def heard_streams(
 ) -> Generator[HeardStream, None, None]:
     """Yield every stream of a plan, listened to now or, by the same settings and array, before."""
     folder.mkdir(parents=True, exist_ok=True)
-    yield from in_processes(partial(_heard, array, folder), plan, jobs)
+    for (one,) in in_processes(partial(_heard, array, [array], folder), plan, jobs):
+        yield one
 
 
-def _heard(array: MicrophoneArray, folder: Path, settings: StreamSettings) -> HeardStream:
+def _heard(
+    array: MicrophoneArray, believed: Sequence[MicrophoneArray], folder: Path, settings: StreamSettings
+) -> list[HeardStream]:
+    paths = [_path(array, one, folder, settings) for one in believed]
+    if not all(path.is_file() for path in paths):
+        for path, heard in zip(paths, hear_stream(settings, array, believed), strict=True):
+            heard.save(path)
+    return [HeardStream.load(path) for path in paths]
+
+
+def _path(array: MicrophoneArray, believed: MicrophoneArray, folder: Path, settings: StreamSettings) -> Path:
     # Whatever else is heard under the same name, by another array or preset, is another file.
-    made_with = json.dumps([asdict(settings), array.positions_m.tolist()], default=str, sort_keys=True)
-    digest = hashlib.sha256(made_with.encode()).hexdigest()[:12]
-    path = folder / f"{settings.name}-{digest}.npz"
-    if not path.is_file():
-        hear_stream(settings, array).save(path)
-    return HeardStream.load(path)
+    places = [array.positions_m.tolist()]
+    if believed is not array:
+        places.append(believed.positions_m.tolist())
+    made_with = json.dumps([asdict(settings), *places], default=str, sort_keys=True)
+    return folder / f"{settings.name}-{hashlib.sha256(made_with.encode()).hexdigest()[:12]}.npz"
 
 
 def stream_evidence(model: EnsembleModel, heard: HeardStream) -> HopEvidence:
@@ -254,12 +265,35 @@ def exam_of(
     on_step: Callable[[], None] = lambda: None,
 ) -> list[ExaminedStream]:
     """Let a model hear streams of the five junctions with a name, which it has not learned."""
+    examined = []
+    for one in heard_streams(exam_streams(settings), array, folder, jobs):
+        examined.append(_examined(model, one))
+        on_step()
+    return examined
+
+
+def _examined(model: Model, heard: HeardStream) -> ExaminedStream:
     windows, sequence = _parts(model)
     if sequence.alarm is None:
         raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
-    examined = []
-    for one in heard_streams(exam_streams(settings), array, folder, jobs):
-        posterior = sequence.posterior(stream_evidence(windows, one))
-        examined.append(ExaminedStream(one, stream_truth(one), posterior, sequence.alarm))
+    posterior = sequence.posterior(stream_evidence(windows, heard))
+    return ExaminedStream(heard, stream_truth(heard), posterior, sequence.alarm)
+
+
+def exam_of_mountings(
+    array: MicrophoneArray,
+    model: Model,
+    settings: CommissionSettings,
+    folder: Path,
+    *,
+    on_step: Callable[[], None] = lambda: None,
+) -> dict[str, list[ExaminedStream]]:
+    """Let a model hear one junction of the exam as it would believe each wrong mounting of its array."""
+    mounted = mountings(array, np.random.default_rng(settings.seed))
+    examined: dict[str, list[ExaminedStream]] = {name: [] for name in mounted}
+    for stream in mounting_streams(settings):
+        heard = _heard(array, list(mounted.values()), folder, stream)
+        for name, one in zip(mounted, heard, strict=True):
+            examined[name].append(_examined(model, one))
         on_step()
     return examined

@@ -50,8 +50,10 @@ class HeardStream:
         return cls(tables[HOPS], tables[VEHICLES], tables[ROWS])
 
 
-def hear_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream:
-    """Render a stream and listen to it, block by block."""
+def hear_stream(
+    settings: StreamSettings, array: MicrophoneArray, believed: Sequence[MicrophoneArray] = ()
+) -> list[HeardStream]:
+    """Render a stream and listen to it, block by block, with each array that is believed to hear it."""
     stream, loudness = draw_stream(settings, array), dict[int, FloatArray]()
     about = {
         **{"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
@@ -59,8 +61,8 @@ def hear_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream
     }
     with closing(stream.blocks()) as blocks:
         samples = _recorded(stream, blocks, loudness)
-        hops = _heard_hops(samples, array, settings.sample_rate_hz, settings.name, about)
-    return HeardStream(hops, _vehicles(stream.vehicles), _rows(stream.vehicles, loudness))
+        told = _heard_hops(samples, believed or [array], settings.sample_rate_hz, settings.name, about)
+    return [HeardStream(one, _vehicles(stream.vehicles), _rows(stream.vehicles, loudness)) for one in told]
 
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
@@ -68,7 +70,7 @@ def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
     with open_sound(sound, array.n_microphones) as audio:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))
-        hops = _heard_hops(blocks, array, audio.sample_rate_hz, sound.name, about)
+        (hops,) = _heard_hops(blocks, [array], audio.sample_rate_hz, sound.name, about)
     return HeardStream(hops, _vehicles(()), _rows((), {}))
 
 
@@ -83,20 +85,23 @@ def _recorded(
 
 def _heard_hops(
     blocks: Iterable[Float32Array],
-    array: MicrophoneArray,
+    arrays: Sequence[MicrophoneArray],
     sample_rate_hz: float,
     name: str,
     about: Mapping[str, object],
-) -> HopTable:
-    front_end = FrontEnd(array, sample_rate_hz, listening_settings(sample_rate_hz))
-    frames: list[AcousticFrame] = []
+) -> list[HopTable]:
+    chosen = listening_settings(sample_rate_hz)
+    front_ends = [FrontEnd(array, sample_rate_hz, chosen) for array in arrays]
+    frames: list[list[AcousticFrame]] = [[] for _ in arrays]
     middle: list[Float32Array] = []
     for samples in blocks:
-        middle.append(samples[:, array.middle].copy())
-        frames += front_end.process(samples)
-    if not frames:
+        middle.append(samples[:, arrays[0].middle].copy())
+        for heard, front_end in zip(frames, front_ends, strict=True):
+            heard += front_end.process(samples)
+    if not frames[0]:
         raise InvalidArgumentError(f"{name}: expected more than a second of sound")
-    return HopTable(_columns(frames, np.concatenate(middle)), name=name, about=about)
+    whole = np.concatenate(middle)
+    return [HopTable(_columns(heard, whole), name=name, about=about) for heard in frames]
 
 
 def listening_settings(sample_rate_hz: float) -> FrontEndSettings:

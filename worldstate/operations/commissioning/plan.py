@@ -11,6 +11,7 @@ from worldstate.ground.checks import in_range
 APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
 # Seeds of streams that are learned from and of those that examine; neither is ever the other.
 LEARNED_SEED, EXAM_SEED = 1000, 2000
+MOUNTING_SITE = SITES[2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +86,14 @@ def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     kinds = ((APPROACHES, 0.6 * settings.exam_minutes), (HAZARD_FREE, settings.exam_minutes))
     return [
         _stream(name, traffic, minutes, EXAM_SEED + settings.seed, settings)
-        for name in (SITES[2:3] if settings.quick else SITES)
+        for name in ((MOUNTING_SITE,) if settings.quick else SITES)
         for traffic, minutes in kinds
     ]
+
+
+def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
+    """Return the streams of the exam at the junction where wrong mountings are heard, too."""
+    return [one for one in exam_streams(settings) if one.site.name == MOUNTING_SITE]
 
 
 def junction_named(name: str) -> Site:

@@ -43,6 +43,8 @@ TOGETHER_S, FOLLOWING_S, AFTER_S = 4.0, 6.0, 6.0
 # 20 an hour leave .22, .17, .13 and .08 of other junctions above that, and detect .888, .881, .870 and .849.
 LOUDEST = 3.0
 _CALIBRATED_S = (1.0, 2.0, 3.0)
+# The ten hops before T0, without T0 itself: there the vehicle is as good as in view.
+_LAST_SECOND_S = np.arange(1, 11) * HOP_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +149,8 @@ def examine(streams: Sequence[ExaminedStream]) -> dict[str, float | int | None]:
     found["wrong_side_only"] = _mean([one.other_side and not one.own_side for one in singles])
     found["both_sides_found"] = _mean([one.every_side for one in loud if one.approach.flow == "both"])
     found["onsets_after"] = _mean([one.onsets_after for one in loud])
-    return found | _false_alarms(streams) | _worst(streams) | _calibration(streams) | _times(streams)
+    found |= _ranking(streams) | _false_alarms(streams) | _worst(streams)
+    return found | _calibration(streams) | _times(streams)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +217,14 @@ def _detections(told: Sequence[_Outcome]) -> dict[str, float | None]:
         "lead_s": _mean([one.lead_s for one in told if one.detected]),
         "lead_missed_as_0_s": _mean([one.lead_s for one in told]),
     }
+
+
+def _ranking(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+    """Return the mean AUROC over the last second before T0, and that at single times before it."""
+    times = {f"auroc_{before:g}s_before": np.array([before]) for before in _CALIBRATED_S}
+    asked = {"auroc_last_second": _LAST_SECOND_S, **times}
+    areas = {name: float(auroc_before(streams, before_s).mean()) for name, before_s in asked.items()}
+    return {name: area if np.isfinite(area) else None for name, area in areas.items()}
 
 
 def _false_alarms(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
