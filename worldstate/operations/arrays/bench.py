@@ -19,6 +19,8 @@ from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.direction.srp import srp_phat
+from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
+from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.stft import StreamingStft
@@ -26,6 +28,7 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array
 
+from .bench_evidence import evidence_times
 from .bench_peers import peer_times
 from .bench_stages import AZIMUTHS_RAD, GOAL, NFFT, RATE_HZ, SRP_BINS, srp_beams, stage_times
 from .stopwatch import Milliseconds, elapsed_ms
@@ -33,7 +36,8 @@ from .stopwatch import Milliseconds, elapsed_ms
 SECONDS = 6
 # Running seconds are full after ten hops, and caches warm.
 WARM_UP_HOPS = 11
-EVERYTHING = FrontEndSettings(music_sources=1, tone_band_hz=ENGINE_BAND_HZ)
+EVERYTHING = FrontEndSettings(music_sources=1, tone_band_hz=ENGINE_BAND_HZ, character=True)
+EGO_NOISE = EgoNoiseSettings()
 SETTINGS = {
     "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames a hop; STFT bins 1-18; SRP "
     "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves; MUSIC bins 3-18, 1 source, running "
@@ -45,6 +49,10 @@ SETTINGS = {
     "pyroomacoustics_srp": "the same 19 frames of a tenth of a second, 181 azimuths, 300-1800 Hz (bins "
     "3-18); against srp181_on_a_tenth",
     "pyroomacoustics_music": "the same 19 frames, azimuths and bins, 1 source; against music_on_a_tenth",
+    "scikit_learn_trees": "the two rows of a hop through 60 rounds of 15 trees of 8 leaves, as a histogram "
+    "classifier; against sequence_reader, its inputs included",
+    "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
+    "window_evidence: five experts, each on the window and its mirror image, the site learned",
 }
 """Frame-exact settings of the stages and of every comparison."""
 
@@ -59,8 +67,9 @@ class BenchReport:
     load: float  # Load average of the machine over the last minute, at the end
     settings: Mapping[str, str]  # What is computed, frame by frame: the stages, and each comparison
     # Median and 99th percentile of each stage; of the whole front-end by default (`front_end`); of all that
-    # it can do (`everything`: with MUSIC, bands, looming and tone), also without channel watching and in
-    # noise without any source.
+    # it can do (`everything`: with MUSIC, bands, looming, tone and the character of the sound), also without
+    # channel watching, with ego-noise learned and cancelled, and in noise without any source. `evidence` is
+    # what follows, with its parts.
     stages: Mapping[str, tuple[float, float]]
     # STFT, phase transform, SRP181 of new frames and running second, and published feature together.
     total_ms: float
@@ -130,11 +139,12 @@ def _one_round(street: Float32Array, noise: Float32Array) -> Mapping[str, Millis
     hops = _hops(street)
     frames = StreamingStft(56, NFFT, range(NFFT // 2 + 1)).push(street[:5000])[:19]
     ours = {name: times[WARM_UP_HOPS:] for name, times in stage_times(hops).items()}
-    ours["front_end"] = _front_end_times(hops, FrontEndSettings())
-    ours["everything"] = _front_end_times(hops, EVERYTHING)
-    ours["everything_unwatched"] = _front_end_times(hops, replace(EVERYTHING, watch_channels=False))
-    ours["everything_in_noise_alone"] = _front_end_times(_hops(noise), EVERYTHING)
-    ours |= _on_a_tenth(frames)
+    ours["front_end"], _ = _front_end_times(hops, FrontEndSettings())
+    ours["everything"], heard = _front_end_times(hops, EVERYTHING)
+    ours["everything_unwatched"], _ = _front_end_times(hops, replace(EVERYTHING, watch_channels=False))
+    ours["everything_and_ego_noise"], _ = _front_end_times(hops, replace(EVERYTHING, ego_noise=EGO_NOISE))
+    ours["everything_in_noise_alone"], _ = _front_end_times(_hops(noise), EVERYTHING)
+    ours |= _on_a_tenth(frames) | evidence_times(heard)
     return ours | peer_times(street, frames, RATE_HZ, AZIMUTHS_RAD)
 
 
@@ -143,10 +153,18 @@ def _hops(sound: Float32Array) -> list[Float32Array]:
     return [sound[a:b] for a, b in pairwise(ends)]
 
 
-def _front_end_times(hops: list[Float32Array], settings: FrontEndSettings) -> Milliseconds:
-    """Time `FrontEnd.process`: what a user gets, every check included."""
-    front_end = FrontEnd(roof_array_56(), RATE_HZ, settings)
-    return [elapsed_ms(partial(front_end.process, samples)) for samples in hops][WARM_UP_HOPS:]
+def _front_end_times(
+    hops: list[Float32Array], settings: FrontEndSettings
+) -> tuple[Milliseconds, list[AcousticFrame]]:
+    """Time `FrontEnd.process`, what a user gets, every check included; return also what it heard."""
+    front_end, heard = FrontEnd(roof_array_56(), RATE_HZ, settings), list[AcousticFrame]()
+
+    def process(samples: Float32Array) -> None:
+        heard.extend(front_end.process(samples))
+        if settings.ego_noise is not None:
+            front_end.learn_ego_noise(1.0)
+
+    return [elapsed_ms(partial(process, samples)) for samples in hops][WARM_UP_HOPS:], heard
 
 
 def _on_a_tenth(frames: Complex64Array) -> dict[str, Milliseconds]:
@@ -173,6 +191,8 @@ def _report(runs: list[Mapping[str, Milliseconds]], kernels: tuple[str, ...]) ->
         "published_chain_per_call": chain_ms,
         "pyroomacoustics_srp": medians["srp181_on_a_tenth"],
         "pyroomacoustics_music": medians["music_on_a_tenth"],
+        "scikit_learn_trees": medians["sequence_reader"],
+        "scikit_learn_classifier": medians["window_evidence"],
     }
     return BenchReport(
         blas=kernels,
