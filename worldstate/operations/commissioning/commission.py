@@ -169,7 +169,7 @@ def commission(
         streams.append(one)
         on_step()
     open_field = open_field_windows(
-        open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng)
+        open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs)
     )
     real = None if table is None else table.select(~np.isin(table.environments, settings.leave_out))
     rate_hz = streams[0].hops.about["sample_rate_hz"]
@@ -189,7 +189,7 @@ def commission(
     # What streets sound like is learned from several of them: two are none that are left out.
     guard = road_users = None
     if not settings.quick:
-        guard = train_guard(array, streams, rng)
+        guard = train_guard(array, streams, rng, jobs)
         sites = list(dict.fromkeys(_site(one) for one in streams))
         road_users = train_road_users(array, sites, rate_hz, rng, jobs)
     provenance = replace(model.provenance, fit_for_use=not settings.quick)

@@ -1,6 +1,7 @@
 """Train a domain guard: streets against foreign sounds and warning signals."""
 
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.standardisation import standardisation
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND, MEASURES
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import significant
 
@@ -31,23 +33,30 @@ _FIGURES = 5  # Of a coefficient in the file, which is a fifth as long
 
 
 def guard_rows(
-    array: MicrophoneArray, streets: Sequence[HeardStream], rng: np.random.Generator, sounds_each: int = 1
+    array: MicrophoneArray,
+    streets: Sequence[HeardStream],
+    rng: np.random.Generator,
+    sounds_each: int = 1,
+    jobs: int = 1,
 ) -> GuardRows:
     """Return the rows of streets, and those of so many sounds of each kind at some of their sites."""
     rate_hz = float(streets[0].hops.middle.shape[1] * HOPS_A_SECOND)
     sites = sorted({str(stream.hops.about["site"]) for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
-    heard = [
-        sound_rows(array, name, rate_hz, draws)
-        for name, draws in zip(sites, rng.spawn(len(sites)), strict=True)
-    ]
+    draws = list(zip(sites, rng.spawn(len(sites)), strict=True))
+    heard = in_processes(partial(_sounds_at, array, rate_hz), draws, jobs)
     return GuardRows.joined([street_rows(streets), *heard])
 
 
+def _sounds_at(array: MicrophoneArray, rate_hz: float, drawn: tuple[str, np.random.Generator]) -> GuardRows:
+    name, rng = drawn
+    return sound_rows(array, name, rate_hz, rng)
+
+
 def train_guard(
-    array: MicrophoneArray, streets: Sequence[HeardStream], rng: np.random.Generator
+    array: MicrophoneArray, streets: Sequence[HeardStream], rng: np.random.Generator, jobs: int = 1
 ) -> DomainGuard:
     """Train a guard on streets that were listened to, of two sites at least, and on sounds at these sites."""
-    rows = guard_rows(array, streets, rng)
+    rows = guard_rows(array, streets, rng, jobs=jobs)
     found = [excess[~np.isnan(excess)] for excess in street_excesses(rows).values()]
     return fit_guard(rows, threshold_of(found))
 

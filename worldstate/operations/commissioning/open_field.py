@@ -4,6 +4,7 @@ Nothing of them is of a site: they teach a model what a source is like whose bea
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.signal
@@ -26,6 +27,7 @@ from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
 # 180 windows at a weight of .1 took the other side, named with p > .5, from .39 of the windows to .03
@@ -68,9 +70,15 @@ def drawn_source(rng: np.random.Generator) -> OpenSource:
     )
 
 
-def open_field_features(array: MicrophoneArray, n: int, rng: np.random.Generator) -> FloatArray:
+def open_field_features(
+    array: MicrophoneArray, n: int, rng: np.random.Generator, jobs: int = 1
+) -> FloatArray:
     """Return the features of n windows of drawn sources in the open, shape (n, 60)."""
-    return np.array([open_feature(array, drawn_source(draws), draws) for draws in rng.spawn(n)])
+    return np.array(list(in_processes(partial(_drawn_feature, array), rng.spawn(n), jobs)))
+
+
+def _drawn_feature(array: MicrophoneArray, rng: np.random.Generator) -> FloatArray:
+    return open_feature(array, drawn_source(rng), rng)
 
 
 def open_field_windows(features: FloatArray, weight: float = OPEN_WEIGHT) -> SimulatedWindows:
