@@ -17,6 +17,7 @@ from worldstate.ground.typing import FloatArray, IndexArray
 
 # A file from elsewhere must not make a walk of any length or size.
 MOST_TREES, MOST_NODES, MOST_INPUTS = 4096, 255, 512
+ROWS_AT_ONCE = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +76,12 @@ class BoostedTrees:
 
     def scores(self, X: FloatArray) -> FloatArray:
         """Return the sums before the softmax, shape (n, inputs) -> (n, classes)."""
+        # A few rows at a time stay in the cache: thousands at once take three times as long.
+        some = range(0, len(X), ROWS_AT_ONCE)
+        parts = [self._scores(X[first : first + ROWS_AT_ONCE]) for first in some]
+        return np.concatenate(parts) if parts else np.zeros((0, len(self.baseline)))
+
+    def _scores(self, X: FloatArray) -> FloatArray:
         # Flat indices: a walk of two rows takes a sixth of what indexing by row and tree takes.
         first = np.arange(len(self.split)) * self.split.shape[1]
         row = np.arange(len(X))[:, None] * X.shape[1]
