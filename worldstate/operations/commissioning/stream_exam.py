@@ -150,7 +150,7 @@ def examine(streams: Sequence[ExaminedStream]) -> dict[str, float | int | None]:
     found["both_sides_found"] = _mean([one.every_side for one in loud if one.approach.flow == "both"])
     found["onsets_after"] = _mean([one.onsets_after for one in loud])
     found |= _ranking(streams) | _false_alarms(streams) | _worst(streams)
-    return found | _calibration(streams) | _times(streams)
+    return found | _calibration(streams) | _times(streams) | _by_kind(told)
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +225,18 @@ def _ranking(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     asked = {"auroc_last_second": _LAST_SECOND_S, **times}
     areas = {name: float(auroc_before(streams, before_s).mean()) for name, before_s in asked.items()}
     return {name: area if np.isfinite(area) else None for name, area in areas.items()}
+
+
+def _by_kind(told: Sequence[_Outcome]) -> dict[str, float | int | None]:
+    """Return a row for each kind of the vehicle that comes first, quiet ones too."""
+    found: dict[str, float | int | None] = {}
+    for kind in sorted({one.approach.kinds[0] for one in told}):
+        leads = [one.lead_s for one in told if one.approach.kinds[0] == kind]
+        detected = [lead for lead in leads if lead > 0.0]
+        found[f"approaches_{kind}"] = len(leads)
+        found[f"detected_{kind}"] = len(detected) / len(leads)
+        found[f"lead_{kind}_s"] = _mean(detected)
+    return found
 
 
 def _false_alarms(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
