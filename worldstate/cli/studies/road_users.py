@@ -4,6 +4,9 @@ Let vehicles of every kind pass alone at drawn junctions, hear them with one mic
 (car, van, truck, tram, motorcycle, bicycle) at junctions that were not learned from. Hops in which a vehicle
 lies more than 6 dB below the ambience are of the class *unknown*. Figures are of the hops from 3 s before to
 1.5 s after line of sight, kinds as frequent as in a town.
+
+With --streams such hops of streams are judged, as they come, where one vehicle is heard alone; streams are to
+be of other junctions than the drawn ones.
 """
 
 import argparse
@@ -27,6 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of each kind at each of them (default: %(default)s)",
     )
+    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="that were listened to")
     add("--seed", type=int, default=0, help="who drives how (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--report", type=Path, metavar="JSON", help="write what was found")
@@ -41,9 +45,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.cli.common.outputs import check_outputs
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.ground.checks import in_range
+    from worldstate.operations.commissioning.heard_stream import HeardStream
     from worldstate.operations.commissioning.plan import CommissionSettings, learned_streams
     from worldstate.operations.commissioning.road_user_training import road_user_rows
-    from worldstate.studies.streets.road_user_exam import road_user_exam
+    from worldstate.studies.streets.road_user_exam import road_user_exam, stream_exam
 
     check_outputs(arguments, "report")
     in_range("--passes", arguments.passes, 1, 100)
@@ -53,7 +58,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     rate_hz = plan[0].sample_rate_hz
     # One microphone is heard: that of another array would hear the same, and no level is read.
     rows = road_user_rows(ovad_array(), sites, rate_hz, rng, passes=arguments.passes, jobs=arguments.jobs)
-    found = road_user_exam(rows)
+    streams = [HeardStream.load(path) for path in arguments.streams]
+    found = stream_exam(rows, streams) if streams else road_user_exam(rows)
     report = {name: np.asarray(one).tolist() for name, one in asdict(found).items()}
     if arguments.report is not None:
         write_report(arguments.report, report)

@@ -40,7 +40,7 @@ _SHARES = {
 }
 CLASSES = (*dict.fromkeys(CLASS_OF.values()), UNKNOWN)
 # Hops that count in every figure, seconds from line of sight; those before are learned, too.
-_FIRST_S, _LAST_S = -3.0, 1.5
+FIRST_S, LAST_S = -3.0, 1.5
 _DRIVEN_S, _LEAD_S = 7.0, 3.0  # Before line of sight, and of ambience before that
 # Over the ambience from 250 to 2600 Hz over one second. At 0 dB a seventh of the hops of cars are unknown,
 # though their class is found as well.
@@ -134,12 +134,12 @@ def _pass(
     ratio = (_over_a_second(loudness(part, rate)) for part in (sound, ambience))
     audible = np.divide(*ratio) >= 10.0 ** (_AUDIBLE_DB / 10.0)
     time_s = (np.arange(len(usable)) + 1) / HOPS_A_SECOND - _LEAD_S - seen_s
-    learned = time_s[usable] <= _LAST_S
+    learned = time_s[usable] <= LAST_S
     rows = RoadUserRows(
         measures,
         np.full(len(measures), kind),
         audible[usable],
-        time_s[usable] >= _FIRST_S,
+        time_s[usable] >= FIRST_S,
         np.full(len(measures), site.name),
     )
     return rows.select(learned)

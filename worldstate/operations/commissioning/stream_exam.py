@@ -228,10 +228,12 @@ def _ranking(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
 
 
 def _by_kind(told: Sequence[_Outcome]) -> dict[str, float | int | None]:
-    """Return a row for each kind of the vehicle that comes first, quiet ones too."""
+    """Return three figures for each kind that came alone, quiet ones too."""
+    # With a bicycle comes a car in half of the others, and the car is what is heard.
+    alone = [one for one in told if len(one.approach.kinds) == 1]
     found: dict[str, float | int | None] = {}
-    for kind in sorted({one.approach.kinds[0] for one in told}):
-        leads = [one.lead_s for one in told if one.approach.kinds[0] == kind]
+    for kind in sorted({one.approach.kinds[0] for one in alone}):
+        leads = [one.lead_s for one in alone if one.approach.kinds[0] == kind]
         detected = [lead for lead in leads if lead > 0.0]
         found[f"approaches_{kind}"] = len(leads)
         found[f"detected_{kind}"] = len(detected) / len(leads)
