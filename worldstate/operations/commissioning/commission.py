@@ -18,7 +18,7 @@ from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.site_reference import KINDS
 from worldstate.abduction.signature.window_classes import side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
-from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.adapters.files.acoustic_domain import check_tables, domain_of
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -171,9 +171,9 @@ def commission(
     open_field = open_field_windows(
         open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs)
     )
-    real = None if table is None else table.select(~np.isin(table.environments, settings.leave_out))
     rate_hz = streams[0].hops.about["sample_rate_hz"]
     domain = domain_of(array, [rate_hz], [_site(one) for one in streams])
+    real = None if table is None else labelled_windows(table, settings, domain)
     fit = partial(_windows_learned, real, open_field, domain)
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
@@ -227,6 +227,15 @@ def _windows_learned(
     streams: Sequence[HeardStream],
 ) -> EnsembleModel:
     return window_model(*_table_and_beside(real, open_field, domain, streams))
+
+
+def labelled_windows(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:
+    """Return the windows that may be learned, as windows of this array; those of another one are refused."""
+    kept = table.select(~np.isin(table.environments, settings.leave_out))
+    if kept.domain is None:
+        return replace(kept, domain=domain)
+    check_tables(domain, kept.domain)
+    return kept
 
 
 def _table_and_beside(
