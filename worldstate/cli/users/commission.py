@@ -65,7 +65,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.operations.commissioning.commission import LEARNING_STEPS, commission, exam_of
     from worldstate.operations.commissioning.exam_figure import write_exam_figure
-    from worldstate.operations.commissioning.exam_report import exam_figures, mounting_lines
+    from worldstate.operations.commissioning.exam_report import (
+        REFERENCE,
+        beside_reference,
+        exam_figures,
+        mounting_lines,
+    )
     from worldstate.operations.commissioning.plan import exam_streams, learned_streams
 
     check_outputs(arguments, "out", "report", figures=("figure",))
@@ -93,11 +98,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         report |= exam_figures(examined)
         if arguments.figure is not None:
             write_exam_figure(examined, arguments.figure)
-    told, lines = dict(report), list[str]()
+    told, lines = beside_reference(report), list[str]()
     if arguments.mounting_errors:
         mounted = _mounted(array, model, settings, folder)
         report["mounting"] = mounted
         lines += ["", *mounting_lines(mounted)]
+    report["reference"] = dict(REFERENCE)
     if arguments.report is not None:
         write_report(arguments.report, report)
     lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
