@@ -43,14 +43,14 @@ class Expert:
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
 
-    def log_posteriors(self, seen: FloatArray) -> FloatArray:
-        r"""Return log-softmax of the weighted sums of its view, shape (n, inputs), as shape (n, classes).
+    def sums(self, seen: FloatArray) -> FloatArray:
+        r"""Return what the softmax is taken of, shape (n, classes), from its view, shape (n, inputs).
 
-        .. math:: \ell = \log \mathrm{softmax}\, \big( W (v - \mu) / \sigma + b \big)
+        .. math:: a = W (v - \mu) / \sigma + b
 
         Shapes: seen (n, inputs).
         """
-        return log_softmax((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
+        return np.asarray((seen - self.mean) / self.scale @ self.weights.T + self.intercepts)
 
 
 def expert_views(wanted: Collection[str], levels: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
