@@ -9,7 +9,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import OutOfDomainError
-from worldstate.operations.commissioning.commission import labelled_windows
+from worldstate.operations.commissioning.commission import windows_of_array
 from worldstate.operations.commissioning.plan import CommissionSettings
 
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.1, -0.3, 0.0]], "three")
@@ -21,10 +21,10 @@ def test_a_table_that_names_no_array_is_of_this_one_and_one_of_another_is_refuse
     table = FeatureTable(
         np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3
     )
-    kept = labelled_windows(table, CommissionSettings(leave_out=("SB1",)), HERE)
+    kept = windows_of_array(table, CommissionSettings(leave_out=("SB1",)), HERE)
     assert kept.environments.tolist() == ["SA1", "SB2"]
     # Without it a commissioned model would state no budget and no times.
     assert kept.domain is HERE
     elsewhere = domain_of(MicrophoneArray(ARRAY.positions_m * [1.0, 1.1, 1.0]), [6000.0], ["SA1"])
     with pytest.raises(OutOfDomainError, match="not the array"):
-        labelled_windows(replace(table, domain=elsewhere), CommissionSettings(), HERE)
+        windows_of_array(replace(table, domain=elsewhere), CommissionSettings(), HERE)

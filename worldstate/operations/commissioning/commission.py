@@ -173,7 +173,7 @@ def commission(
     )
     rate_hz = streams[0].hops.about["sample_rate_hz"]
     domain = domain_of(array, [rate_hz], [_site(one) for one in streams])
-    real = None if table is None else labelled_windows(table, settings, domain)
+    real = None if table is None else windows_of_array(table, settings, domain)
     fit = partial(_windows_learned, real, open_field, domain)
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
     windows, beside = _table_and_beside(real, open_field, domain, streams)
@@ -229,7 +229,7 @@ def _windows_learned(
     return window_model(*_table_and_beside(real, open_field, domain, streams))
 
 
-def labelled_windows(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:
+def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:
     """Return the windows that may be learned, as windows of this array; those of another one are refused."""
     kept = table.select(~np.isin(table.environments, settings.leave_out))
     if kept.domain is None:
