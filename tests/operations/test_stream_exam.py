@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.commissioning.heard_stream import HeardStream
+from worldstate.operations.commissioning.plan import CommissionSettings, exam_streams, learned_streams
 from worldstate.operations.commissioning.stream_exam import (
     LOUDEST,
     ExaminedStream,
@@ -179,3 +180,12 @@ def test_an_alarm_keeps_the_onsets_it_was_set_for_on_the_streams_it_was_set_on(
     quiet = _made_up(np.random.default_rng(seed), 3)
     alarm = alarm_for(quiet, rate)
     assert np.mean([_onsets_per_hour(alarm, one) for one in quiet]) <= rate
+
+
+def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_with_it() -> None:
+    plans = [CommissionSettings(seed=seed, junctions=40) for seed in (1, 2)]
+    learned = {one.name: one.seed for plan in plans for one in learned_streams(plan)}
+    exams = {one.name: one.seed for plan in plans for one in exam_streams(plan)}
+    # Approaches and the hazard-free stream of a junction are different traffic under one seed.
+    assert len(set(learned.values())) == 2 * 40 and len(set(exams.values())) == 2 * 5
+    assert not set(learned.values()) & set(exams.values())

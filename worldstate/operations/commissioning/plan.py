@@ -9,8 +9,9 @@ from worldstate.adapters.simulation.stream.traffic import traffic_named
 from worldstate.ground.checks import in_range
 
 APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
-# Seeds of streams that are learned from and of those that examine; neither is ever the other.
-LEARNED_SEED, EXAM_SEED = 1000, 2000
+# Seeds of streams that are learned from and of those that examine; neither is ever the other. Every junction
+# has its own: of one seed the same drivers come at the same times everywhere, and many junctions are one draw.
+LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
 MOUNTING_SITE = SITES[2]
 
 
@@ -61,7 +62,7 @@ class CommissionSettings:
         in_range("hazard_free_minutes", self.hazard_free_minutes, 0.5, 120.0)
         in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
         in_range("onsets_per_hour", self.onsets_per_hour, 0.1, 3600.0)
-        in_range("seed", self.seed, 0, LEARNED_SEED - 1)
+        in_range("seed", self.seed, 0, SEEDS_EACH - 1)
 
 
 def quick_settings(settings: CommissionSettings) -> CommissionSettings:
@@ -75,7 +76,7 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams that a model learns from: drawn junctions, none of the five with a name."""
     kinds = ((APPROACHES, settings.approach_minutes), (HAZARD_FREE, settings.hazard_free_minutes))
     return [
-        _stream(f"S{'AB'[i % 2]}{101 + i // 2}", traffic, minutes, LEARNED_SEED + settings.seed, settings)
+        _stream(f"S{'AB'[i % 2]}{101 + i // 2}", traffic, minutes, LEARNED_SEED + i, settings)
         for i in range(settings.junctions)
         for traffic, minutes in kinds
     ]
@@ -85,7 +86,7 @@ def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
     kinds = ((APPROACHES, 0.6 * settings.exam_minutes), (HAZARD_FREE, settings.exam_minutes))
     return [
-        _stream(name, traffic, minutes, EXAM_SEED + settings.seed, settings)
+        _stream(name, traffic, minutes, EXAM_SEED + SITES.index(name), settings)
         for name in ((MOUNTING_SITE,) if settings.quick else SITES)
         for traffic, minutes in kinds
     ]
@@ -107,7 +108,7 @@ def _stream(
     return StreamSettings(
         junction_named(name),
         minutes,
-        seed,
+        seed + SEEDS_EACH * settings.seed,
         traffic_named(traffic),
         sample_rate_hz=rate_for(settings.bandwidth_hz),
     )
