@@ -9,8 +9,8 @@ from worldstate.adapters.simulation.stream.traffic import traffic_named
 from worldstate.ground.checks import in_range
 
 APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
-# Seeds of streams that are learned from and of those that examine; neither is ever the other. Every junction
-# has its own: of one seed the same drivers come at the same times everywhere, and many junctions are one draw.
+# Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
+# junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
 MOUNTING_SITE = SITES[2]
 
