@@ -9,6 +9,7 @@ Figures = dict[str, float | int | None]
 # What OVAD's 56 microphones reach in 130 approaches and two hours without hazards, by
 # worldstate commission --labelled extracted_features.csv --out model.json --report exam.json
 # with OVAD's array and the released static windows: its window model knows real ones of these junctions.
+# Seed 1 of a plan in which the same drivers came to every junction; the present one is still to be taken.
 REFERENCE: Mapping[str, float] = {
     "detected": 0.746,
     "lead_s": 1.86,
