@@ -254,6 +254,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             kinds=kinds,
             sequence=sequence,
             sightings=self._vision.sightings(frame.stamp_ns) if self._vision else (),
+            look=self._vision.last_look(frame.stamp_ns) if self._vision else None,
             source=self.source,
         )
 
@@ -274,7 +275,8 @@ def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> M
     heard = measurement.bearing, measurement.signature, measurement.kinds
     answer = _answer(vision, AcousticSettings(), stamp_ns, *heard)
     sightings = vision.sightings(stamp_ns) if vision else ()
-    return replace(measurement, co_evidence=answer, sightings=sightings)
+    look = vision.last_look(stamp_ns) if vision else None
+    return replace(measurement, co_evidence=answer, sightings=sightings, look=look)
 
 
 def _answer(

@@ -12,7 +12,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
-from worldstate.measurement.measurement import Bearing, Sighting
+from worldstate.measurement.measurement import Bearing, Look, Sighting
 from worldstate.measurement.protocols import Side
 from worldstate.measurement.sector import WHOLE_SIDES, Sector
 
@@ -20,6 +20,7 @@ from .detections import DetectionFilter, DetectionLog
 from .pinhole import PinholeCamera
 from .static_boxes import ParkedRule, kept_and_parked
 
+SENSOR = "camera"
 # Points at which a miss rate is averaged over the part of the sector that is in view.
 # The table is piecewise linear over tens of degrees: more points do not change the mean.
 SAMPLES = 8
@@ -188,11 +189,11 @@ class VisionQuery:
         if not any(label in kept for label in labels):
             return Unqueried("the signature predicts no class that a camera would see")
         sector = self._sector(bearing, side)
-        d = self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
+        d = self._degraded(stamp_ns)
         beta = self._expected_miss_rate(sector, d, labels)
         if beta is None:
             return Unqueried("sector outside the field of view")
-        clutter = self.settings.clutter_rate if self._clutter is None else self._clutter(d)
+        clutter = self._clutter_rate(d)
         found = any(
             sighting.moving
             and sighting.label in labels
@@ -225,6 +226,39 @@ class VisionQuery:
         if frame != self._last[0]:
             self._last = (frame, self._look(self.detections, frame))
         return self._last[1]
+
+    def last_look(self, stamp_ns: int) -> Look | None:
+        """Return what the whole image at `stamp_ns` says: whether anything that moves is in view.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Time on the clock of the stream, nanoseconds.
+
+        Returns
+        -------
+        Look or None
+            With the time at which the image was taken; None without one.
+
+        Examples
+        --------
+        >>> VisionQuery(PinholeCamera(), detections=None).last_look(0) is None
+        True
+        """
+        frame = self._frame(stamp_ns)
+        if frame is None or self.detections is None:
+            return None
+        d = self._degraded(stamp_ns)
+        beta = self._expected_miss_rate(self._view, d, self.settings.keep.labels)
+        moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
+        answer = (Present if moving else Absent)(1.0 if beta is None else beta, self._clutter_rate(d))
+        return Look(SENSOR, int(self.detections.stamps_ns[frame]), answer)
+
+    def _degraded(self, stamp_ns: int) -> float:
+        return self._degradation(stamp_ns) if callable(self._degradation) else self._degradation
+
+    def _clutter_rate(self, d: float) -> float:
+        return self.settings.clutter_rate if self._clutter is None else self._clutter(d)
 
     def _frame(self, stamp_ns: int) -> int | None:
         if self.detections is None:

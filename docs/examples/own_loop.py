@@ -27,6 +27,7 @@ from worldstate import (
     AcousticAdapter,
     Bearing,
     DetectionFrame,
+    Look,
     MicrophoneArray,
     NotUsable,
     PinholeCamera,
@@ -94,6 +95,11 @@ class LiveCamera:
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return all that is in view."""
         return self._seen or ()
+
+    def last_look(self, stamp_ns: int) -> Look | None:
+        """Return whether anything is in view; here an image belongs to the hop that it was taken in."""
+        answer = self.ask(stamp_ns, NotUsable("whole view"))
+        return None if isinstance(answer, Unqueried) else Look("camera", stamp_ns, answer)
 
 
 class PatternSignature:

@@ -40,7 +40,7 @@ def street(rng, seconds):
     )
 
 
-def test_a_hop_of_the_whole_chain_makes_fewer_than_ten_checks():
+def test_a_hop_of_the_whole_chain_makes_at_most_ten_checks():
     boxes = DetectionFrame(np.array([[900.0, 500.0, 1100.0, 650.0]]), np.array([0.9]), ("car",))
     vision = VisionQuery(PinholeCamera(), DetectionLog.at_rate([boxes] * 60, frame_rate_hz=10.0))
     signature = SiteSignature(read_model().signature)
@@ -65,7 +65,7 @@ def test_a_hop_of_the_whole_chain_makes_fewer_than_ten_checks():
         sys.setprofile(None)
     assert hops == 10
     assert world.state.entities
-    assert calls / hops < 10
+    assert calls / hops <= 10
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,9 @@ def test_what_the_camera_is_asked_for_follows_from_the_claim(v2x):
         def sightings(self, stamp_ns):
             return ()
 
+        def last_look(self, stamp_ns):
+            return None
+
     beacon = v2x.approach_from_left()[0]
     adapter = v2x.BeaconAdapter(vision=Spy())
     kinds = ["passenger car", "truck", "pedestrian", "spaceship"]

@@ -1,7 +1,8 @@
 r"""How the groups of a sequence model follow one another where nothing is heard, and what looks say of them.
 
-Whoever comes counts down through the groups into view, .004 of the hops begin anew anywhere, and the whole is
-balanced, so that it leaves the context's distribution c as it is. As a chain in continuous time,
+Whoever comes counts down through the groups into view, behind somebody in view or not; .004 of the hops begin
+anew anywhere, and the whole is balanced, so that it leaves the context's distribution c as it is. As a
+chain in continuous time,
 
 .. math:: A(\Delta t) = \exp(Q\, \Delta t), \qquad c\, Q = 0,
 
@@ -22,8 +23,6 @@ from .markov_chain import LONGEST_STEP_S
 from .ratio_recursion import balanced
 
 HOP_S = 0.1
-# Looks closer in time repeat each other's misses; a vehicle stays in view for some seconds.
-LOOK_INTERVAL_S = 1.0
 _LEAK = 0.004  # Of the hops: what the sequence of groups does not foresee
 # A wrong prior on both sides slides the alarm: by +2 nats from 15 to 58 onsets an hour, by -1 to a detection
 # of .73 in place of .94.
@@ -32,9 +31,16 @@ _SMALLEST = 1e-12
 _ROUNDS = 1000  # After 200 the prior still drifts by a percent, after these by 1e-9
 
 _COMING = len(COMING_S)
-# Mean seconds in a group before another one follows: passages, and births of .004 a hop.
+_REST = len(GROUPS) - _COMING
+# Who comes does so with nobody in view or behind somebody who is: of the sequence's groups each coming one is
+# two states here. Taken as one, every second of an empty view would count against whoever comes.
+STATES = (*GROUPS[:_COMING], *(f"{group}_behind" for group in GROUPS[:_COMING]), *GROUPS[_COMING:])
+_SEEN = STATES.index("seen")
+IN_VIEW = np.array([state == "seen" or state.endswith("_behind") for state in STATES])
+# Mean seconds in a state before another one follows: passages, and births of .004 a hop.
+_PASSED_S = 3.0
 _FOLLOWS_S = {
-    ("seen", "past"): 3.0,
+    ("seen", "past"): _PASSED_S,
     ("other", "seen"): 3.0,
     ("past", "none"): 4.0,
     ("rising", "falling"): 4.0,
@@ -43,7 +49,37 @@ _FOLLOWS_S = {
     ("none", "rising"): 25.0,
     ("none", "other"): 25.0,
     ("rising", GROUPS[_COMING - 1]): 25.0,
-}
+    ("seen", f"{GROUPS[_COMING - 1]}_behind"): 25.0,
+} | {(f"{group}_behind", group): _PASSED_S for group in GROUPS[:_COMING]}
+
+
+def states_of(groups: FloatArray, prior: FloatArray) -> FloatArray:
+    """Return the states of some groups' probabilities, shape (..., groups) to (..., states).
+
+    Whoever comes has somebody ahead in view as often as the mean of what the prior and what the sound has of
+    the street without whoever comes. By the prior alone what is heard is one or the other and a look tells
+    which, by the sound alone a look tells nothing of who comes: on streams the truth lies between.
+
+    Examples
+    --------
+    >>> even = np.full(len(GROUPS), 1.0 / len(GROUPS))
+    >>> states = states_of(even, even)
+    >>> round(float(states[IN_VIEW].sum()), 3), np.allclose(groups_of(states), even)
+    (0.167, True)
+    """
+    coming, rest = groups[..., :_COMING], groups[..., _COMING:]
+    behind = 0.5 * prior[_COMING] / prior[_COMING:].sum() + 0.5 * _in_view_of(rest)
+    return np.concatenate([coming * (1.0 - behind), coming * behind, rest], axis=-1)
+
+
+def _in_view_of(rest: FloatArray) -> FloatArray:
+    return np.asarray(rest[..., :1] / np.maximum(rest.sum(axis=-1, keepdims=True), _SMALLEST))
+
+
+def groups_of(states: FloatArray) -> FloatArray:
+    """Return the groups of some states' probabilities: the inverse of `states_of`."""
+    coming = states[..., :_COMING] + states[..., _COMING : 2 * _COMING]
+    return np.concatenate([coming, states[..., 2 * _COMING :]], axis=-1)
 
 
 def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
@@ -68,13 +104,13 @@ def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
     return np.asarray(moved / moved.sum())
 
 
-def group_transition(prior: FloatArray, step_ns: int) -> FloatArray:
-    """Return the chain of some nanoseconds, shape (groups, groups), which leaves a prior as it is.
+def state_transition(prior: FloatArray, step_ns: int) -> FloatArray:
+    """Return the chain of some nanoseconds, shape (states, states), which leaves a prior of the groups.
 
     Examples
     --------
     >>> prior = np.full(len(GROUPS), 1.0 / len(GROUPS))
-    >>> np.allclose(prior @ group_transition(prior, 10**9), prior)
+    >>> np.allclose(states_of(prior, prior) @ state_transition(prior, 10**9), states_of(prior, prior))
     True
     """
     return _transition(tuple(prior.tolist()), step_ns)
@@ -95,35 +131,27 @@ def _transition(prior: tuple[float, ...], step_ns: int) -> FloatArray:
 @lru_cache(maxsize=8)
 def _rates_hz(prior: tuple[float, ...]) -> FloatArray:
     """Return Q, 1/s, from the chain of one hop that is nearest to the countdown."""
-    hop = np.eye(len(GROUPS))
-    towards_view = (GROUPS.index("seen"), *range(_COMING - 1))
-    arrows = dict(zip(enumerate(towards_view), np.diff((0.0, *COMING_S)), strict=True))
-    arrows |= {(GROUPS.index(one), GROUPS.index(to)): mean_s for (one, to), mean_s in _FOLLOWS_S.items()}
+    hop, share = np.eye(len(STATES)), states_of(np.array(prior), np.array(prior))
+    spans_s = np.diff((0.0, *COMING_S))
+    arrows = {(k, k - 1 if k else _SEEN): span for k, span in enumerate(spans_s)}
+    arrows |= {(_COMING + k, _COMING + k - 1 if k else _SEEN): span for k, span in enumerate(spans_s)}
+    arrows |= {(STATES.index(one), STATES.index(to)): mean_s for (one, to), mean_s in _FOLLOWS_S.items()}
     for (one, to), mean_s in arrows.items():
         hop[one, [one, to]] += [-HOP_S / mean_s, HOP_S / mean_s]
-    loose = (1.0 - _LEAK) * hop + _LEAK * np.array(prior)
-    still = balanced(loose, np.array(prior), _ROUNDS)
-    return np.asarray((still - np.eye(len(GROUPS))) / HOP_S)
+    loose = (1.0 - _LEAK) * hop + _LEAK * share
+    still = balanced(loose, share, _ROUNDS)
+    return np.asarray((still - np.eye(len(STATES))) / HOP_S)
 
 
-def look_log_likelihoods(answer: CoEvidence, prior: FloatArray) -> FloatArray:
-    r"""Return log p(look | group), shape (groups,), nats.
-
-    .. math:: p(V \mid g) = v_g\, p(V \mid visible) + (1 - v_g)\, p(V \mid none)
-
-    with v the share of a group's time in which somebody is in view: all of "seen"; of those who come, who are
-    told even while another one is in view, as much as of the rest; none elsewhere.
+def look_log_likelihoods(answer: CoEvidence) -> FloatArray:
+    """Return log p(look | state), shape (states,), nats: of a view with somebody in it, or with nobody.
 
     Examples
     --------
     >>> from worldstate.abduction.co_evidence import Absent
-    >>> prior = np.full(len(GROUPS), 1.0 / len(GROUPS))
-    >>> told = look_log_likelihoods(Absent(miss_rate=0.04, clutter_rate=0.01), prior)
-    >>> told[GROUPS.index("seen")].round(2), told[GROUPS.index("none")].round(2)
-    (np.float64(-3.23), np.float64(-0.01))
+    >>> told = look_log_likelihoods(Absent(miss_rate=0.04, clutter_rate=0.01))
+    >>> [told[STATES.index(name)].round(2).item() for name in ("seen", "coming_1s", "coming_1s_behind")]
+    [-3.23, -0.01, -3.23]
     """
-    seen = GROUPS.index("seen")
-    in_view = np.zeros(len(GROUPS))
-    in_view[:_COMING], in_view[seen] = prior[seen] / prior[_COMING:].sum(), 1.0
     _, visible, none = np.exp(answer.log_likelihoods())
-    return np.asarray(np.log(np.maximum(in_view * visible + (1.0 - in_view) * none, _SMALLEST)))
+    return np.asarray(np.log(np.maximum(np.where(IN_VIEW, visible, none), _SMALLEST)))

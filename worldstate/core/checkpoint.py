@@ -19,7 +19,7 @@ from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Priors
 
-from .memory import Memory
+from .memory import CountedLook, Memory
 from .sequence_memory import SequenceMemory
 
 Logs = tuple[float, ...]
@@ -56,6 +56,7 @@ class _Memory:
     predicted: Priors | None
     instant: _Posterior | None
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
+    looks: tuple[CountedLook, ...] = field(default=(), metadata=ADDED)
     bearing: Bearing | None = field(default=None, metadata=ADDED)
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)
     sequence: SequenceMemory | None = field(default=None, metadata=ADDED)
@@ -113,6 +114,7 @@ def memory_record(memory: Memory) -> _Memory:
         predicted=memory.predicted,
         instant=None if instant is None else _posterior_record(instant),
         threshold=memory.threshold,
+        looks=memory.looks,
         bearing=memory.bearing,
         domain=memory.domain,
         sequence=memory.sequence,
@@ -138,6 +140,7 @@ def memory_of(record: FilterRecord) -> Memory:
         predicted=kept.predicted,
         instant=None if kept.instant is None else _posterior_of(kept.instant, directions),
         threshold=kept.threshold,
+        looks=kept.looks,
         bearing=kept.bearing,
         domain=kept.domain,
         sequence=kept.sequence,

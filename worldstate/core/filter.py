@@ -21,7 +21,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, Measurement
+from worldstate.measurement.measurement import Approach, Bearing, Look, Measurement
 from worldstate.state import Context, WorldState
 
 from .checkpoint import FilterRecord, memory_of, memory_record
@@ -31,6 +31,7 @@ from .step import (
     FilterModel,
     advance,
     alarmed,
+    counted_once,
     site_geometry_of,
     update_advisories,
     update_entities,
@@ -48,6 +49,7 @@ _KINDS: dict[str, Any] = {
     "co_evidence": CoEvidence,
     "bearing": Bearing | NotUsable,
     "approach": Approach | NotUsable,
+    "look": Look | None,
     "sequence": SequenceReading | NotUsable | None,
 }
 
@@ -222,11 +224,13 @@ class WorldFilter:
         world = self.predict_to(measurement.stamp_ns)
         memory, model = world._memory, world._model
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
+        memory, measurement, looked = counted_once(memory, measurement)
         # Evidence first: association and births need the explanations of this very window.
         memory = update_evidence(memory, measurement, weights, model)
-        memory = update_sightings(memory, measurement, weights, model)
+        if looked:
+            memory = update_sightings(memory, measurement, weights, model)
         memory = update_advisories(memory, measurement, model)
-        memory = update_sequence(memory, measurement, weights, model)
+        memory = update_sequence(memory, measurement, looked, model)
         return replace(world, memory=update_entities(memory, measurement, model))
 
     def to_dict(self) -> dict[str, Any]:
@@ -289,6 +293,8 @@ def _checked(measurement: Measurement, context: Context, last_ns: dict[str, int]
         raise InvalidArgumentError(
             f"stamp_ns: expected time stamps in order, got {stamp_ns} ns after {before_ns} ns"
         )
+    if measurement.look is not None:
+        _integer_ns("look.stamp_ns", measurement.look.stamp_ns)
     for name, value, low, high in _numbers(measurement):
         # NaN compares false, and what is no number does not compare.
         if not isinstance(value, int | float | np.number) or not low <= value <= high:

@@ -16,6 +16,15 @@ from worldstate.state import Context, Priors
 from .sequence_memory import SequenceMemory
 
 
+@dataclass(frozen=True, slots=True)
+class CountedLook:
+    """The last look of a sensor, and the source whose measurement carried it first."""
+
+    sensor: str
+    stamp_ns: int
+    source: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Memory:
     """State of a filter; everything else in it is configuration."""
@@ -30,6 +39,7 @@ class Memory:
     seq: int = 0  # Measurements so far
     sighted: int = 0  # Entities born in view so far
     last_ns: tuple[tuple[str, int], ...] = ()  # Last time stamp of each source
+    looks: tuple[CountedLook, ...] = ()  # Last look of every sensor, sorted by its name
     predicted: Priors | None = None  # Explanation priors of the last update; None before the first
     # Posterior of the last window alone, at the policy's reference prior; None before the first.
     instant: Posterior | None = None

@@ -1,6 +1,7 @@
 """What the filter believes of who comes into view and when: the sequence's reading with everything else."""
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -13,32 +14,43 @@ from worldstate.abduction.sequence.sequence_model import (
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
-from worldstate.belief.sequence_chain import context_prior, group_transition, look_log_likelihoods
+from worldstate.belief.sequence_chain import (
+    STATES,
+    context_prior,
+    groups_of,
+    look_log_likelihoods,
+    state_transition,
+    states_of,
+)
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 
 # In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
 _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
+# A look says who is in view then, not who will be: multiplied into the belief hop by hop, looks at one vehicle
+# outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
+_LOOK_NS = 500_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceMemory:
     """Belief of both sides, and the alarm that goes by it."""
 
-    sides: SequenceBelief
+    sides: SequenceBelief  # Without the looks: each tells of its own time
     share: FloatArray  # shape (groups,): Prior that the model was trained at
     margin_s: float
     alarm: SequenceAlarm | None
     # Stamps of the last .3 s with the log-odds of coming into view within three seconds, left and right.
     recent: tuple[tuple[int, float, float], ...] = ()
     over_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When each side was last above the threshold
+    looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
 
     def check(self) -> None:
         """Refuse what a file cannot have been written with."""
-        groups, sides = (len(GROUPS),), (len(SIDES), len(GROUPS))
+        groups, sides = (len(GROUPS),), (len(SIDES), len(STATES))
         for name, array, shape in (
             ("share", self.share, groups),
             ("belief", self.sides.belief, sides),
@@ -54,7 +66,9 @@ class SequenceMemory:
     @property
     def posterior(self) -> SequencePosterior:
         """The belief, as one hop of a stream."""
-        return SequencePosterior(self.sides.belief[None], self.margin_s)
+        told = sum((look_log_likelihoods(look.answer) for look in self.looks), np.zeros(len(STATES)))
+        weighed = self.sides.belief * np.exp(told - told.max())
+        return SequencePosterior(groups_of(weighed / weighed.sum(axis=1, keepdims=True))[None], self.margin_s)
 
     def alarmed(self, stamp_ns: int) -> tuple[bool, ...]:
         """Return for each side whether it was above the threshold within the last second."""
@@ -62,30 +76,37 @@ class SequenceMemory:
         return tuple(over_ns is not None and over_ns >= last_ns for over_ns in self.over_ns)
 
 
-def carried(kept: SequenceMemory, step_ns: int, context: Context) -> SequenceMemory:
-    """Return the belief some time on, with nothing heard."""
-    chain = group_transition(_prior(kept.share, context), step_ns)
-    return replace(kept, sides=next_belief(kept.sides, None, chain))
+def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
+    """Return the belief at a later time, with nothing heard."""
+    chain = state_transition(_prior(kept.share, context), step_ns)
+    looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
+    return replace(kept, sides=next_belief(kept.sides, None, chain), looks=looks)
 
 
 def informed(
-    kept: SequenceMemory | None, measurement: Measurement, look_weight: float, context: Context
+    kept: SequenceMemory | None,
+    measurement: Measurement,
+    look: Look | None,
+    context: Context,
 ) -> SequenceMemory | None:
     """Return the belief at a measurement after its reading and its look; None before the first reading."""
     reading = measurement.sequence
     said = None
     if isinstance(reading, SequenceReading):
-        said = at_prior(reading.groups, reading.share, _prior(reading.share, context))
+        prior = _prior(reading.share, context)
+        said = states_of(at_prior(reading.groups, reading.share, prior), prior)
         sides = first_belief(said) if kept is None else kept.sides
-        recent, over_ns = ((), (None,) * len(SIDES)) if kept is None else (kept.recent, kept.over_ns)
-        kept = SequenceMemory(sides, reading.share, reading.margin_s, reading.alarm, recent, over_ns)
+        first = SequenceMemory(sides, reading.share, reading.margin_s, reading.alarm)
+        kept = first if kept is None else replace(first, recent=kept.recent, over_ns=kept.over_ns, looks=kept.looks)
     if kept is None:
         return None
-    prior = _prior(kept.share, context)
-    look = look_weight * look_log_likelihoods(measurement.co_evidence, prior)
     # The chain of the hops since then was taken when the belief was carried here.
-    sides = next_belief(kept.sides, said, np.eye(len(GROUPS)), look)
-    return _alerted(replace(kept, sides=sides), measurement.stamp_ns)
+    sides = next_belief(kept.sides, said, np.eye(len(STATES)))
+    looks = kept.looks
+    if look is not None:
+        looks = (*(one for one in looks if one.sensor != look.sensor), look)
+    looks = tuple(sorted(looks, key=attrgetter("sensor")))
+    return _alerted(replace(kept, sides=sides, looks=looks), measurement.stamp_ns)
 
 
 def _prior(share: FloatArray, context: Context) -> FloatArray:

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
+from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
@@ -13,16 +15,15 @@ from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
-from worldstate.belief.sequence_chain import LOOK_INTERVAL_S
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import predict_track
 from worldstate.belief.vision_update import log_co_evidence, surviving, vision_update
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
-from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 
-from .memory import Memory, priors_of
+from .memory import CountedLook, Memory, priors_of
 from .sequence_memory import carried, informed
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
@@ -44,7 +45,6 @@ class Weights:
 
     sound: float
     look: float
-    sequence_look: float  # Of the groups of a sequence, which are forgotten slower than entities
 
 
 def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry:
@@ -62,9 +62,41 @@ def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings
     .. math:: \kappa = \min(dt / T, 1), \quad T = window for the sound, look interval for the look
     """
     before_ns = dict(memory.last_ns).get(measurement.source, start_ns)
-    elapsed_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
-    intervals_s = (settings.window_s, settings.look_interval_s, LOOK_INTERVAL_S)
-    return Weights(*(min(elapsed_s / interval_s, 1.0) for interval_s in intervals_s))
+    sensor, look_ns = _searched(measurement)
+    last = _last_look(memory, sensor)
+    heard_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
+    looked_s = max(seconds(look_ns - (start_ns if last is None else last.stamp_ns)), 0.0)
+    return Weights(
+        min(heard_s / settings.window_s, 1.0),
+        min(looked_s / settings.look_interval_s, 1.0),
+    )
+
+
+def counted_once(memory: Memory, measurement: Measurement) -> tuple[Memory, Measurement, bool]:
+    """Return the memory that knows of a look, the measurement, and whether its look is a new one.
+
+    A look belongs to the sensor that looked. Carried by a second source, or delivered again, it says nothing
+    new; the source that carried it first keeps its answer, since each of its windows is weighed anew.
+    """
+    sensor, stamp_ns = _searched(measurement)
+    last = _last_look(memory, sensor)
+    if last is None or stamp_ns > last.stamp_ns:
+        others = tuple(one for one in memory.looks if one.sensor != sensor)
+        looks = (*others, CountedLook(sensor, stamp_ns, measurement.source))
+        return replace(memory, looks=tuple(sorted(looks, key=attrgetter("sensor")))), measurement, True
+    own = last.source == measurement.source
+    answer = measurement.co_evidence if own else Unqueried(f"this look of {sensor} was counted before")
+    return memory, replace(measurement, co_evidence=answer, sightings=(), look=None), False
+
+
+def _searched(measurement: Measurement) -> tuple[str, int]:
+    """Return whose look a measurement carries, and when it was made; of none, the source's own now."""
+    look = measurement.look
+    return (measurement.source, measurement.stamp_ns) if look is None else (look.sensor, look.stamp_ns)
+
+
+def _last_look(memory: Memory, sensor: str) -> CountedLook | None:
+    return next((one for one in memory.looks if one.sensor == sensor), None)
 
 
 def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
@@ -79,7 +111,7 @@ def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
         stamp_ns=stamp_ns,
         explanation=explanation.predict(model.context.rates.values_hz, step_ns),
         tracks=surviving(tracks, model.site.settings),
-        sequence=memory.sequence and carried(memory.sequence, step_ns, model.context),
+        sequence=memory.sequence and carried(memory.sequence, stamp_ns, step_ns, model.context),
     )
 
 
@@ -156,13 +188,17 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, model.policy))
 
 
-def update_sequence(memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel) -> Memory:
+def update_sequence(
+    memory: Memory, measurement: Measurement, looked: bool, model: FilterModel
+) -> Memory:
     """Return the memory after what a sequence model and the camera say of who comes into view, and when."""
-    said = measurement.sequence
+    said, answer, look = measurement.sequence, measurement.co_evidence, measurement.look
+    if look is None and looked and not isinstance(answer, Unqueried):
+        look = Look(measurement.source, measurement.stamp_ns, answer)
     refused = said if isinstance(said, NotUsable) else None
     return replace(
         memory,
-        sequence=informed(memory.sequence, measurement, weights.sequence_look, model.context),
+        sequence=informed(memory.sequence, measurement, look, model.context),
         # Other sources do not speak of it: what was said last holds.
         no_sequence=memory.no_sequence if said is None else refused,
     )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from worldstate.abduction.co_evidence import CoEvidence
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import ClassShares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
@@ -89,6 +89,30 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
+class Look:
+    """One search of a sensor through all that it sees: it counts once, whoever carries it.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor that looked.
+    stamp_ns : int
+        When it looked, nanoseconds on the stream's clock: of an image, when it was taken.
+    answer : Present or Absent
+        Whether anything that moves is in view, with the miss and the clutter rate of the whole view.
+
+    Examples
+    --------
+    >>> Look("camera", 100_000_000, Absent(miss_rate=0.06)).sensor
+    'camera'
+    """
+
+    sensor: str
+    stamp_ns: int
+    answer: Present | Absent
+
+
+@dataclass(frozen=True, slots=True)
 class Measurement:
     """Evidence of one modality at one instant, with the answer of its co-evidence channel.
 
@@ -104,6 +128,9 @@ class Measurement:
         Marginalised where not usable.
     sightings : tuple of Sighting
         All that the co-evidence channel reports, in the queried sector or not.
+    look : Look or None
+        The search that co-evidence and sightings come from; None takes them for one of the source's own, made
+        at the stamp.
     domain : Familiar, Foreign, WarningSignal or None
         Whether the model was made for what was heard; None where nothing tells.
     kinds : tuple of (str, float)
@@ -129,6 +156,7 @@ class Measurement:
     bearing: Bearing | NotUsable
     approach: Approach | NotUsable
     sightings: tuple[Sighting, ...] = ()
+    look: Look | None = None
     domain: DomainVerdict | None = None
     kinds: ClassShares = ()
     sequence: SequenceReading | NotUsable | None = None

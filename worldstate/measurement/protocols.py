@@ -6,7 +6,7 @@ from typing import Literal, Protocol, TypeVar
 from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.ground.values import NotUsable
 
-from .measurement import Bearing, Measurement, Sighting
+from .measurement import Bearing, Look, Measurement, Sighting
 
 RawT = TypeVar("RawT", contravariant=True)
 
@@ -65,6 +65,7 @@ class CoEvidenceChannel(Protocol):
     >>> class Blind:
     ...     def ask(self, stamp_ns, bearing, expected_labels=None, side=None): return Unqueried("no camera")
     ...     def sightings(self, stamp_ns): return ()
+    ...     def last_look(self, stamp_ns): return None
     >>> channel: CoEvidenceChannel = Blind()
     >>> channel.ask(0, NotUsable("flat spectrum")).reason
     'no camera'
@@ -82,4 +83,8 @@ class CoEvidenceChannel(Protocol):
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return all objects that the channel detects at this instant, in any sector."""
+        ...
+
+    def last_look(self, stamp_ns: int) -> Look | None:
+        """Return the search of the whole view that counts at this instant, None where there was none."""
         ...

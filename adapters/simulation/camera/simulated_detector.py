@@ -62,14 +62,14 @@ def detect(
     for x, low, high, sight in zip(trajectory.behind(0.0)[0], right, left, seen, strict=True):
         share = (high - low) / min(kind.length_m, LENGTH_M)
         clear = share > LEAST_VISIBLE and (sight or not site.is_open)
-        box = _project(camera, site, x, (low, high), kind) if clear else None
-        missed = rng.random() < _miss_rate(x, 0.5 * (low + high))
+        box = project(camera, site, x, (low, high), kind) if clear else None
+        missed = rng.random() < miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)
         if box is None or missed:
             frames.append(())
         else:
             score = float(np.clip(luck * (0.75 + 0.25 * min(share, 1.0)), 0.3, 0.999))
-            frames.append((SimulatedDetection(_inside(box + jitter, camera), round(score, 4), kind.label),))
+            frames.append((SimulatedDetection(inside(box + jitter, camera), round(score, 4), kind.label),))
     return frames
 
 
@@ -79,13 +79,13 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
     right, left = site.sight_m(x, camera.position_m[:2])
     middle = rng.uniform(0.6 * right, 0.6 * left)
     low, high = max(middle - LENGTH_M / 2.0, right), min(middle + LENGTH_M / 2.0, left)
-    box = _project(camera, site, x, (low, high))
+    box = project(camera, site, x, (low, high))
     if box is None:
         return [()] * frames
     noise = rng.normal(0.0, PARKED_NOISE_PX, (frames, 4))
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
     return [
-        (SimulatedDetection(_inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)
+        (SimulatedDetection(inside(box + n, camera), float(s)),) for n, s in zip(noise, scores, strict=True)
     ]
 
 
@@ -113,12 +113,13 @@ def to_json(frames: list[Frame]) -> dict[str, Any]:
     return {"detections_per_frame": rows}
 
 
-def _miss_rate(ahead_m: float, lateral_m: float) -> float:
+def miss_rate(ahead_m: float, lateral_m: float) -> float:
+    """Return how often a vehicle there is missed, by its azimuth."""
     azimuth_deg = abs(math.degrees(math.atan2(lateral_m, ahead_m)))
     return float(np.interp(azimuth_deg, MISS_AZIMUTH_DEG, MISS_RATE))
 
 
-def _project(
+def project(
     camera: PinholeCamera, site: Site, middle_x: float, ends_y: tuple[float, float], kind: VehicleKind = LIGHT
 ) -> FloatArray | None:
     """Box (left, top, right, bottom) around the visible cuboid; None where it is outside the image."""
@@ -141,7 +142,7 @@ def _project(
     return None if outside else box
 
 
-def _inside(box: FloatArray, camera: PinholeCamera) -> tuple[float, float, float, float]:
+def inside(box: FloatArray, camera: PinholeCamera) -> tuple[float, float, float, float]:
     """Clip to the image, keep at least one pixel, round to tenths."""
     x = np.clip(box[[0, 2]], 0.0, camera.width_px - 1.0)
     y = np.clip(box[[1, 3]], 0.0, camera.height_px - 1.0)
