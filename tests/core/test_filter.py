@@ -582,9 +582,10 @@ def test_overlapping_bearings_are_not_counted_twice():
     m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
     (track,) = world.memory.tracks
     once, often = (track,), (track,)
-    once = acoustic_update(once, m, world.explanation, 1.0, FilterSettings())
+    sides, visible = world.memory.sides, world.explanation.visible
+    once = acoustic_update(once, m, sides, visible, 1.0, FilterSettings())
     for _ in range(10):
-        often = acoustic_update(often, m, world.explanation, 0.1, FilterSettings())
+        often = acoustic_update(often, m, sides, visible, 0.1, FilterSettings())
     for row, most in ((0, 0.35), (2, 0.2)):
         one, ten, none = (t.motion.covariance[row, row] for t in (once[0], often[0], track))
         assert ten == pytest.approx(one, rel=most)

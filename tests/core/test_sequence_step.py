@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Context, Measurement, WorldFilter, WorldState
+from worldstate import Context, Look, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
@@ -49,7 +49,7 @@ def run(world: WorldFilter, measured: Sequence[Measurement]) -> list[WorldFilter
 
 def belief(world: WorldFilter) -> np.ndarray:
     assert world.memory is not None and world.memory.sequence is not None
-    return world.memory.sequence.sides.belief
+    return world.memory.sequence.posterior.groups[0]
 
 
 def looks(rng: np.random.Generator, hops: int) -> list[CoEvidence]:
@@ -161,17 +161,68 @@ def test_the_alarm_is_held_for_a_second_whatever_the_hop() -> None:
     assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
 
 
-def test_looks_say_whether_somebody_is_in_view_and_as_much_in_a_second_as_one() -> None:
+def test_a_look_says_who_is_in_view_for_half_a_second_however_often() -> None:
     said = replace(drawn(np.random.default_rng(1), 1)[0], groups=np.full((2, len(GROUPS)), 1 / len(GROUPS)))
     seen = GROUPS.index("seen")
-    beliefs = [
-        belief(run(WorldFilter(), [heard(hop, said, look) for hop in range(1, 11)])[-1])[:, seen]
+    present, nothing, absent = (
+        run(WorldFilter(), [heard(hop, said, look) for hop in range(1, 11)])[-1]
         for look in (Present(0.04, 0.01), UNASKED, Absent(0.04, 0.01))
-    ]
-    assert (np.diff(beliefs, axis=0) < -0.01).all()
-    once = belief(run(WorldFilter(), [heard(10, said, Absent(0.04, 0.01))])[-1])[:, seen]
-    # Of ten looks in a second each counts a tenth, less what was forgotten since.
-    assert (beliefs[2] > once - 1e-9).all() and (beliefs[2] < beliefs[1]).all()
+    )
+    assert (np.diff([belief(one)[:, seen] for one in (present, nothing, absent)], axis=0) < -0.01).all()
+    once = run(WorldFilter(), [heard(10, said, Absent(0.04, 0.01))])[-1]
+    np.testing.assert_allclose(belief(absent), belief(once))
+    later = belief(absent.update(heard(16, said, source="radar")))
+    np.testing.assert_allclose(later, belief(nothing.update(heard(16, said, source="radar"))))
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_a_look_counts_once_whoever_carries_it_and_however_often(seed: int) -> None:
+    """One image is carried by the sound, again by the sound, and by a second source a little later."""
+    rng = np.random.default_rng(seed)
+    said, seen = drawn(rng, 12), looks(rng, 12)
+    car = Sighting(0.4, 0.02, "car", 0.9)
+    worlds = [WorldFilter(), WorldFilter()]
+    for hop, (reading, answer) in enumerate(zip(said, seen, strict=True), 1):
+        look = None if isinstance(answer, Unqueried) else Look("camera", hop * 10**8, answer)
+        sightings = (car,) if isinstance(answer, Present) else ()
+        first = replace(heard(hop, reading, answer), look=look, sightings=sightings)
+        dumb = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+        second = replace(first, stamp_ns=first.stamp_ns + 10**7, sequence=None, signature=dumb, source="v2x")
+        bare = replace(second, look=None, sightings=(), co_evidence=UNASKED)
+        carried = [first, first, second] if look is not None else [first, first, bare]
+        for number, every in enumerate((carried, [first, bare])):
+            for one in every:
+                worlds[number] = worlds[number].update(one)
+    many, once = (world.state for world in worlds)
+    assert [one.id for one in many.entities] == [one.id for one in once.entities]
+    for one, other in zip(many.entities, once.entities, strict=True):
+        assert one.existence_probability == pytest.approx(other.existence_probability, abs=1e-12)
+    np.testing.assert_allclose(belief(worlds[0]), belief(worlds[1]), atol=1e-9)
+    hypotheses = [np.array([*asdict(state.cues[0].hypotheses).values()]) for state in (many, once)]
+    np.testing.assert_allclose(hypotheses[0], hypotheses[1], atol=1e-9)
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_whoever_comes_on_one_side_takes_nothing_from_the_other(seed: int) -> None:
+    """Law 11: sides are factored. Both come, and both are entities, each with its own place and chance."""
+    rng = np.random.default_rng(seed)
+    coming = np.concatenate([rng.dirichlet(np.ones(COMING)) * 0.9, np.full(len(GROUPS) - COMING, 0.1 / 6)])
+    nobody = np.concatenate([np.full(COMING, 0.01 / 9), np.full(len(GROUPS) - COMING, 0.99 / 6)])
+    alone, both = (
+        run(
+            WorldFilter(),
+            [heard(hop, SequenceReading(np.stack([coming, one]), SHARE)) for hop in range(1, 5)],
+        )
+        for one in (nobody, coming)
+    )
+    left = {one.direction: one for one in alone[-1].state.entities}
+    sides = {one.direction: one for one in both[-1].state.entities}
+    assert (set(left), set(sides)) == ({"left"}, {"left", "right"})
+    assert sides["left"].existence_probability == pytest.approx(left["left"].existence_probability, abs=1e-6)
+    assert sides["left"].azimuth_rad == pytest.approx(-sides["right"].azimuth_rad)
+    assert sides["left"].existence_probability == pytest.approx(0.9, abs=1e-6)
 
 
 def test_without_a_sequence_nothing_is_said_of_times_and_the_rule_alarms() -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
-from .explanation import ExplanationBelief
+from .hidden_belief import HiddenBelief
 from .motion import log_azimuth_likelihood, update_approach, update_azimuth
 from .settings import FilterSettings
 from .track import Track, merged
@@ -19,27 +19,25 @@ _LOG_CLUTTER_DENSITY = -math.log(math.pi)
 def acoustic_update(
     tracks: tuple[Track, ...],
     measurement: Measurement,
-    explanation: ExplanationBelief,
+    sides: HiddenBelief,
+    visible: float,
     weight: float,
     settings: FilterSettings,
 ) -> tuple[Track, ...]:
-    """Return the tracks after the bearing and the approach rate of a measurement."""
+    """Return the tracks after the bearing and the approach rate of a measurement; `visible` is P(visible)."""
     # R is divided by `weight`: consecutive windows overlap, and full weight for each would count the same
     # samples up to ten times.
     if weight <= 0.0:
         return tracks
     return tuple(
-        _updated(track, measurement, explanation, weight, settings) if track.moving else track
+        _updated(track, measurement, sides, visible, weight, settings) if track.moving else track
         for track in tracks
     )
 
 
-def hidden_share(track: Track, explanation: ExplanationBelief) -> float:
+def hidden_share(track: Track, sides: HiddenBelief) -> float:
     """Return P(hidden | exists) of a track, 0 once it was seen."""
-    if track.seen:
-        return 0.0
-    hidden, emerged = explanation.hidden[track.side], explanation.emerged[track.side]
-    return hidden / (hidden + emerged) if hidden + emerged > 0 else 1.0
+    return 0.0 if track.seen else sides.hidden_share(track.side)
 
 
 def association_probability(
@@ -60,12 +58,13 @@ def association_probability(
 def _updated(
     track: Track,
     measurement: Measurement,
-    explanation: ExplanationBelief,
+    sides: HiddenBelief,
+    visible: float,
     weight: float,
     settings: FilterSettings,
 ) -> Track:
-    share = hidden_share(track, explanation)
-    sounding = _sounding(track, explanation)
+    share = hidden_share(track, sides)
+    sounding = _sounding(track, sides, visible)
     motion, used = track.motion, False
     if not isinstance(measurement.bearing, NotUsable):
         std, path = _path(measurement.bearing.std_rad, share, settings)
@@ -96,8 +95,6 @@ def _path(line_of_sight_std_rad: float, share: float, settings: FilterSettings) 
     return line_of_sight_std_rad, settings.line_of_sight_path_probability
 
 
-def _sounding(track: Track, explanation: ExplanationBelief) -> float:
+def _sounding(track: Track, sides: HiddenBelief, visible: float) -> float:
     """Return the probability that this entity is the source of this window's sound."""
-    if track.seen:
-        return explanation.visible * track.existence
-    return explanation.hidden[track.side] + explanation.emerged[track.side]
+    return visible * track.existence if track.seen else sides.existence(track.side)

@@ -8,6 +8,7 @@ from worldstate.ground.values import NANOSECONDS_PER_SECOND
 from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
+from .hidden_belief import HiddenBelief
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, heard_as
 
@@ -25,6 +26,7 @@ class BirthDeath:
 def birth_death(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
+    sides: HiddenBelief | None,
     births: tuple[int, ...],
     alarmed: Sequence[bool],
     rearmed: Sequence[bool],
@@ -33,6 +35,8 @@ def birth_death(
 ) -> BirthDeath:
     """Return the tracks with hidden entities born, updated and removed.
 
+    What a sequence says of the `sides` stands in for the explanations, which exclude each other.
+
     Shapes: alarmed (K,), rearmed (K,).
     """
     settings, kept, counts = site.settings, list(tracks), list(births)
@@ -40,14 +44,15 @@ def birth_death(
     for k in range(len(site.sides)):
         current = next((track for track in kept if not track.seen and track.side == k), None)
         if current is None:
-            heard = explanation.hidden[k] >= settings.birth_probability or alarmed[k]
+            believed = sides or HiddenBelief.of_explanation(explanation)
+            heard = believed.hidden[k] >= settings.birth_probability or alarmed[k]
             if heard and rearmed[k]:
                 # What came into view from here before was another vehicle: the new one starts without its
                 # mass.
                 explanation = explanation.forget_origin(k)
                 begun.append(k)
                 returning = _returning(kept, k, measurement.stamp_ns, site)
-                existence = min(explanation.hidden[k], 1.0)
+                existence = min((sides or explanation).hidden[k], 1.0)
                 if returning is None:
                     kept.append(_born(k, counts[k], existence, measurement, site))
                     counts[k] += 1
@@ -56,8 +61,7 @@ def birth_death(
                     kept.append(_hidden_again(returning, k, existence, measurement, site))
         else:
             kept.remove(current)
-            # The sum of two exponentials exceeds one by rounding where nothing else is possible.
-            existence = min(explanation.hidden[k] + explanation.emerged[k], 1.0)
+            existence = (sides or HiddenBelief.of_explanation(explanation)).existence(k)
             if existence >= settings.death_probability or alarmed[k]:
                 labels = heard_as(current, measurement.kinds)
                 kept.append(replace(current, existence=existence, labels=labels))

@@ -163,17 +163,15 @@ class WorldFilter:
     @cached_property
     def state(self) -> WorldState:
         """The snapshot S_t."""
-        memory, context, settings = self._memory, self.context, self.settings
+        memory, context, settings, sides = self._memory, self.context, self.settings, self._memory.sides
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
-            entities=tuple(
-                entity_of(track, memory.explanation, context, settings) for track in memory.tracks
-            ),
+            entities=tuple(entity_of(track, memory, context, settings) for track in memory.tracks),
             relations=tuple(
                 edge
                 for track in memory.tracks
-                for edge in relations_of(track, memory.explanation, context, memory.stamp_ns)
+                for edge in relations_of(track, sides, context, memory.stamp_ns)
             ),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
             cues=cues_of(memory, self._model, self.risk, alarmed(memory)),

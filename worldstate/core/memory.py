@@ -8,6 +8,7 @@ from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
+from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.track import Track
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
@@ -49,6 +50,13 @@ class Memory:
     domain: DomainVerdict | None = None  # Of the last measurement
     sequence: SequenceMemory | None = None  # Who comes into view and when; None without such a model
     no_sequence: NotUsable | None = None  # Why the last one that should have said so could not
+
+    @property
+    def sides(self) -> HiddenBelief:
+        """What is believed of hidden vehicles: by the sequence where one is read, or the explanations."""
+        if self.sequence is None:
+            return HiddenBelief.of_explanation(self.explanation)
+        return self.sequence.hidden
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

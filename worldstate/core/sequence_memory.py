@@ -7,12 +7,14 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
+    COMING_S,
     GROUPS,
     SequenceAlarm,
     SequencePosterior,
     soon_log_odds,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
 from worldstate.belief.sequence_chain import (
     STATES,
@@ -30,8 +32,8 @@ from worldstate.state import Context
 
 # In seconds what the alarm's threshold was set with in hops; less by the rounding of stamps.
 _SMOOTHED_NS, _HELD_NS, _SLACK_NS = 300_000_000, 1_000_000_000, 5_000_000
-# A look says who is in view then, not who will be: multiplied into the belief hop by hop, looks at one vehicle
-# outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
+# A look says who is in view then, not who will be: multiplied into the belief hop by hop, looks at one
+# vehicle outweigh the next one for seconds (Brier skill at 2 s .175 in place of .204 without looks).
 _LOOK_NS = 500_000_000
 
 
@@ -70,6 +72,12 @@ class SequenceMemory:
         weighed = self.sides.belief * np.exp(told - told.max())
         return SequencePosterior(groups_of(weighed / weighed.sum(axis=1, keepdims=True))[None], self.margin_s)
 
+    @property
+    def hidden(self) -> HiddenBelief:
+        """Whoever comes into view within eight seconds is hidden now."""
+        coming = self.posterior.groups[0, :, : len(COMING_S)].sum(axis=1)
+        return HiddenBelief(tuple(np.minimum(coming, 1.0).tolist()), (0.0,) * len(SIDES))
+
     def alarmed(self, stamp_ns: int) -> tuple[bool, ...]:
         """Return for each side whether it was above the threshold within the last second."""
         last_ns = stamp_ns - _HELD_NS - _SLACK_NS
@@ -95,9 +103,9 @@ def informed(
     if isinstance(reading, SequenceReading):
         prior = _prior(reading.share, context)
         said = states_of(at_prior(reading.groups, reading.share, prior), prior)
-        sides = first_belief(said) if kept is None else kept.sides
-        first = SequenceMemory(sides, reading.share, reading.margin_s, reading.alarm)
-        kept = first if kept is None else replace(first, recent=kept.recent, over_ns=kept.over_ns, looks=kept.looks)
+        if kept is None:
+            kept = SequenceMemory(first_belief(said), reading.share, reading.margin_s, reading.alarm)
+        kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
     if kept is None:
         return None
     # The chain of the hops since then was taken when the belief was carried here.

@@ -7,7 +7,8 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.belief.acoustic_update import hidden_share
-from worldstate.belief.explanation import ExplanationBelief
+from worldstate.belief.hidden_bearing import hidden_bearing
+from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.motion import MotionBelief
 from worldstate.belief.polar import AZIMUTH_RATE, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
@@ -23,13 +24,16 @@ from .step import FilterModel
 _KNOWN_LOG_RANGE_STD = 0.25
 
 
-def entity_of(
-    track: Track, explanation: ExplanationBelief, context: Context, settings: FilterSettings
-) -> Entity:
+def entity_of(track: Track, memory: Memory, context: Context, settings: FilterSettings) -> Entity:
     """Return the published entity of a track."""
-    share, existence = hidden_share(track, explanation), existence_of(track, explanation)
+    sides = memory.sides
+    share, existence = hidden_share(track, sides), existence_of(track, sides)
     hidden, motion = share >= 0.5, track.motion
     range_m = _range(motion, hidden)
+    azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
+    if hidden:
+        edge_rad = context.occluders[track.side].edge_azimuth_rad
+        azimuth_rad, std_rad = hidden_azimuth(track.side, motion, memory.sequence, edge_rad, settings)
     return Entity(
         id=track.id,
         status="hidden" if hidden else "visible" if track.seen else "emerged",
@@ -38,8 +42,8 @@ def entity_of(
         classification=tuple(Classification(label, probability) for label, probability in track.labels),
         moving=track.moving,
         direction=context.directions[track.side],
-        azimuth_rad=motion.azimuth_rad,
-        azimuth_std_rad=published_std(motion, hidden, settings),
+        azimuth_rad=azimuth_rad,
+        azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else float(motion.mean[AZIMUTH_RATE]),
         range_m=range_m,
         position_m=None if range_m is None else _position(motion, range_m),
@@ -54,11 +58,9 @@ def entity_of(
     )
 
 
-def existence_of(track: Track, explanation: ExplanationBelief) -> float:
-    """Return the existence of a track, from the explanation belief of its side until it is seen."""
-    if track.seen:
-        return track.existence
-    return min(explanation.hidden[track.side] + explanation.emerged[track.side], 1.0)
+def existence_of(track: Track, sides: HiddenBelief) -> float:
+    """Return the existence of a track, from the belief of its side until it is seen."""
+    return track.existence if track.seen else sides.existence(track.side)
 
 
 def time_to_arrival(track: Track) -> float | None:
@@ -67,22 +69,22 @@ def time_to_arrival(track: Track) -> float | None:
     return 1.0 / rate if track.approach_heard and rate > track.motion.inverse_tta_std_hz else None
 
 
-def published_std(motion: MotionBelief, hidden: bool, settings: FilterSettings) -> float:
-    """Return the published standard deviation of the azimuth, with the bias of the path while hidden."""
-    if not hidden:
-        return motion.azimuth_std_rad
+def hidden_azimuth(
+    side: int, motion: MotionBelief, kept: SequenceMemory | None, edge_rad: float, settings: FilterSettings
+) -> tuple[float, float]:
+    """Return where a hidden vehicle is and how far that may be off: by its time to visible, or as heard."""
+    if kept is not None:
+        return hidden_bearing(kept.posterior.groups[0, side, : len(COMING_S)], edge_rad)
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
-    return math.hypot(motion.azimuth_std_rad, settings.hidden_bias_std_rad)
+    return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, settings.hidden_bias_std_rad)
 
 
-def relations_of(
-    track: Track, explanation: ExplanationBelief, context: Context, stamp_ns: int
-) -> list[Relation]:
+def relations_of(track: Track, sides: HiddenBelief, context: Context, stamp_ns: int) -> list[Relation]:
     """Return the relations of one entity to its occluder and to the ego vehicle."""
     occluder, edges = context.occluders[track.side].id, []
     if not track.seen:
-        share = hidden_share(track, explanation)
+        share = hidden_share(track, sides)
         edges.append(Relation(track.id, occluder, "occluded_by", share, stamp_ns))
     elif track.was_hidden:
         edges.append(Relation(track.id, occluder, "emerged_from", 1.0, stamp_ns))
@@ -106,7 +108,8 @@ def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: 
     explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
     assert instant is not None
     track = next((t for t in memory.tracks if not t.seen and t.side == k), None)
-    motion = model.site.prior(k) if track is None else track.motion
+    motion, settings = model.site.prior(k) if track is None else track.motion, model.site.settings
+    azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, side.edge_azimuth_rad, settings)
     # The floor only matters where P(hidden) has underflowed; then no direction has a share.
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     arrival_s = None if track is None else time_to_arrival(track)
@@ -114,8 +117,8 @@ def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: 
     own_alarm = memory.sequence is not None and memory.sequence.alarm is not None
     return RiskCue(
         direction=side.label,
-        azimuth_rad=motion.azimuth_rad,
-        azimuth_std_rad=published_std(motion, True, model.site.settings),
+        azimuth_rad=azimuth_rad,
+        azimuth_std_rad=std_rad,
         risk=hazard_risk * share,
         confidence=share,
         statistic=min(instant.hidden_total, 1.0),

@@ -101,9 +101,9 @@ def _last_look(memory: Memory, sensor: str) -> CountedLook | None:
 
 def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     """Return the memory predicted to a later time."""
-    step_ns, explanation = stamp_ns - memory.stamp_ns, memory.explanation
+    step_ns, explanation, sides = stamp_ns - memory.stamp_ns, memory.explanation, memory.sides
     tracks = tuple(
-        predict_track(track, hidden_share(track, explanation), seconds(step_ns), model.site)
+        predict_track(track, hidden_share(track, sides), seconds(step_ns), model.site)
         for track in memory.tracks
     )
     return replace(
@@ -131,7 +131,14 @@ def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, 
         memory,
         explanation=explanation,
         lag=memory.lag.add(evidence, explanation, window_ns),
-        tracks=acoustic_update(memory.tracks, measurement, explanation, weights.sound, settings),
+        tracks=acoustic_update(
+            memory.tracks,
+            measurement,
+            replace(memory, explanation=explanation).sides,
+            explanation.visible,
+            weights.sound,
+            settings,
+        ),
         predicted=priors_of(prior),
     )
 
@@ -188,9 +195,7 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, model.policy))
 
 
-def update_sequence(
-    memory: Memory, measurement: Measurement, looked: bool, model: FilterModel
-) -> Memory:
+def update_sequence(memory: Memory, measurement: Measurement, looked: bool, model: FilterModel) -> Memory:
     """Return the memory after what a sequence model and the camera say of who comes into view, and when."""
     said, answer, look = measurement.sequence, measurement.co_evidence, measurement.look
     if look is None and looked and not isinstance(answer, Unqueried):
@@ -237,6 +242,7 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
     hidden = birth_death(
         memory.tracks,
         memory.explanation,
+        None if memory.sequence is None else memory.sides,
         memory.births,
         alarmed(memory),
         [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
