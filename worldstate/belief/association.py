@@ -16,6 +16,7 @@ _FORBIDDEN = 1e6
 # Cost of pairing a parked with a moving object: above gate_sigma**2 = 16, so that any free partner is
 # preferred, and finite, so that a parked car that drives off keeps its id.
 _PARKED_MISMATCH = 20.0
+_LEAST = 1e-300  # Keeps logarithms finite
 
 
 def match_visible(
@@ -71,13 +72,22 @@ def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> flo
 
 
 def _emergence(track: Track, sighting: Sighting, site: SiteGeometry) -> float:
-    """Return the log odds of this hidden entity against an unheard vehicle; -inf beyond every gate."""
+    r"""Return the log odds of this hidden entity against a vehicle that was not heard.
+
+    .. math:: \frac{r\, [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)]}{u / V}
+
+    with existence r, the edges a of its own side k and of the others, of which the signature may have meant
+    one with probability c, and vehicles that were not heard, u of them, anywhere in the view V.
+    """
     settings = site.settings
-    distances = [side.distance_rad(sighting.azimuth_rad) for side in site.sides]
-    if min(distances) > settings.handover_gate_rad:
-        return -math.inf
-    near = [math.exp(-2.0 * (distance / settings.handover_gate_rad) ** 2) for distance in distances]
+    near = [_edge_density(side.distance_rad(sighting.azimuth_rad), settings) for side in site.sides]
     own = near.pop(track.side)
     heard = (1.0 - settings.side_confusion) * own + settings.side_confusion * max(near, default=own)
-    unheard = settings.unheard_probability * max([own, *near])
-    return math.log(max(track.existence, 1e-12) * heard / unheard)
+    unheard = settings.unheard_probability / (2.0 * site.view_half_angle_rad)
+    return math.log(max(track.existence * heard, _LEAST)) - math.log(unheard)
+
+
+def _edge_density(distance_rad: float, settings: FilterSettings) -> float:
+    """Return the density of first sightings at a distance from the edge that they come past, 1/rad."""
+    deviations = distance_rad / settings.edge_std_rad
+    return math.exp(-0.5 * deviations**2) / (settings.edge_std_rad * math.sqrt(2.0 * math.pi))

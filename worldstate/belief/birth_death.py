@@ -78,7 +78,7 @@ def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -
         for track in tracks
         if track.seen and track.moving and track.last_seen_ns is not None
         if earliest_ns <= track.last_seen_ns <= latest_ns
-        if side.distance_rad(track.motion.azimuth_rad) <= settings.handover_gate_rad
+        if side.distance_rad(track.motion.azimuth_rad) <= settings.reocclusion_gate_rad
     ]
     return min(candidates, key=lambda track: side.distance_rad(track.motion.azimuth_rad), default=None)
 

@@ -30,6 +30,7 @@ COMMANDS = (
     "studies.evaluate",
     "studies.evaluate_features",
     "studies.evaluate_signatures",
+    "studies.evaluate_streams",
     "studies.foreign_sounds",
     "studies.road_users",
     "users.extract_features",

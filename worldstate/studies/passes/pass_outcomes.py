@@ -106,7 +106,7 @@ def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
     """Tell whether the entity hidden on the first vehicle's side at T0 is the one seen in its place later."""
     followed, entry_s = stream.followed, one.entries_s[0]
     hop = int(np.searchsorted(followed.time_s, entry_s - SLACK_S)) - 1
-    hidden = followed.hidden(hop, one.sides[0], EXISTS)
+    hidden = followed.hidden(hop, one.sides[0])
     later = int(np.searchsorted(followed.time_s, entry_s + SEEN_AFTER_S))
     seen = _seen_at(stream, _vehicle(stream.heard, entry_s), later)
     if not hidden or seen is None:
