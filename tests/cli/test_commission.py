@@ -31,6 +31,10 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
     assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}
     assert told["mounting"]["as mounted"]["detected"] == told["detected"]
+    follow = ["evaluate-streams", *map(str, (tmp_path / "model.streams").glob("*-200*.npz"))]
+    assert main([*follow, "--model", str(out), "--report", str(tmp_path / "passes.json")]) == 0
+    passes = json.loads((tmp_path / "passes.json").read_text())["junctions"]
+    assert passes["all"]["approaches"] >= 1 and 0.0 < passes["all"]["hazard_free_hours"] < 0.1
     heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}
     before = out.read_bytes()
     assert main(command) == 0

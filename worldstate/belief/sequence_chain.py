@@ -36,6 +36,7 @@ _REST = len(GROUPS) - _COMING
 # two states here. Taken as one, every second of an empty view would count against whoever comes.
 STATES = (*GROUPS[:_COMING], *(f"{group}_behind" for group in GROUPS[:_COMING]), *GROUPS[_COMING:])
 _SEEN = STATES.index("seen")
+COMES = np.array([state.startswith("coming") for state in STATES])
 IN_VIEW = np.array([state == "seen" or state.endswith("_behind") for state in STATES])
 # Mean seconds in a state before another one follows: passages, and births of .004 a hop.
 _PASSED_S = 3.0

@@ -99,8 +99,8 @@ class FilterSettings:
     # The second bounds the first: four deviations of an entity unseen for a second are most of the view.
     gate_sigma: float = 4.0
     gate_rad: float = 0.35
-    # Corners of real junctions stand within 6 deg of the default, and a box of 20 % of a vehicle that is missed
-    # once or twice moves on by 3 to 6 deg an image.
+    # Corners of real junctions stand within 6 deg of the default; missed once or twice, a vehicle moves on by
+    # 3 to 6 deg an image.
     edge_std_rad: float = 0.15
     reocclusion_gate_rad: float = 0.8  # Less than the 64 deg between the edges of a default junction
     # Rarely wrong on junctions that the signature model was trained on, often on others.

@@ -30,12 +30,13 @@ _MOST_MISSES = 0.99
 
 @dataclass(frozen=True, slots=True)
 class VisionUpdate:
-    """Result of a look: tracks, explanations, sides of hand-overs, number of entities born in view so far."""
+    """Result of a look."""
 
     tracks: tuple[Track, ...]
     explanation: ExplanationBelief
-    handed_over: tuple[int, ...]
-    born: int
+    handed_over: tuple[int, ...]  # Sides of hand-overs
+    emerged: tuple[int, ...]  # Sides past whose edge somebody came into view, heard before or not
+    born: int  # Entities born in view so far
 
 
 def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
@@ -71,7 +72,9 @@ def vision_update(
         explanation = explanation.emerge(side, site.settings.handover_residual)
     fresh = [s for j, s in new if j not in emerging.values()]
     after += [_born(s, measurement, born + n, site) for n, s in enumerate(fresh)]
-    return VisionUpdate(tuple(after), explanation, handed_over, born + len(fresh))
+    unheard = (_emerged_from(sighting, site) for sighting in fresh)
+    emerged = {*handed_over, *(side for side in unheard if side is not None)}
+    return VisionUpdate(tuple(after), explanation, handed_over, tuple(sorted(emerged)), born + len(fresh))
 
 
 def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
@@ -130,6 +133,13 @@ def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, sit
         labels=((sighting.label, sighting.score),),
     )
     return _found(seen, measurement, site.settings)
+
+
+def _emerged_from(sighting: Sighting, site: SiteGeometry) -> int | None:
+    """Return the side past whose edge a moving object has just come, None where it came from elsewhere."""
+    side = site.nearest_side(sighting.azimuth_rad)
+    near = site.sides[side].distance_rad(sighting.azimuth_rad) <= 2.0 * site.settings.edge_std_rad
+    return side if near and sighting.moving else None
 
 
 def _not_sighted(track: Track, answer: CoEvidence, weight: float, site: SiteGeometry) -> Track:

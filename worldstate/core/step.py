@@ -182,6 +182,7 @@ def update_sightings(
         lag=lag,
         handover_ns=handover_ns,
         sighted=seen.born,
+        sequence=memory.sequence and memory.sequence.emerged(seen.emerged, measurement.stamp_ns),
     )
 
 

@@ -23,7 +23,7 @@ from .pass_outcomes import PassedStream
 from .stream_camera import stream_detections
 
 CameraKind = Literal["all", "cars", "none"]
-# Everything that drives, however small its box; the boxes that the authors of OVAD keep are cars above 100 px.
+# Everything that drives, however small its box; of OVAD's boxes its authors keep cars above 100 px.
 EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcycle", "bicycle"}), 0.5, 20.0)
 
 
