@@ -1,4 +1,4 @@
-"""Association of sightings with entities, in view and at the edge of an occluder."""
+"""Association of sightings with entities, in view and at the edge of an occluder, all at once."""
 
 import math
 
@@ -11,80 +11,68 @@ from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 from .track import Track
 
-# Cost of a pair outside the gate; larger than any sum of costs within it.
-_FORBIDDEN = 1e6
-# Cost of pairing a parked with a moving object: above gate_sigma**2 = 16, so that any free partner is
+# Of a pair outside the gate; below any sum of scores within it.
+_FORBIDDEN = -1e6
+# Of pairing a parked with a moving object, nats: below the gate's 4 deviations, so that any free partner is
 # preferred, and finite, so that a parked car that drives off keeps its id.
-_PARKED_MISMATCH = 20.0
+_PARKED_MISMATCH = -10.0
+_FOUND = 0.95  # Of the looks at an entity in view
 _LEAST = 1e-300  # Keeps logarithms finite
 
 
-def match_visible(
-    tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], settings: FilterSettings
+def associated(
+    tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], site: SiteGeometry
 ) -> dict[int, int]:
-    """Return {track index: sighting index} by global nearest neighbour in azimuth, within the gate."""
-    # The cost is the squared Mahalanobis distance, plus a penalty where one is parked and the other moves:
-    # without it a vehicle that drives past a parked one swapped ids with it. Only entities already seen take
-    # part.
-    candidates = [i for i, track in enumerate(tracks) if track.seen]
-    if not candidates or not sightings:
+    r"""Return {track index: sighting index} of the likeliest assignment; what is left over is new.
+
+    Every sighting is one of an entity in view, a hidden one that comes past an edge, or a vehicle that nobody
+    has heard; their scores, nats, are
+
+    .. math:: \log \frac{r N(z; \theta, S)}{1 - r p_D}, \qquad
+              \log r\, [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)], \qquad
+              \log \frac{u}{V}
+
+    with existence r, the edge a of a hidden one's side, which the signature may have confused with
+    probability c, and u vehicles that were not heard anywhere in the view V. Entities in view and hidden ones
+    compete: an entity that has left the view would else take the first sighting of the next one.
+    """
+    if not tracks or not sightings:
         return {}
-    cost = np.array([[_distance(tracks[i], s, settings) for s in sightings] for i in candidates])
+    unheard = math.log(site.settings.unheard_probability / (2.0 * site.view_half_angle_rad))
+    scores = np.full((len(sightings), len(tracks) + len(sightings)), _FORBIDDEN)
+    for j, sighting in enumerate(sightings):
+        scores[j, : len(tracks)] = [_score(track, sighting, unheard, site) for track in tracks]
+        scores[j, len(tracks) + j] = unheard
     # Imported where it is needed: scipy.optimize takes longer than all else that the core imports.
     from scipy.optimize import linear_sum_assignment
 
-    rows, columns = linear_sum_assignment(cost)
-    return {
-        candidates[row]: int(column)
-        for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
-        if cost[row, column] < _FORBIDDEN
-    }
+    rows, columns = linear_sum_assignment(-scores)
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return {column: row for row, column in pairs if column < len(tracks) and scores[row, column] > _FORBIDDEN}
 
 
-def match_hidden(
-    tracks: tuple[Track, ...], sightings: tuple[tuple[int, Sighting], ...], site: SiteGeometry
-) -> dict[int, int]:
-    """Return {track index: sighting index} of the hidden entities that came into view."""
-    # A vehicle comes into view near the edge of its occluder. A new moving sighting is either a hidden
-    # entity, whose side may be wrong, or a vehicle that was not heard; the likelier hypothesis is taken, best
-    # pair first.
-    pairs = sorted(
-        (-score, i, j)
-        for i, track in enumerate(tracks)
-        for j, sighting in sightings
-        if not track.seen and sighting.moving
-        if (score := _emergence(track, sighting, site)) > 0.0
-    )
-    found: dict[int, int] = {}
-    for _, i, j in pairs:
-        if i not in found and j not in found.values():
-            found[i] = j
-    return found
-
-
-def _distance(track: Track, sighting: Sighting, settings: FilterSettings) -> float:
+def _score(track: Track, sighting: Sighting, unheard: float, site: SiteGeometry) -> float:
+    if not track.seen:
+        return _emergence(track, sighting, site) if sighting.moving else _FORBIDDEN
     residual = wrap_angle(sighting.azimuth_rad - track.motion.azimuth_rad)
     variance = track.motion.azimuth_std_rad**2 + sighting.std_rad**2
-    outside = abs(residual) > settings.gate_rad or residual**2 > settings.gate_sigma**2 * variance
-    if outside:
+    settings = site.settings
+    if abs(residual) > settings.gate_rad or residual**2 > settings.gate_sigma**2 * variance:
         return _FORBIDDEN
-    return residual**2 / variance + (0.0 if sighting.moving == track.moving else _PARKED_MISMATCH)
+    density = -0.5 * (residual**2 / variance + math.log(2.0 * math.pi * variance))
+    expected = math.log(max(track.existence, _LEAST)) - math.log1p(-track.existence * _FOUND)
+    mismatch = 0.0 if sighting.moving == track.moving else _PARKED_MISMATCH
+    # Within its gate an entity in view takes a sighting before that counts as a new vehicle; a maximum of the
+    # two would be a tie of all poor pairs, which the order of sightings would settle.
+    return float(np.logaddexp(density + expected + mismatch, unheard))
 
 
 def _emergence(track: Track, sighting: Sighting, site: SiteGeometry) -> float:
-    r"""Return the log odds of this hidden entity against a vehicle that was not heard.
-
-    .. math:: \frac{r\, [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)]}{u / V}
-
-    with existence r, the edges a of its own side k and of the others, of which the signature may have meant
-    one with probability c, and vehicles that were not heard, u of them, anywhere in the view V.
-    """
     settings = site.settings
     near = [_edge_density(side.distance_rad(sighting.azimuth_rad), settings) for side in site.sides]
     own = near.pop(track.side)
     heard = (1.0 - settings.side_confusion) * own + settings.side_confusion * max(near, default=own)
-    unheard = settings.unheard_probability / (2.0 * site.view_half_angle_rad)
-    return math.log(max(track.existence * heard, _LEAST)) - math.log(unheard)
+    return math.log(max(track.existence * heard, _LEAST))
 
 
 def _edge_density(distance_rad: float, settings: FilterSettings) -> float:

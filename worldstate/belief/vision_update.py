@@ -9,7 +9,7 @@ from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
 from worldstate.ground.typing import FloatArray
 from worldstate.measurement.measurement import Measurement, Sighting
 
-from .association import match_hidden, match_visible
+from .association import associated
 from .existence import after_empty_look, after_sighting
 from .explanation import ExplanationBelief
 from .motion import MotionBelief, update_azimuth
@@ -56,21 +56,19 @@ def vision_update(
     """Return tracks and explanations after one look; `born` counts the entities born in view so far."""
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings = tuple(sorted(measurement.sightings, key=_BY_ALL))
-    known = match_visible(tracks, sightings, site.settings)
-    new = tuple((j, s) for j, s in enumerate(sightings) if j not in known.values())
-    emerging = match_hidden(tracks, new, site)
+    found = associated(tracks, sightings, site)
     after = []
     for i, track in enumerate(tracks):
-        if i in known:
-            after.append(_sighted(track, sightings[known[i]], measurement, site.settings))
-        elif i in emerging:
-            after.append(_handed_over(track, sightings[emerging[i]], measurement, site))
-        else:
+        if i not in found:
             after.append(_not_sighted(track, measurement.co_evidence, weight, site))
-    handed_over = tuple(tracks[i].side for i in emerging)
+        elif track.seen:
+            after.append(_sighted(track, sightings[found[i]], measurement, site.settings))
+        else:
+            after.append(_handed_over(track, sightings[found[i]], measurement, site))
+    handed_over = tuple(tracks[i].side for i in found if not tracks[i].seen)
     for side in handed_over:
         explanation = explanation.emerge(side, site.settings.handover_residual)
-    fresh = [s for j, s in new if j not in emerging.values()]
+    fresh = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
     after += [_born(s, measurement, born + n, site) for n, s in enumerate(fresh)]
     unheard = (_emerged_from(sighting, site) for sighting in fresh)
     emerged = {*handed_over, *(side for side in unheard if side is not None)}
