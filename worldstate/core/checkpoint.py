@@ -16,8 +16,8 @@ from worldstate.belief.track import Track
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
 from worldstate.ground.values import NotUsable
-from worldstate.measurement.measurement import Bearing
-from worldstate.state import Context, Priors
+from worldstate.measurement.measurement import Bearing, Measurement
+from worldstate.state import Context, Delivery, Priors
 
 from .memory import CountedLook, Memory
 from .sequence_memory import SequenceMemory
@@ -64,19 +64,36 @@ class _Memory:
 
 
 @dataclass(frozen=True, slots=True)
+class LagRecord:
+    """Measurements of the last two seconds, and the memory before the first of them."""
+
+    stamp_ns: int  # Of the belief, predicted since the last measurement
+    base: _Memory
+    measurements: tuple[Measurement, ...]
+    delivery: Delivery
+    late_since_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.0.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.1.0")
 
     context: Context
     policy: CueingPolicy
     settings: FilterSettings
     start_ns: int
     memory: _Memory
+    past: LagRecord | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        k, memory = len(self.context.directions), self.memory
+        self._check(self.memory)
+        if self.past is not None:
+            self._check(self.past.base)
+
+    def _check(self, memory: _Memory) -> None:
+        k = len(self.context.directions)
         beliefs = [logs for _, logs in memory.trail.beliefs]
         lengths: dict[str, tuple[Sequence[Sized], int]] = {
             "log_explanations": ([memory.log_explanations, *beliefs], 2 * k + 2),
@@ -122,9 +139,9 @@ def memory_record(memory: Memory) -> _Memory:
     )
 
 
-def memory_of(record: FilterRecord) -> Memory:
-    """Return the memory that `memory_record` kept."""
-    kept, directions = record.memory, record.context.directions
+def memory_of(kept: _Memory, record: FilterRecord) -> Memory:
+    """Return the memory that `memory_record` kept in a record."""
+    directions = record.context.directions
     beliefs = tuple((ns, ExplanationBelief(directions, logs)) for ns, logs in kept.trail.beliefs)
     return Memory(
         stamp_ns=kept.stamp_ns,

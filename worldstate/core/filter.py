@@ -24,7 +24,8 @@ from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, Look, Measurement
 from worldstate.state import Context, WorldState
 
-from .checkpoint import FilterRecord, memory_of, memory_record
+from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
+from .fixed_lag import FixedLag, restored
 from .memory import Memory, first_memory, priors_of
 from .snapshot_builder import cues_of, entity_of, relations_of
 from .step import (
@@ -93,6 +94,8 @@ class WorldFilter:
         Time of the first belief, ns on the clock of the measurements.
     memory : Memory, optional
         What another filter carried; the first belief where not given.
+    lag : FixedLag, optional
+        Measurements of the last two seconds, among which a late one is put; none where not given.
 
     Raises
     ------
@@ -118,6 +121,7 @@ class WorldFilter:
     settings: FilterSettings = field(default_factory=FilterSettings)
     start_ns: int = 0
     memory: Memory | None = field(default=None, repr=False)
+    lag: FixedLag | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_ns", _integer_ns("start_ns", self.start_ns))
@@ -179,6 +183,7 @@ class WorldFilter:
             bearing=memory.bearing,
             domain=memory.domain,
             no_sequence=memory.no_sequence,
+            delivery=self._lag.delivery,
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":
@@ -206,21 +211,36 @@ class WorldFilter:
             )
         if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
-        return replace(self, memory=advance(self._memory, stamp_ns, self._model))
+        # From the last measurement on, so that many small steps are one step to the bit.
+        return replace(self, memory=advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
 
     def update(self, measurement: Measurement) -> "WorldFilter":
-        """Return the filter after a measurement, predicted to its time stamp first.
+        """Return the filter after a measurement, at its time stamp or, if that has passed, at the belief's.
+
+        A measurement that is up to two seconds late is put where it belongs, as if it had come in time. One
+        that was delivered before is dropped, and one that is later still; `WorldState.delivery` counts them.
+        Where everything comes too late for a second, clocks were changed: the belief begins anew.
 
         Raises
         ------
         InvalidArgumentError
-            If the time stamp is no integer or is earlier than the belief's or than the source's last one, the
-            directions are not those of the context, or a number is not finite.
+            If the time stamp is no integer, the directions are not those of the context, or a number is not
+            finite.
         """
         # Before anything is computed: a measurement that is refused leaves the filter as it was.
-        measurement = _checked(measurement, self.context, dict(self._memory.last_ns))
-        world = self.predict_to(measurement.stamp_ns)
-        memory, model = world._memory, world._model
+        measurement = _checked(measurement, self.context)
+        lag = self._lag.add(measurement, self._step)
+        if lag is None:
+            return self._begun_anew(measurement)
+        world = replace(self, memory=lag.latest, lag=lag)
+        return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
+
+    def _step(self, memory: Memory, measurement: Measurement) -> Memory:
+        """Return the memory after one more measurement, not earlier than the last one."""
+        model = self._model
+        # Within the slack the belief is not moved back.
+        if measurement.stamp_ns > memory.stamp_ns:
+            memory = advance(memory, measurement.stamp_ns, model)
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
         memory, measurement, looked = counted_once(memory, measurement)
         # Evidence first: association and births need the explanations of this very window.
@@ -229,7 +249,14 @@ class WorldFilter:
             memory = update_sightings(memory, measurement, weights, model)
         memory = update_advisories(memory, measurement, model)
         memory = update_sequence(memory, measurement, looked, model)
-        return replace(world, memory=update_entities(memory, measurement, model))
+        return update_entities(memory, measurement, model)
+
+    def _begun_anew(self, measurement: Measurement) -> "WorldFilter":
+        delivery = self._lag.delivery
+        fresh = first_memory(self.context, self.policy, measurement.stamp_ns)
+        counted = replace(delivery, reanchored=delivery.reanchored + 1)
+        world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
+        return world.update(measurement)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a checkpoint as JSON-able values: what is read back continues bit for bit.
@@ -240,8 +267,17 @@ class WorldFilter:
         >>> WorldFilter.from_dict(world.to_dict()).state == world.state
         True
         """
-        kept = memory_record(self._memory)
-        return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, kept))
+        lag = self._lag
+        past = LagRecord(
+            stamp_ns=self.stamp_ns,
+            base=memory_record(lag.base),
+            measurements=tuple(one.measurement for one in lag.arrivals),
+            delivery=lag.delivery,
+            late_since_ns=lag.late_since_ns,
+        )
+        # What was predicted since the last measurement is predicted again.
+        latest = memory_record(lag.latest)
+        return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, latest, past))
 
     @classmethod
     def from_dict(cls, value: object) -> "WorldFilter":
@@ -255,11 +291,22 @@ class WorldFilter:
             If a value is missing, of the wrong type or out of range; the message says where.
         """
         kept = decode(FilterRecord, value, "checkpoint")
-        return cls(kept.context, kept.policy, kept.settings, kept.start_ns, memory_of(kept))
+        past, latest = kept.past, memory_of(kept.memory, kept)
+        world = cls(kept.context, kept.policy, kept.settings, kept.start_ns, latest)
+        if past is None:
+            return world
+        base = memory_of(past.base, kept)
+        lag = restored(latest, base, past.measurements, past.delivery, past.late_since_ns)
+        world = replace(world, lag=lag)
+        return world if past.stamp_ns <= latest.stamp_ns else world.predict_to(past.stamp_ns)
 
     @cached_property
     def _memory(self) -> Memory:
         return self.memory or first_memory(self.context, self.policy, self.start_ns)
+
+    @cached_property
+    def _lag(self) -> FixedLag:
+        return self.lag or FixedLag(self._memory)
 
     @cached_property
     def _model(self) -> FilterModel:
@@ -274,7 +321,7 @@ def _integer_ns(name: str, value: object) -> int:
     return int(value)
 
 
-def _checked(measurement: Measurement, context: Context, last_ns: dict[str, int]) -> Measurement:
+def _checked(measurement: Measurement, context: Context) -> Measurement:
     """Return the measurement in plain numbers; refuse what would poison the belief: it takes NaN as it is."""
     for name, kind in _KINDS.items():
         if not isinstance(getattr(measurement, name), kind):
@@ -286,11 +333,7 @@ def _checked(measurement: Measurement, context: Context, last_ns: dict[str, int]
         )
     if isinstance(measurement.sequence, SequenceReading) and context.directions != SIDES:
         raise InvalidArgumentError(f"sequence: expected the directions {SIDES}, got {context.directions}")
-    stamp_ns, before_ns = _integer_ns("stamp_ns", measurement.stamp_ns), last_ns.get(measurement.source)
-    if before_ns is not None and stamp_ns < before_ns:
-        raise InvalidArgumentError(
-            f"stamp_ns: expected time stamps in order, got {stamp_ns} ns after {before_ns} ns"
-        )
+    stamp_ns = _integer_ns("stamp_ns", measurement.stamp_ns)
     if measurement.look is not None:
         _integer_ns("look.stamp_ns", measurement.look.stamp_ns)
     for name, value, low, high in _numbers(measurement):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
+from worldstate.ground.serialisation import ADDED, Count, Layout, decode, decode_json, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 
@@ -18,6 +18,33 @@ from .relation import Relation
 
 if TYPE_CHECKING:
     import networkx as nx
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """What has been wrong with the order of measurements since the filter began.
+
+    Parameters
+    ----------
+    replayed : int
+        Late ones that were put where they belong.
+    repeated : int
+        Delivered before, and dropped.
+    too_late : int
+        Later than the filter's lag, and dropped.
+    reanchored : int
+        Times that everything came too late for a second, by clocks that changed, and the belief began anew.
+
+    Examples
+    --------
+    >>> Delivery().too_late
+    0
+    """
+
+    replayed: Count = 0
+    repeated: Count = 0
+    too_late: Count = 0
+    reanchored: Count = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +79,8 @@ class WorldState:
         evidence of that hop counts little; a warning signal comes from a vehicle.
     no_sequence : NotUsable or None
         Why the cues state no times although the model could.
+    delivery : Delivery
+        Measurements that came late, twice, or too late.
 
     Examples
     --------
@@ -60,7 +89,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.4.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "1.5.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -74,6 +103,7 @@ class WorldState:
     bearing: Bearing | None = None
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)
     no_sequence: NotUsable | None = field(default=None, metadata=ADDED)
+    delivery: Delivery = field(default_factory=Delivery, metadata=ADDED)
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.

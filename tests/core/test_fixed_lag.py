@@ -1,0 +1,134 @@
+"""Late, repeated, reordered and misdated measurements: the belief is that of the measurements in order."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.state import Delivery, WorldState
+
+SEEDS = st.integers(0, 2**32 - 1)
+SILENT = NotUsable("not scripted")
+SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
+
+
+def script(rng: np.random.Generator, hops: int = 18) -> list[Measurement]:
+    """Return sound every tenth of a second, a camera in it, and a radio that speaks now and then."""
+    measured = []
+    for hop in range(1, hops + 1):
+        left, right, visible, none = rng.normal(0.0, 1.0, 4).tolist()
+        heard = SignatureEvidence(("left", "right"), (left, right), visible, none)
+        reading = SequenceReading(
+            rng.dirichlet(np.ones(len(GROUPS)), 2), SHARE, 0.0, SequenceAlarm(0.0, 20.0)
+        )
+        seen = rng.random() < 0.3
+        boxes = (Sighting(float(rng.uniform(-0.5, 0.5)), 0.02, "car", 0.9),) if seen else ()
+        answer = Present(0.04, 0.01) if seen else Absent(0.04, 0.01)
+        own = Measurement(hop * 10**8, heard, answer, SILENT, SILENT, boxes, sequence=reading)
+        measured.append(own)
+        if rng.random() < 0.4:
+            unasked = Unqueried("no camera")
+            stamp_ns = own.stamp_ns + int(rng.integers(0, 10**8))
+            measured.append(replace(own, stamp_ns=stamp_ns, co_evidence=unasked, sightings=(), source="v2x"))
+    return sorted(measured, key=lambda one: (one.stamp_ns, one.source))
+
+
+def filtered(measurements: list[Measurement], world: WorldFilter | None = None) -> WorldFilter:
+    world = world or WorldFilter()
+    for one in measurements:
+        world = world.update(one)
+    return world
+
+
+def content(world: WorldFilter) -> WorldState:
+    return replace(world.state, delivery=Delivery())
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_the_order_of_arrival_does_not_matter_within_the_lag(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    in_order = script(rng)
+    # Each is held up by so long that the newest one before it is less than the lag ahead.
+    arrival_s = [one.stamp_ns * 1e-9 + rng.uniform(0.0, 1.8) for one in in_order]
+    shuffled = [in_order[i] for i in np.argsort(arrival_s)]
+    late = filtered(shuffled)
+    assert content(late) == content(filtered(in_order))
+    assert late.state.delivery.too_late == late.state.delivery.repeated == 0
+    assert (late.state.delivery.replayed > 0) == (shuffled != in_order)
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_what_was_delivered_before_changes_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    once = script(rng)
+    often = [copy for one in once for copy in [one] * int(rng.integers(1, 4))]
+    repeated = filtered(often)
+    assert content(repeated) == content(filtered(once))
+    assert repeated.state.delivery == Delivery(repeated=len(often) - len(once))
+
+
+@given(SEEDS, st.integers(1, 12))
+@settings(max_examples=3)
+def test_a_checkpoint_takes_late_measurements_as_the_filter_itself_does(seed: int, cut: int) -> None:
+    in_order = script(np.random.default_rng(seed))
+    late = in_order.pop(cut)
+    until = [one for one in in_order if one.stamp_ns <= late.stamp_ns + 15 * 10**8]
+    world = filtered(until).predict(0.03)
+    copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict())))
+    rest = [late, *in_order[len(until) :]]
+    assert filtered(rest, copy).state == filtered(rest, world).state
+    assert filtered(rest, world).state.delivery.replayed == 1
+
+
+def test_beyond_the_lag_it_is_counted_and_left_out() -> None:
+    in_order = script(np.random.default_rng(1), hops=40)
+    world = filtered(in_order[1:])
+    late = world.update(in_order[0])
+    assert late.state == replace(world.state, delivery=Delivery(too_late=1))
+    # A single stray one is no change of clocks, however old it is.
+    again = filtered([in_order[0], *script(np.random.default_rng(2), hops=50)[-10:]], late)
+    assert again.state.delivery.reanchored == 0
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, 60.0])
+def test_after_a_change_of_clocks_it_goes_on_within_two_seconds(jump_s: float) -> None:
+    """A clock set back by an hour, and one stamp a minute ahead, after which all others seem too late."""
+    before, jump_ns = script(np.random.default_rng(1)), round(jump_s * 1e9)
+    if jump_s < 0.0:
+        before = [replace(one, stamp_ns=one.stamp_ns - jump_ns) for one in before]
+        after = script(np.random.default_rng(2), hops=30)
+    else:
+        stray = replace(before[-1], stamp_ns=before[-1].stamp_ns + jump_ns)
+        before, after = [*before, stray], script(np.random.default_rng(2), hops=60)[len(before) + 1 :]
+    world = filtered(before)
+    taken_ns = [(world := world.update(one)).state.stamp_ns == one.stamp_ns for one in after]
+    waited = [
+        one.stamp_ns - after[0].stamp_ns for one, taken in zip(after, taken_ns, strict=True) if not taken
+    ]
+    assert max(waited) <= 2 * 10**9 and taken_ns[-1]
+    assert world.state.delivery.reanchored == 1
+    assert world.state.cues
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_many_small_predictions_are_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    measured = script(rng, hops=12)
+    often = WorldFilter()
+    for one in measured:
+        for stamp_ns in sorted(
+            rng.integers(often.stamp_ns, max(one.stamp_ns, often.stamp_ns + 1), 3).tolist()
+        ):
+            often = often.predict_to(stamp_ns)
+        often = often.update(one)
+    assert often.state == filtered(measured).state
