@@ -19,7 +19,6 @@ from .ground.values import NotUsable as NotUsable
 from .ground.values import nanoseconds as nanoseconds
 from .measurement.measurement import Approach as Approach
 from .measurement.measurement import Bearing as Bearing
-from .measurement.measurement import Look as Look
 from .measurement.measurement import Measurement as Measurement
 from .measurement.measurement import Sighting as Sighting
 from .measurement.protocols import CoEvidenceChannel as CoEvidenceChannel

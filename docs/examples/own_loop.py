@@ -27,7 +27,6 @@ from worldstate import (
     AcousticAdapter,
     Bearing,
     DetectionFrame,
-    Look,
     MicrophoneArray,
     NotUsable,
     PinholeCamera,
@@ -96,10 +95,8 @@ class LiveCamera:
         """Return all that is in view."""
         return self._seen or ()
 
-    def last_look(self, stamp_ns: int) -> Look | None:
-        """Return whether anything is in view; here an image belongs to the hop that it was taken in."""
-        answer = self.ask(stamp_ns, NotUsable("whole view"))
-        return None if isinstance(answer, Unqueried) else Look("camera", stamp_ns, answer)
+    def last_look(self, stamp_ns: int) -> None:
+        """Every answer is a look of its own: no camera here is asked by two sources."""
 
 
 class PatternSignature:

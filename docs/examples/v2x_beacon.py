@@ -20,7 +20,6 @@ from worldstate import (
     Approach,
     Bearing,
     CoEvidenceChannel,
-    Look,
     Measurement,
     NotUsable,
     Present,
@@ -202,10 +201,8 @@ class ScriptedCamera:
         azimuth = self._seen.get(stamp_ns)
         return () if azimuth is None else (Sighting(azimuth, 0.03, "car", 0.9, 0.1),)
 
-    def last_look(self, stamp_ns: int) -> Look:
-        """Return whether the vehicle is in view: this camera looks whenever it is asked."""
-        answer = (Present if stamp_ns in self._seen else Absent)(self._miss_rate, 0.01)
-        return Look("camera", stamp_ns, answer)
+    def last_look(self, stamp_ns: int) -> None:
+        """Every answer is a look of its own: no camera here is asked by two sources."""
 
 
 def approach_from_left(duration_s: float = 6.0, t0_s: float = 4.0) -> list[Beacon]:

@@ -70,6 +70,9 @@ class Asked:
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         return ()
 
+    def last_look(self, stamp_ns):
+        return None
+
 
 @pytest.mark.parametrize(
     ("deep", "name", "labels"), [(True, "truck", {"truck", "bus"}), (False, "car", {"car"})]

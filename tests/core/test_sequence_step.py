@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Context, Look, Measurement, Sighting, WorldFilter, WorldState
+from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
+from worldstate.measurement import Look
 from worldstate.state import Priors, blind_corner
 
 SEEDS = st.integers(0, 2**32 - 1)
