@@ -19,6 +19,9 @@ _NEAREST_M, _FARTHEST_M = 3.0, 200.0
 # Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
 # array.
 _CLOSEST_SHARE = 0.5
+# No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
+# covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
+_LEAST_STD, _LARGEST_STD = 1e-4, 1e2
 
 
 def _covariance(row: FloatArray) -> FloatArray:
@@ -43,7 +46,7 @@ class MotionBelief:
         cls, mean: tuple[float, float, float, float], std: tuple[float, float, float, float]
     ) -> "MotionBelief":
         """Return independent components."""
-        return cls(np.array(mean), np.diag(np.square(std)))
+        return cls(np.array(mean), np.diag(np.square(np.clip(std, _LEAST_STD, _LARGEST_STD))))
 
     @property
     def azimuth_rad(self) -> float:
@@ -130,6 +133,7 @@ def _update(belief: MotionBelief, row: int, value: float, std: float, weight: fl
     """
     if weight <= 0.0:
         return belief
+    std = max(std, _LEAST_STD)
     residual = value - float(belief.mean[row])
     if row == AZIMUTH:
         residual = wrap_angle(residual)

@@ -1,0 +1,109 @@
+"""Fault campaign: measurements of the whole accepted range, late, repeated, reordered; clocks that jump."""
+
+import json
+
+import numpy as np
+import pytest
+
+from worldstate import Approach, Bearing, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.measurement import Look
+
+SILENT, TINY = NotUsable("not scripted"), 5e-324
+SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
+SECOND_NS, HOUR_NS = 10**9, 3600 * 10**9
+
+
+def extreme(rng: np.random.Generator, low: float, high: float) -> float:
+    """Return an end of a range, what rounds to nothing, or anything between, equally often as not."""
+    kind = rng.random()
+    if kind < 0.2:
+        return low if kind < 0.1 else high
+    return float(np.clip(rng.normal() * 1e-300, low, high)) if kind < 0.3 else float(rng.uniform(low, high))
+
+
+def answer(rng: np.random.Generator) -> CoEvidence:
+    miss, clutter = extreme(rng, 0.0, 1.0), extreme(rng, 1e-12, 0.999)
+    return (Unqueried("-"), Absent(miss, clutter), Present(miss, clutter))[int(rng.integers(0, 3))]
+
+
+def reading(rng: np.random.Generator) -> SequenceReading:
+    groups = np.nan_to_num(rng.dirichlet(np.full(len(GROUPS), rng.choice([0.01, 0.2, 5.0])), 2)) + 1e-12
+    margin_s = abs(extreme(rng, 0.0, 2.0))
+    return SequenceReading(
+        groups / groups.sum(axis=1, keepdims=True), SHARE, margin_s, SequenceAlarm(0.0, 20.0)
+    )
+
+
+def sighting(rng: np.random.Generator) -> Sighting:
+    azimuth_rad, std_rad = extreme(rng, -np.pi, np.pi), max(extreme(rng, 0.0, 1e3), TINY)
+    label = str(rng.choice(["car", "truck", "pedestrian"]))
+    moves = bool(rng.random() < 0.7)
+    return Sighting(azimuth_rad, std_rad, label, extreme(rng, 0.0, 1.0), extreme(rng, 0.0, 3.0), moves)
+
+
+def measurement(rng: np.random.Generator, stamp_ns: int) -> Measurement:
+    left, right, visible, none = (rng.normal(0.0, 1.0, 4) * rng.choice([1.0, 10.0, 500.0])).tolist()
+    said, azimuth_rad, rate_hz = answer(rng), extreme(rng, -np.pi, np.pi), extreme(rng, -1e3, 1e3)
+    bearing = Bearing(azimuth_rad, max(extreme(rng, 0.0, 1e3), TINY), 1.0 + extreme(rng, 0.0, 10.0))
+    approach = Approach(rate_hz, max(extreme(rng, 0.0, 1e6), TINY))
+    taken_ns = stamp_ns - int(rng.integers(0, SECOND_NS))
+    look = None if isinstance(said, Unqueried) or rng.random() < 0.5 else Look("camera", taken_ns, said)
+    boxes = int(rng.integers(0, 6)) if rng.random() < 0.4 else 0
+    return Measurement(
+        stamp_ns,
+        SignatureEvidence(("left", "right"), (left, right), visible, none),
+        said,
+        bearing if rng.random() < 0.5 else SILENT,
+        approach if rng.random() < 0.5 else SILENT,
+        tuple(sighting(rng) for _ in range(boxes)),
+        look=look,
+        sequence=(reading(rng), reading(rng), SILENT, None)[int(rng.integers(0, 4))],
+        source=str(rng.choice(["acoustic", "v2x", "radar"])),
+    )
+
+
+def campaign(rng: np.random.Generator, steps: int) -> WorldFilter:
+    """Filter what comes; look at every fiftieth state and every five-hundredth checkpoint."""
+    world, now_ns, last = WorldFilter(), HOUR_NS, measurement(rng, HOUR_NS)
+    for step in range(steps):
+        now_ns += int(rng.choice([10**7, 10**8, 10**8, 5 * 10**8]))
+        kind = rng.random()
+        if kind < 0.004:
+            now_ns = max(now_ns + HOUR_NS if kind < 0.002 else now_ns - HOUR_NS, HOUR_NS)
+        late_ns = int(rng.integers(0, 3 * SECOND_NS)) if rng.random() < 0.1 else 0
+        last = last if rng.random() < 0.05 else measurement(rng, now_ns - late_ns)
+        world = world.update(last)
+        if rng.random() < 0.02:
+            world = world.predict_to(world.stamp_ns + int(rng.integers(0, SECOND_NS)))
+        if step % 50 == 0:
+            sound(world)
+        if step % 500 == 0:
+            copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict(), allow_nan=False)))
+            again = measurement(rng, world.stamp_ns + 10**8)
+            assert copy.update(again).state == world.update(again).state
+    return world
+
+
+def sound(world: WorldFilter) -> None:
+    """Check that probabilities are probabilities, numbers finite, and entities bounded."""
+    state = world.state
+    state.to_json()
+    chances = [one.existence_probability for one in state.entities] + [cue.risk for cue in state.cues]
+    chances += [chance for cue in state.cues for chance in (cue.within or {}).values()]
+    assert all(0.0 <= chance <= 1.0 for chance in chances)
+    assert len(state.entities) < 60
+
+
+def test_what_is_accepted_leaves_a_sound_state_and_a_checkpoint_that_reads() -> None:
+    world = campaign(np.random.default_rng(1), 1000)
+    assert world.state.delivery.replayed > 20 and world.state.delivery.repeated > 10
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_faults() -> None:
+    world = campaign(np.random.default_rng(2), 100_000)
+    delivery = world.state.delivery
+    assert min(delivery.replayed, delivery.repeated, delivery.too_late, delivery.reanchored) > 100
