@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
 
@@ -40,9 +41,8 @@ def associated(
         return {}
     unheard = math.log(site.settings.unheard_probability / (2.0 * site.view_half_angle_rad))
     scores = np.full((len(sightings), len(tracks) + len(sightings)), _FORBIDDEN)
-    for j, sighting in enumerate(sightings):
-        scores[j, : len(tracks)] = [_score(track, sighting, unheard, site) for track in tracks]
-        scores[j, len(tracks) + j] = unheard
+    scores[:, : len(tracks)] = _scores(tracks, sightings, unheard, site)
+    np.fill_diagonal(scores[:, len(tracks) :], unheard)
     # Imported where it is needed: scipy.optimize takes longer than all else that the core imports.
     from scipy.optimize import linear_sum_assignment
 
@@ -51,31 +51,49 @@ def associated(
     return {column: row for row, column in pairs if column < len(tracks) and scores[row, column] > _FORBIDDEN}
 
 
-def _score(track: Track, sighting: Sighting, unheard: float, site: SiteGeometry) -> float:
-    if not track.seen:
-        return _emergence(track, sighting, site) if sighting.moving else _FORBIDDEN
-    residual = wrap_angle(sighting.azimuth_rad - track.motion.azimuth_rad)
-    variance = track.motion.azimuth_std_rad**2 + sighting.std_rad**2
-    settings = site.settings
-    if abs(residual) > settings.gate_rad or residual**2 > settings.gate_sigma**2 * variance:
-        return _FORBIDDEN
-    density = -0.5 * (residual**2 / variance + math.log(2.0 * math.pi * variance))
-    expected = math.log(max(track.existence, _LEAST)) - math.log1p(-track.existence * _FOUND)
-    mismatch = 0.0 if sighting.moving == track.moving else _PARKED_MISMATCH
+def _scores(
+    tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], unheard: float, site: SiteGeometry
+) -> FloatArray:
+    """Return the score of every sighting and track, shape (sightings, tracks)."""
+    azimuth_rad = np.array([one.azimuth_rad for one in sightings])[:, None]
+    std_rad = np.array([one.std_rad for one in sightings])[:, None]
+    moving = np.array([one.moving for one in sightings])[:, None]
+    seen = np.array([track.seen for track in tracks])
+    in_view = _in_view(tracks, azimuth_rad, std_rad, moving, unheard, site.settings)
+    return np.where(seen, in_view, np.where(moving, _emergence(tracks, azimuth_rad, site), _FORBIDDEN))
+
+
+def _in_view(
+    tracks: tuple[Track, ...],
+    azimuth_rad: FloatArray,
+    std_rad: FloatArray,
+    moving: BoolArray,
+    unheard: float,
+    settings: FilterSettings,
+) -> FloatArray:
+    existence = np.array([track.existence for track in tracks])
+    residual = wrap_angle(azimuth_rad - np.array([track.motion.azimuth_rad for track in tracks]))
+    variance = np.array([track.motion.azimuth_std_rad for track in tracks]) ** 2 + std_rad**2
+    density = -0.5 * (residual**2 / variance + np.log(2.0 * math.pi * variance))
+    expected = np.log(np.maximum(existence, _LEAST)) - np.log1p(-existence * _FOUND)
+    mismatch = np.where(moving == np.array([track.moving for track in tracks]), 0.0, _PARKED_MISMATCH)
+    outside = (np.abs(residual) > settings.gate_rad) | (residual**2 > settings.gate_sigma**2 * variance)
     # Within its gate an entity in view takes a sighting before that counts as a new vehicle; a maximum of the
     # two would be a tie of all poor pairs, which the order of sightings would settle.
-    return float(np.logaddexp(density + expected + mismatch, unheard))
+    return np.where(outside, _FORBIDDEN, np.logaddexp(density + expected + mismatch, unheard))
 
 
-def _emergence(track: Track, sighting: Sighting, site: SiteGeometry) -> float:
+def _emergence(tracks: tuple[Track, ...], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
     settings = site.settings
-    near = [_edge_density(side.distance_rad(sighting.azimuth_rad), settings) for side in site.sides]
-    own = near.pop(track.side)
-    heard = (1.0 - settings.side_confusion) * own + settings.side_confusion * max(near, default=own)
-    return math.log(max(track.existence * heard, _LEAST))
-
-
-def _edge_density(distance_rad: float, settings: FilterSettings) -> float:
-    """Return the density of first sightings at a distance from the edge that they come past, 1/rad."""
-    deviations = distance_rad / settings.edge_std_rad
-    return math.exp(-0.5 * deviations**2) / (settings.edge_std_rad * math.sqrt(2.0 * math.pi))
+    edges_rad = np.array([side.edge_azimuth_rad for side in site.sides])
+    deviations = wrap_angle(azimuth_rad - edges_rad) / settings.edge_std_rad
+    # Of first sightings about the edge that they come past, 1/rad.
+    near = np.exp(-0.5 * deviations**2) / (settings.edge_std_rad * math.sqrt(2.0 * math.pi))
+    heard = np.empty_like(near)
+    for side in range(len(edges_rad)):
+        others = np.delete(near, side, axis=1).max(axis=1) if len(edges_rad) > 1 else near[:, side]
+        confused = settings.side_confusion
+        heard[:, side] = (1.0 - confused) * near[:, side] + confused * others
+    existence = np.array([track.existence for track in tracks])
+    own = heard[:, [track.side for track in tracks]]
+    return np.asarray(np.log(np.maximum(existence * own, _LEAST)))

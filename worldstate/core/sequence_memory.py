@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import attrgetter
 
 import numpy as np
@@ -43,7 +44,8 @@ _LOOK_NS = 500_000_000
 _EXPLAINED_NS, _FOLLOWED = 1_300_000_000, 0.2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+# No slots: what is derived is computed once, and read by every entity and cue.
+@dataclass(frozen=True, eq=False)
 class SequenceMemory:
     """Belief of both sides, and the alarm that goes by it."""
 
@@ -73,7 +75,7 @@ class SequenceMemory:
             got = len(self.over_ns)
             raise InvalidArgumentError(f"memory.sequence.over_ns: expected {len(SIDES)}, got {got}")
 
-    @property
+    @cached_property
     def posterior(self) -> SequencePosterior:
         """The belief, as one hop of a stream."""
         told = sum((look_log_likelihoods(look.answer) for look in self.looks), np.zeros(len(STATES)))
@@ -95,7 +97,7 @@ class SequenceMemory:
         ages_ns = [np.inf if ns is None else self.stamp_ns - ns for ns in self.emerged_ns]
         return np.where(np.array(ages_ns) <= _EXPLAINED_NS, math.log(_FOLLOWED), 0.0)
 
-    @property
+    @cached_property
     def hidden(self) -> HiddenBelief:
         """Whoever comes into view within eight seconds is hidden now."""
         coming = self.posterior.groups[0, :, : len(COMING_S)].sum(axis=1)
