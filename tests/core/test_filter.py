@@ -650,3 +650,25 @@ def test_the_same_run_has_the_same_ids():
     assert ids[0] == ids[1]
     other = run(start(settings=FilterSettings(stream="other")), approach_from_left())[1]
     assert not set(ids[0]) & {e.id for s in other for e in s.entities}
+
+
+def test_an_uninformative_second_source_leaves_the_advisory_as_it_is():
+    """Thirty seconds of a radio that knows nothing, between the hops of a vehicle that is heard."""
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    dumb = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    beside = [
+        replace(measured(t + 0.05, LEFT), signature=dumb, co_evidence=Unqueried("-"), source="v2x")
+        for t in hops(1.0, 4.0)
+    ]
+    _, alone = run(start(), script)
+    _, both = run(start(), sorted([*script, *beside], key=lambda one: one.stamp_ns))
+    heard = [state for state in both if state.stamp_ns in {one.stamp_ns for one in alone}]
+    named = [[cue.advisory for cue in state.cues] for state in alone]
+    assert [[cue.advisory for cue in state.cues] for state in heard] == named and [True, False] in named
+
+
+def test_without_news_an_advisory_ends_after_a_second():
+    world, states = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
+    assert any(cue.advisory for cue in states[-1].cues)
+    assert any(cue.advisory for cue in world.predict(0.9).state.cues)
+    assert not any(cue.advisory for cue in world.predict(1.1).state.cues)

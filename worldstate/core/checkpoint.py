@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag, SourceEvidence
@@ -19,7 +19,7 @@ from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing, Measurement
 from worldstate.state import Context, Delivery, Priors
 
-from .memory import CountedLook, Memory
+from .memory import CountedLook, Memory, SourceRule
 from .sequence_memory import SequenceMemory
 
 Logs = tuple[float, ...]
@@ -46,7 +46,6 @@ class _Memory:
     stamp_ns: int
     log_explanations: Logs
     trail: _BeliefLag
-    rule_run: Count
     births: tuple[Count, ...]
     handover_ns: tuple[Annotated[int | None, Keys("stamp_ns")], ...]
     tracks: tuple[Track, ...]
@@ -56,6 +55,7 @@ class _Memory:
     predicted: Priors | None
     instant: _Posterior | None
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
+    rules: tuple[SourceRule, ...] = field(default=(), metadata=ADDED)
     looks: tuple[CountedLook, ...] = field(default=(), metadata=ADDED)
     bearing: Bearing | None = field(default=None, metadata=ADDED)
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)
@@ -110,8 +110,10 @@ class FilterRecord:
             memory.sequence.check()
         if not beliefs:
             raise InvalidArgumentError("memory.trail.beliefs: expected at least one")
-        if memory.rule_run > self.policy.sustain_hops or any(track.side >= k for track in memory.tracks):
-            raise InvalidArgumentError("memory: expected a run within the rule and tracks on known sides")
+        if any(one.run > self.policy.sustain_hops for one in memory.rules):
+            raise InvalidArgumentError("memory.rules: expected runs within the policy's rule")
+        if any(track.side >= k for track in memory.tracks):
+            raise InvalidArgumentError("memory.tracks: expected known sides")
 
 
 def memory_record(memory: Memory) -> _Memory:
@@ -121,7 +123,7 @@ def memory_record(memory: Memory) -> _Memory:
         stamp_ns=memory.stamp_ns,
         log_explanations=memory.explanation.log_probabilities,
         trail=_BeliefLag(tuple((ns, b.log_probabilities) for ns, b in lag.beliefs), lag.heard),
-        rule_run=memory.rule.run,
+        rules=memory.rules,
         births=memory.births,
         handover_ns=memory.handover_ns,
         tracks=memory.tracks,
@@ -147,7 +149,7 @@ def memory_of(kept: _Memory, record: FilterRecord) -> Memory:
         stamp_ns=kept.stamp_ns,
         explanation=ExplanationBelief(directions, kept.log_explanations),
         lag=BeliefLag(beliefs, kept.trail.heard),
-        rule=SustainedRule(record.policy.sustain_hops, kept.rule_run),
+        rules=kept.rules,
         births=kept.births,
         handover_ns=kept.handover_ns,
         tracks=kept.tracks,

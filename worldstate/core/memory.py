@@ -3,18 +3,29 @@
 from dataclasses import dataclass, field
 
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.track import Track
+from worldstate.ground.serialisation import Count
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Priors
 
 from .sequence_memory import SequenceMemory
+
+
+@dataclass(frozen=True, slots=True)
+class SourceRule:
+    """Run of a source's statistic above the threshold: what another one measures does not end it."""
+
+    source: str
+    run: Count  # Hops in a row, counted up to those that the rule asks for
+    alarm: bool
+    stamp_ns: int  # Of its last measurement
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +44,7 @@ class Memory:
     stamp_ns: int  # Time of the belief
     explanation: ExplanationBelief  # Which explanation holds
     lag: BeliefLag  # Its past of one window
-    rule: SustainedRule  # Run of the statistic above its threshold
+    rules: tuple[SourceRule, ...]  # One of every source, sorted by its name
     births: tuple[int, ...]  # Hidden entities born so far on each side
     handover_ns: tuple[int | None, ...]  # Last hand-over on each side
     tracks: tuple[Track, ...] = ()  # Entities
@@ -66,7 +77,7 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
         stamp_ns=start_ns,
         explanation=explanation,
         lag=BeliefLag(((start_ns, explanation),)),
-        rule=policy.rule(),
+        rules=(),
         births=(0,) * len(directions),
         handover_ns=(None,) * len(directions),
     )

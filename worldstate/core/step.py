@@ -23,11 +23,13 @@ from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseco
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 
-from .memory import CountedLook, Memory, priors_of
+from .memory import CountedLook, Memory, SourceRule, priors_of
 from .sequence_memory import carried, informed
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
+# An advisory lives in time: without news it ends, as that of a sequence does, after a second.
+RULE_HOLDS_NS = nanoseconds(1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +194,13 @@ def update_advisories(memory: Memory, measurement: Measurement, model: FilterMod
     log_prior = np.log(model.policy.reference_prior)
     instant = posterior_of(log_prior, measurement.signature, measurement.co_evidence)
     held = instant.hidden_total >= model.policy.gamma_at(memory.threshold.shift_nats)
-    alerted = replace(memory, instant=instant, rule=memory.rule.advance(held))
-    return replace(alerted, threshold=_adapted(alerted, measurement.stamp_ns, model.policy))
+    source, stamp_ns = measurement.source, measurement.stamp_ns
+    run = next((one.run for one in memory.rules if one.source == source), 0)
+    rule = replace(model.policy.rule(), run=run).advance(held)
+    others = (one for one in memory.rules if one.source != source)
+    rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns))
+    alerted = replace(memory, instant=instant, rules=tuple(sorted(rules, key=attrgetter("source"))))
+    return replace(alerted, threshold=_adapted(alerted, stamp_ns, model.policy))
 
 
 def update_sequence(memory: Memory, measurement: Measurement, looked: bool, model: FilterModel) -> Memory:
@@ -219,7 +226,7 @@ def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThr
         policy.adaptive,
         visible=memory.explanation.visible,
         none=memory.explanation.none,
-        alarm=memory.rule.alarm,
+        alarm=sustained(memory),
         elapsed_s=max(seconds(stamp_ns - before_ns), 0.0),
     )
 
@@ -234,7 +241,13 @@ def alarmed(memory: Memory) -> tuple[bool, ...]:
         return sequence.alarmed(memory.stamp_ns)
     hidden = memory.explanation.hidden
     least = max(hidden) * (1.0 - _TIE)
-    return tuple(memory.rule.alarm and p >= least for p in hidden)
+    return tuple(sustained(memory) and p >= least for p in hidden)
+
+
+def sustained(memory: Memory) -> bool:
+    """Return whether the rule of any source is in alarm; one that is silent for a second says nothing."""
+    latest_ns = memory.stamp_ns - RULE_HOLDS_NS
+    return any(one.alarm and one.stamp_ns >= latest_ns for one in memory.rules)
 
 
 def update_entities(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
