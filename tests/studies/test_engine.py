@@ -1,5 +1,6 @@
 """One evaluation on one process, on several or on a cluster: the same tables, whatever happens meanwhile."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -100,6 +101,9 @@ def test_a_cluster_without_workers_is_refused(monkeypatch):
     import distributed
 
     monkeypatch.setattr("worldstate.studies.trials.engine.CONNECT_S", 0.5)
+    # A client that never connected is closed when it is collected; collected while another loop starts, it
+    # waits for the lock that this start holds, for ever.
+    gc.collect()
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
         pytest.raises(InvalidArgumentError, match="got none; start some with `dask worker"),
