@@ -1,5 +1,6 @@
 """The whole world-state on made-up streams: who is warned of, who keeps an identity, who takes none."""
 
+import json
 import math
 
 import numpy as np
@@ -91,6 +92,14 @@ def test_two_that_come_at_once_are_two_and_a_car_ahead_is_neither() -> None:
     told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
     assert (told["both_sides_found"], told["phantom_third"]) == (1.0, 0.0)
     assert (told["identity_kept"], told["took_hidden_identity"]) == (1.0, 0.0)
+
+
+def test_of_a_street_where_nobody_comes_what_cannot_be_told_is_none() -> None:
+    made_up = stream([("from_ahead", "left", 12.0)], duration_s=30.0)
+    follow = followed(WorldFilter(Context()), heard(made_up))
+    told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
+    assert (told["onsets_per_hour"], told["detected"], told["time_rmse_of_constant"]) == (0.0, None, None)
+    json.dumps(told, allow_nan=False)
 
 
 def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:

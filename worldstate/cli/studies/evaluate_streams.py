@@ -55,10 +55,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     report = {"camera": arguments.camera, "seed": arguments.seed, "junctions": figures}
     if arguments.report is not None:
         write_report(arguments.report, report)
-    lines = ["", f"{'':24}" + "".join(f"{site:>9}" for site in figures)]
+    lines = [f"{'':24}" + "".join(f"{site:>9}" for site in figures)]
     for name in figures["all"]:
         lines.append(f"{name:24}" + "".join(f"{_shown(one[name]):>9}" for one in figures.values()))
-    return CommandResult(report, table={}, lines=lines[1:])
+    return CommandResult(report, table={}, lines=lines)
 
 
 def _shown(value: float | int | None) -> str:

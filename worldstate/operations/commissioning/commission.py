@@ -201,7 +201,7 @@ def with_quiet_alarm(
     model: Model, array: MicrophoneArray, quiet: Sequence[Path], onsets_per_hour: float
 ) -> Model:
     """Return a model whose alarm is set on recordings in which nobody came."""
-    windows, sequence = _parts(model)
+    windows, sequence = parts_of(model)
     heard = [hear_recording(path, array) for path in quiet]
     hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR
     # Where fewer onsets than these are to be expected, a threshold is set by chance alone.
@@ -214,7 +214,8 @@ def with_quiet_alarm(
     return replace(model, sequence=replace(sequence, alarm=alarm_for(said, onsets_per_hour)))
 
 
-def _parts(model: Model) -> tuple[EnsembleModel, SequenceModel]:
+def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
+    """Return the window and the sequence model of a file that holds both, as `commission` makes them."""
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
         raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
     return model.signature, model.sequence
@@ -282,7 +283,7 @@ def exam_of(
 
 
 def _examined(model: Model, heard: HeardStream) -> ExaminedStream:
-    windows, sequence = _parts(model)
+    windows, sequence = parts_of(model)
     if sequence.alarm is None:
         raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
     posterior = sequence.posterior(stream_evidence(windows, heard))

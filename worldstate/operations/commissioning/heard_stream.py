@@ -39,6 +39,11 @@ class HeardStream:
     vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
     rows: HopTable  # One row a vehicle and tenth of a second: time, place, in view, loudness
 
+    @property
+    def hazard_free(self) -> bool:
+        """Whether nobody comes out of a hidden arm."""
+        return not self.vehicles.hazard.any()
+
     def save(self, path: Path) -> None:
         """Write it, whole or not at all."""
         save_named(path, {HOPS: self.hops, VEHICLES: self.vehicles, ROWS: self.rows})

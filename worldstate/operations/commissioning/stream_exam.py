@@ -142,19 +142,21 @@ def examine(streams: Sequence[ExaminedStream]) -> dict[str, float | int | None]:
     loud = [one for one in told if not one.approach.quiet]
     found: dict[str, float | int | None] = {"approaches": len(loud), **_detections(loud)}
     for flow in ("single", "both", "queue"):
-        found[f"detected_{flow}"] = _mean([one.detected for one in loud if one.approach.flow == flow])
-    found["detected_quiet"] = _mean([one.detected for one in told if one.approach.quiet])
+        found[f"detected_{flow}"] = mean_of([one.detected for one in loud if one.approach.flow == flow])
+    found["detected_quiet"] = mean_of([one.detected for one in told if one.approach.quiet])
     singles = [one for one in loud if one.approach.flow == "single"]
-    found["other_side_too"] = _mean([one.other_side for one in singles])
-    found["wrong_side_only"] = _mean([one.other_side and not one.own_side for one in singles])
-    found["both_sides_found"] = _mean([one.every_side for one in loud if one.approach.flow == "both"])
-    found["onsets_after"] = _mean([one.onsets_after for one in loud])
+    found["other_side_too"] = mean_of([one.other_side for one in singles])
+    found["wrong_side_only"] = mean_of([one.other_side and not one.own_side for one in singles])
+    found["both_sides_found"] = mean_of([one.every_side for one in loud if one.approach.flow == "both"])
+    found["onsets_after"] = mean_of([one.onsets_after for one in loud])
     found |= _ranking(streams) | _false_alarms(streams) | _worst(streams)
     return found | _calibration(streams) | _times(streams) | _by_kind(told)
 
 
 @dataclass(frozen=True, slots=True)
-class _Outcome:
+class AlarmOutcome:
+    """What alarms made of one approach, from five seconds before its first T0 to six after its last."""
+
     approach: StreamApproach
     lead_s: float  # 0 where missed
     own_side: bool
@@ -164,29 +166,33 @@ class _Outcome:
 
     @property
     def detected(self) -> bool:
+        """Whether an alarm stood before the first T0."""
         return self.lead_s > 0.0
 
 
-def _outcomes(stream: ExaminedStream) -> list[_Outcome]:
-    time_s, raised = stream.heard.hops.time_s, stream.alarm.raised(stream.posterior)
+def alarm_outcomes(heard: HeardStream, time_s: FloatArray, raised: BoolArray) -> list[AlarmOutcome]:
+    """Return the outcome of every approach that lies whole within the hops, whoever raised the alarms.
+
+    Shapes: time_s (n,), raised (n, 2).
+    """
     any_side = np.asarray(raised.any(axis=1))
     onsets_s = time_s[rising_edges(any_side)]
     told = []
-    for one in approaches(stream.heard):
+    for one in approaches(heard):
         first, last = one.entries_s[0], max(one.entries_s)
         if first - LONGEST_LEAD_S < time_s[0] or last + AFTER_S > time_s[-1]:
             continue
-        before = _before(time_s, first)
+        before = shortly_before(time_s, first)
         alarms_s = time_s[before & any_side]
         by_side = np.asarray(raised[before].any(axis=0))
         told.append(
-            _Outcome(
+            AlarmOutcome(
                 approach=one,
                 lead_s=first - float(alarms_s[0]) if alarms_s.size else 0.0,
                 own_side=bool(by_side[one.sides[0]]),
                 other_side=bool(by_side[1 - one.sides[0]]),
                 every_side=all(
-                    raised[_before(time_s, entry_s), side].any()
+                    raised[shortly_before(time_s, entry_s), side].any()
                     for entry_s, side in zip(one.entries_s, one.sides, strict=True)
                 ),
                 onsets_after=int(((onsets_s >= last) & (onsets_s < last + AFTER_S)).sum()),
@@ -195,15 +201,21 @@ def _outcomes(stream: ExaminedStream) -> list[_Outcome]:
     return told
 
 
-def _loud(streams: Sequence[ExaminedStream]) -> list[_Outcome]:
+def _outcomes(stream: ExaminedStream) -> list[AlarmOutcome]:
+    raised = np.asarray(stream.alarm.raised(stream.posterior))
+    return alarm_outcomes(stream.heard, stream.heard.hops.time_s, raised)
+
+
+def _loud(streams: Sequence[ExaminedStream]) -> list[AlarmOutcome]:
     return [one for stream in streams for one in _outcomes(stream) if not one.approach.quiet]
 
 
-def _before(time_s: FloatArray, entry_s: float) -> BoolArray:
+def shortly_before(time_s: FloatArray, entry_s: float) -> BoolArray:
+    """Return the hops of the five seconds before a T0, shape (n,)."""
     return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
 
 
-def _detections(told: Sequence[_Outcome]) -> dict[str, float | None]:
+def _detections(told: Sequence[AlarmOutcome]) -> dict[str, float | None]:
     from scipy.stats import beta
 
     hits, n = sum(one.detected for one in told), len(told)
@@ -211,11 +223,11 @@ def _detections(told: Sequence[_Outcome]) -> dict[str, float | None]:
     low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0
     high = float(beta.ppf(0.975, hits + 1, n - hits)) if hits < n else 1.0
     return {
-        "detected": _mean([one.detected for one in told]),
+        "detected": mean_of([one.detected for one in told]),
         "detected_low": low if n else None,
         "detected_high": high if n else None,
-        "lead_s": _mean([one.lead_s for one in told if one.detected]),
-        "lead_missed_as_0_s": _mean([one.lead_s for one in told]),
+        "lead_s": mean_of([one.lead_s for one in told if one.detected]),
+        "lead_missed_as_0_s": mean_of([one.lead_s for one in told]),
     }
 
 
@@ -227,7 +239,7 @@ def _ranking(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     return {name: area if np.isfinite(area) else None for name, area in areas.items()}
 
 
-def _by_kind(told: Sequence[_Outcome]) -> dict[str, float | int | None]:
+def _by_kind(told: Sequence[AlarmOutcome]) -> dict[str, float | int | None]:
     """Return three figures for each kind that came alone, quiet ones too."""
     # With a bicycle comes a car in half of the others, and the car is what is heard.
     alone = [one for one in told if len(one.approach.kinds) == 1]
@@ -237,27 +249,39 @@ def _by_kind(told: Sequence[_Outcome]) -> dict[str, float | int | None]:
         detected = [lead for lead in leads if lead > 0.0]
         found[f"approaches_{kind}"] = len(leads)
         found[f"detected_{kind}"] = len(detected) / len(leads)
-        found[f"lead_{kind}_s"] = _mean(detected)
+        found[f"lead_{kind}_s"] = mean_of(detected)
     return found
 
 
 def _false_alarms(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
-    quiet = [one for one in streams if _hazard_free(one)]
-    alarms = [np.asarray(one.alarm.raised(one.posterior).any(axis=1)) for one in quiet]
+    quiet = [one for one in streams if one.heard.hazard_free]
+    found = quiet_figures([np.asarray(one.alarm.raised(one.posterior)) for one in quiet])
+    hours, rate = found["hazard_free_hours"], found["onsets_per_hour"]
+    if not hours or rate is None:
+        return found
+    low, high = poisson_interval(round(rate * hours), hours)
+    return found | {"onsets_low": low, "onsets_high": high}
+
+
+def quiet_figures(raised: Sequence[BoolArray]) -> dict[str, float | None]:
+    """Return the onsets an hour of streams in which nobody comes, and the share of their hops in alarm.
+
+    Shapes: raised (hops, 2).
+    """
+    alarms = [np.asarray(one.any(axis=1)) for one in raised]
     hours = sum(map(len, alarms)) * HOP_S / SECONDS_PER_HOUR
     if not hours:
         return {"hazard_free_hours": 0.0, "onsets_per_hour": None, "hazard_free_share": None}
     onsets = sum(rising_edges(one).size for one in alarms)
-    low, high = poisson_interval(onsets, hours)
-    rate = {"onsets_per_hour": onsets / hours, "onsets_low": low, "onsets_high": high}
-    return {"hazard_free_hours": hours, **rate, "hazard_free_share": _mean(np.concatenate(alarms))}
+    share = mean_of(np.concatenate(alarms))
+    return {"hazard_free_hours": hours, "onsets_per_hour": onsets / hours, "hazard_free_share": share}
 
 
 def _worst(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     """Return what is detected at the junction with the least of it, and the most onsets of any junction."""
     sites = np.array([str(one.heard.hops.about["site"]) for one in streams])
     there = [[streams[i] for i in np.flatnonzero(sites == site).tolist()] for site in np.unique(sites)]
-    shares = [_mean([one.detected for one in _loud(here)]) for here in there]
+    shares = [mean_of([one.detected for one in _loud(here)]) for here in there]
     rates = [_false_alarms(here)["onsets_per_hour"] for here in there]
     return {
         "detected_worst_junction": min((one for one in shares if one is not None), default=None),
@@ -277,12 +301,19 @@ def _calibration(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
 
 
 def _times(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
-    coming = [one.truth.coming_s <= LONGEST_S for one in streams]
-    true = np.concatenate([one.truth.coming_s[at] for one, at in zip(streams, coming, strict=True)])
-    if not true.size:
+    stated = np.concatenate([one.posterior.time_to_visible_s().reshape(-1, 3) for one in streams])
+    return time_figures(stated, np.concatenate([one.truth.coming_s.reshape(-1) for one in streams]))
+
+
+def time_figures(stated: FloatArray, coming_s: FloatArray) -> dict[str, float | None]:
+    """Return how true the times are of those who come within five seconds; None where none is stated.
+
+    Shapes: stated (n, 3), coming_s (n,).
+    """
+    comes = coming_s <= LONGEST_S
+    errors = visible_errors(stated[comes], coming_s[comes])
+    if not errors.count:
         return {"time_rmse_of_constant": None, "time_coverage": None, "time_width_s": None}
-    stated = [one.posterior.time_to_visible_s()[at] for one, at in zip(streams, coming, strict=True)]
-    errors = visible_errors(np.concatenate(stated), true)
     return {
         "time_rmse_of_constant": errors.rmse_s / errors.constant_rmse_s,
         "time_coverage": errors.coverage,
@@ -290,7 +321,8 @@ def _times(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     }
 
 
-def _mean(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
+def mean_of(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
+    """Return the mean, None of nothing."""
     return float(np.mean(values)) if len(values) else None
 
 
@@ -302,7 +334,7 @@ def warned_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> Fl
 
 def auroc_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
     """Return the AUROC of what alarms are read from, so long before T0 against hazard-free hops, (times,)."""
-    quiet = [smoothed_log_odds(one.posterior).max(axis=1) for one in streams if _hazard_free(one)]
+    quiet = [smoothed_log_odds(one.posterior).max(axis=1) for one in streams if one.heard.hazard_free]
     if not quiet:
         return np.full(len(before_s), np.nan)
     none = np.concatenate(quiet)
@@ -320,7 +352,3 @@ def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
     entries = [one.entries_s[0] for one in approaches(stream.heard) if not one.quiet]
     at = np.searchsorted(time_s, np.array(entries) - before_s + SLACK_S) - 1
     return np.asarray(scores[at[(at >= 0)]])
-
-
-def _hazard_free(stream: ExaminedStream) -> bool:
-    return not stream.heard.vehicles.hazard.any()

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
-from worldstate.abduction.sequence.sequence_model import SequenceModel, SequencePosterior
+from worldstate.abduction.sequence.sequence_inputs import HopEvidence
+from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReading
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_signature import SiteSignature
@@ -20,11 +21,11 @@ def measurements(
     heard: HeardStream,
     model: EnsembleModel,
     sequence: SequenceModel,
-    posterior: SequencePosterior,
+    evidence: HopEvidence,
     vision: CoEvidenceChannel | None,
 ) -> Iterator[Measurement]:
     """Yield one measurement a hop, as the acoustic adapter makes them of the sound."""
-    hops, signature = heard.hops, SiteSignature(model)
+    hops, signature, posterior = heard.hops, SiteSignature(model), sequence.posterior(evidence)
     for i in range(len(hops)):
         reading = SequenceReading(posterior.groups[i], sequence.share, sequence.margin_s, sequence.alarm)
         measurement = Measurement(
@@ -35,7 +36,7 @@ def measurements(
             approach=_approach(heard, i),
             sequence=reading if i + 1 >= LEAST_HOPS else NotUsable("too few hops"),
         )
-        yield asked_again(measurement, vision) if vision is not None else measurement
+        yield asked_again(measurement, vision)
 
 
 def _bearing(heard: HeardStream, i: int) -> Bearing | NotUsable:

@@ -11,15 +11,21 @@ import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, LONGEST_S
-from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.commissioning.heard_stream import HeardStream
-from worldstate.operations.commissioning.stream_exam import AFTER_S, StreamApproach, approaches
+from worldstate.operations.commissioning.stream_exam import (
+    AlarmOutcome,
+    StreamApproach,
+    alarm_outcomes,
+    approaches,
+    mean_of,
+    quiet_figures,
+    shortly_before,
+    time_figures,
+)
 from worldstate.operations.commissioning.stream_labels import StreamTruth
-from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.recordings.advisories import (
     LONGEST_LEAD_S,
-    SECONDS_PER_HOUR,
     SLACK_S,
     rising_edges,
 )
@@ -39,67 +45,33 @@ class PassedStream:
     truth: StreamTruth
     followed: FollowedStream
 
-    @property
-    def hazard_free(self) -> bool:
-        """Whether nobody comes out of a hidden arm."""
-        return not self.heard.vehicles.hazard.any()
-
 
 @dataclass(frozen=True, slots=True)
 class PassOutcome:
-    """One approach."""
+    """One approach: what the advisories made of it, and the entities."""
 
-    approach: StreamApproach
-    lead_s: float  # 0 where no advisory came before T0
+    alarm: AlarmOutcome
     onsets: int  # Of advisories, from five seconds before T0 to T0
-    own_side: bool
-    other_side: bool
-    every_side: bool
     hidden_before: int  # Different entities believed hidden before T0
     identity: bool | None  # None where nobody was believed there, or nobody was seen
-    onsets_after: int
 
 
 def outcomes(stream: PassedStream) -> list[PassOutcome]:
     """Return the outcome of every approach that lies whole within the stream."""
-    time_s, alarms = stream.followed.time_s, stream.followed.advisory
-    any_side = np.asarray(alarms.any(axis=1))
-    onsets_s = time_s[rising_edges(any_side)]
+    followed = stream.followed
+    onsets_s = followed.time_s[rising_edges(followed.advisory.any(axis=1))]
     found = []
-    for one in approaches(stream.heard):
-        first, last = one.entries_s[0], max(one.entries_s)
-        if first - LONGEST_LEAD_S < time_s[0] or last + AFTER_S > time_s[-1]:
-            continue
-        before = _before(time_s, first)
-        alarmed_s = time_s[before & any_side]
-        by_side = np.asarray(alarms[before].any(axis=0))
+    for alarm in alarm_outcomes(stream.heard, followed.time_s, followed.advisory):
+        first, last = alarm.approach.entries_s[0], max(alarm.approach.entries_s)
         hidden = {
             entity.id
-            for hop in np.flatnonzero(_before(time_s, last))
+            for hop in np.flatnonzero(shortly_before(followed.time_s, last))
             for side in (0, 1)
-            for entity in stream.followed.hidden(int(hop), side, EXISTS)
+            for entity in followed.hidden(int(hop), side, EXISTS)
         }
-        found.append(
-            PassOutcome(
-                approach=one,
-                lead_s=first - float(alarmed_s[0]) if alarmed_s.size else 0.0,
-                onsets=int(((onsets_s > first - LONGEST_LEAD_S) & (onsets_s < first)).sum()),
-                own_side=bool(by_side[one.sides[0]]),
-                other_side=bool(by_side[1 - one.sides[0]]),
-                every_side=all(
-                    alarms[_before(time_s, entry), side].any()
-                    for entry, side in zip(one.entries_s, one.sides, strict=True)
-                ),
-                hidden_before=len(hidden),
-                identity=_identity(stream, one),
-                onsets_after=int(((onsets_s >= last) & (onsets_s < last + AFTER_S)).sum()),
-            )
-        )
+        onsets = int(((onsets_s > first - LONGEST_LEAD_S) & (onsets_s < first)).sum())
+        found.append(PassOutcome(alarm, onsets, len(hidden), _identity(stream, alarm.approach)))
     return found
-
-
-def _before(time_s: FloatArray, entry_s: float) -> BoolArray:
-    return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
 
 
 def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
@@ -142,33 +114,24 @@ def _seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
 def pass_figures(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
     """Return the figures of some streams together, ready for a table and for JSON."""
     told = [one for stream in streams for one in outcomes(stream)]
-    loud = [one for one in told if not one.approach.quiet]
-    flows = {flow: [one for one in loud if one.approach.flow == flow] for flow in ("single", "both", "queue")}
+    loud = [one for one in told if not one.alarm.approach.quiet]
+    singles, both = ([one for one in loud if one.alarm.approach.flow == flow] for flow in ("single", "both"))
     judged = [one.identity for one in loud if one.identity is not None]
     found: dict[str, float | int | None] = {
         "approaches": len(loud),
-        "detected": _mean([one.lead_s > 0.0 for one in loud]),
-        "lead_missed_as_0_s": _mean([one.lead_s for one in loud]),
-        "onsets_per_approach": _mean([one.onsets for one in loud if one.lead_s > 0.0]),
-        "both_sides_found": _mean([one.every_side for one in flows["both"]]),
-        "other_side_too": _mean([one.other_side for one in flows["single"]]),
-        "wrong_side_only": _mean([one.other_side and not one.own_side for one in flows["single"]]),
-        "phantom_third": _mean([one.hidden_before > 2 for one in flows["both"]]),
+        "detected": mean_of([one.alarm.detected for one in loud]),
+        "lead_missed_as_0_s": mean_of([one.alarm.lead_s for one in loud]),
+        "onsets_per_approach": mean_of([one.onsets for one in loud if one.alarm.detected]),
+        "both_sides_found": mean_of([one.alarm.every_side for one in both]),
+        "other_side_too": mean_of([one.alarm.other_side for one in singles]),
+        "wrong_side_only": mean_of([one.alarm.other_side and not one.alarm.own_side for one in singles]),
+        "phantom_third": mean_of([one.hidden_before > 2 for one in both]),
         "identity_judged": len(judged),
-        "identity_kept": _mean(judged),
-        "onset_after_pass": _mean([one.onsets_after > 0 for one in flows["single"]]),
+        "identity_kept": mean_of(judged),
+        "onset_after_pass": mean_of([one.alarm.onsets_after > 0 for one in singles]),
     }
-    return found | _false_alarms(streams) | _ahead(streams) | _forecast(streams) | _bearing(streams)
-
-
-def _false_alarms(streams: Sequence[PassedStream]) -> dict[str, float | None]:
-    quiet = [np.asarray(one.followed.advisory.any(axis=1)) for one in streams if one.hazard_free]
-    hours = sum(map(len, quiet)) * HOP_S / SECONDS_PER_HOUR
-    if not hours:
-        return {"hazard_free_hours": 0.0, "onsets_per_hour": None, "hazard_free_share": None}
-    onsets = sum(rising_edges(one).size for one in quiet) / hours
-    share = _mean(np.concatenate(quiet))
-    return {"hazard_free_hours": hours, "onsets_per_hour": onsets, "hazard_free_share": share}
+    quiet = quiet_figures([one.followed.advisory for one in streams if one.heard.hazard_free])
+    return found | quiet | _ahead(streams) | _forecast(streams) | _bearing(streams)
 
 
 def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
@@ -189,7 +152,7 @@ def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
             before = {one.id for side in (0, 1) for one in stream.followed.hidden(first - 1, side)}
             if entity is not None:
                 taken.append(entity.id in before)
-    return {"seen_ahead": len(taken), "took_hidden_identity": _mean(taken)}
+    return {"seen_ahead": len(taken), "took_hidden_identity": mean_of(taken)}
 
 
 def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
@@ -197,15 +160,11 @@ def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
     coming_s = np.concatenate([one.truth.coming_s.ravel() for one in streams])
     said = np.isfinite(within)
     stated = np.concatenate([one.followed.time_to_visible_s.reshape(-1, 3) for one in streams])
-    comes = coming_s <= LONGEST_S
-    errors = visible_errors(stated[comes], coming_s[comes])
     return {
         "skill_2s": brier_skill(within[said], coming_s[said] <= 2.0),
         "ece_2s": expected_calibration_error(within[said], coming_s[said] <= 2.0),
-        "time_rmse_of_constant": errors.rmse_s / errors.constant_rmse_s,
-        "time_coverage": errors.coverage,
-        "time_width_s": errors.width_s,
-        "times_stated": _mean(np.isfinite(stated[comes][:, 1])),
+        **time_figures(stated, coming_s),
+        "times_stated": mean_of(np.isfinite(stated[coming_s <= LONGEST_S][:, 1])),
     }
 
 
@@ -224,8 +183,4 @@ def _bearing(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
                     if azimuth is not None:
                         error = wrap_angle(entity.azimuth_rad - azimuth)
                         squares.append(error**2 / entity.azimuth_std_rad**2)
-    return {"hidden_hops": len(squares), "hidden_nees": _mean(squares)}
-
-
-def _mean(values: Sequence[float] | Sequence[bool] | FloatArray | BoolArray) -> float | None:
-    return float(np.mean(values)) if len(values) else None
+    return {"hidden_hops": len(squares), "hidden_nees": mean_of(squares)}

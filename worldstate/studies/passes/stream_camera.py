@@ -8,7 +8,6 @@ from worldstate.adapters.simulation.camera.simulated_detector import BOX_NOISE_P
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import nanoseconds
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.plan import junction_named
 
@@ -27,19 +26,19 @@ def stream_detections(
     for number, name in kinds.items():
         kind, mine = vehicle_kind(name), heard.rows.vehicle == number
         x, y, seen = heard.rows.x_m[mine], heard.rows.y_m[mine], heard.rows.in_view[mine]
+        time_s = heard.rows.time_s[mine]
         crossing = _crossing(x, y)
         for at in np.flatnonzero(seen).tolist():
             box = _box(camera, site, kind, float(x[at]), float(y[at]), int(crossing[at]))
             if box is None or rng.random() < miss_rate(float(x[at]), float(y[at])):
                 continue
             noisy = np.array(inside(box + rng.normal(0.0, BOX_NOISE_PX, 4), camera))
-            frame = round(float(heard.rows.time_s[mine][at]) / FRAME_S)
+            frame = round(float(time_s[at]) / FRAME_S)
             score = float(np.clip(rng.normal(0.95, 0.03), 0.3, 0.999))
             frames.setdefault(frame, []).append((noisy, score, kind.label))
     last = round(float(heard.hops.time_s[-1]) / FRAME_S)
     every = [_frame(frames.get(at, [])) for at in range(last + 1)]
-    stamps = np.array([nanoseconds(at * FRAME_S) for at in range(last + 1)], np.int64)
-    return DetectionLog(tuple(every), stamps, heard.hops.name)
+    return DetectionLog.at_rate(every, 1.0 / FRAME_S, source=heard.hops.name)
 
 
 def _crossing(x: FloatArray, y: FloatArray) -> FloatArray:

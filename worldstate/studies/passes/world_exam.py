@@ -1,19 +1,16 @@
 """Let the whole world-state follow streams that were listened to, with a camera or without."""
 
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.files.model_file import Model
 from worldstate.core.filter import WorldFilter
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.commissioning.commission import stream_evidence
+from worldstate.operations.commissioning.commission import parts_of, stream_evidence
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_labels import stream_truth
 
@@ -37,15 +34,12 @@ def passed_stream(
     InvalidArgumentError
         If the model has no sequence, as `commission` makes one.
     """
-    if model.sequence is None or not isinstance(model.signature, EnsembleModel):
-        raise InvalidArgumentError("model: expected one with a sequence, as `worldstate commission` makes")
-    heard = HeardStream.load(path)
-    posterior = model.sequence.posterior(stream_evidence(model.signature, heard))
-    measured = partial(measurements, heard, model.signature, model.sequence, posterior)
-    vision = None
+    windows, sequence = parts_of(model)
+    heard, vision = HeardStream.load(path), None
     if camera != "none":
         boxes = EVERYBODY if camera == "all" else DetectionFilter()
         detections = stream_detections(heard, np.random.default_rng(seed))
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
+    measured = measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
     world = WorldFilter(policy=model.policies.for_alpha(alpha))
-    return PassedStream(heard, stream_truth(heard), followed(world, measured(vision)))
+    return PassedStream(heard, stream_truth(heard), followed(world, measured))
