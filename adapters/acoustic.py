@@ -244,19 +244,18 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
         reader = self._sequence
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
-        return Measurement(
+        measured = Measurement(
             stamp_ns=frame.stamp_ns,
             signature=signature,
-            co_evidence=_answer(self._vision, self._settings, frame.stamp_ns, bearing, signature, kinds),
+            co_evidence=Unqueried("no camera"),
             bearing=bearing,
             approach=approach,
             domain=domain,
             kinds=kinds,
             sequence=sequence,
-            sightings=self._vision.sightings(frame.stamp_ns) if self._vision else (),
-            look=self._vision.last_look(frame.stamp_ns) if self._vision else None,
             source=self.source,
         )
+        return asked_again(measured, self._vision, self._settings)
 
     def _judged(self, frame: AcousticFrame) -> DomainVerdict | None:
         if self._guard is None or isinstance(frame.character, NotUsable):
@@ -269,30 +268,27 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         return heard_kinds(self._road_users, frame.character, domain)
 
 
-def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
-    """Return a measurement with the answers of another camera; what was heard stays as it is."""
-    stamp_ns = measurement.stamp_ns
-    heard = measurement.bearing, measurement.signature, measurement.kinds
-    answer = _answer(vision, AcousticSettings(), stamp_ns, *heard)
-    sightings = vision.sightings(stamp_ns) if vision else ()
-    look = vision.last_look(stamp_ns) if vision else None
-    return replace(measurement, co_evidence=answer, sightings=sightings, look=look)
-
-
-def _answer(
-    vision: CoEvidenceChannel | None,
-    settings: AcousticSettings,
-    stamp_ns: int,
-    bearing: Bearing | NotUsable,
-    signature: SignatureEvidence,
-    kinds: ClassShares,
-) -> CoEvidence:
+def asked_again(
+    measurement: Measurement, vision: CoEvidenceChannel | None, settings: AcousticSettings | None = None
+) -> Measurement:
+    """Return a measurement with the answers of a camera, or of none; what was heard stays as it is."""
     if vision is None:
-        return Unqueried("no camera")
+        return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None)
+    stamp_ns = measurement.stamp_ns
+    return replace(
+        measurement,
+        co_evidence=_answer(measurement, vision, settings or AcousticSettings()),
+        sightings=vision.sightings(stamp_ns),
+        look=vision.last_look(stamp_ns),
+    )
+
+
+def _answer(measurement: Measurement, vision: CoEvidenceChannel, settings: AcousticSettings) -> CoEvidence:
+    bearing, labels = measurement.bearing, expected_labels(measurement.kinds)
     if isinstance(bearing, Bearing) and bearing.std_rad <= settings.coarse_std_rad:
-        return vision.ask(stamp_ns, bearing, expected_labels(kinds))
-    side = _likelier_side(signature)
-    return vision.ask(stamp_ns, NotUsable("coarse bearing"), expected_labels(kinds), side)
+        return vision.ask(measurement.stamp_ns, bearing, labels)
+    side = _likelier_side(measurement.signature)
+    return vision.ask(measurement.stamp_ns, NotUsable("coarse bearing"), labels, side)
 
 
 def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotUsable:

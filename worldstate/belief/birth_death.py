@@ -26,7 +26,7 @@ class BirthDeath:
 def birth_death(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
-    sides: HiddenBelief | None,
+    sides: HiddenBelief,
     births: tuple[int, ...],
     alarmed: Sequence[bool],
     rearmed: Sequence[bool],
@@ -35,8 +35,6 @@ def birth_death(
 ) -> BirthDeath:
     """Return the tracks with hidden entities born, updated and removed.
 
-    What a sequence says of the `sides` stands in for the explanations, which exclude each other.
-
     Shapes: alarmed (K,), rearmed (K,).
     """
     settings, kept, counts = site.settings, list(tracks), list(births)
@@ -44,15 +42,14 @@ def birth_death(
     for k in range(len(site.sides)):
         current = next((track for track in kept if not track.seen and track.side == k), None)
         if current is None:
-            believed = sides or HiddenBelief.of_explanation(explanation)
-            heard = believed.hidden[k] >= settings.birth_probability or alarmed[k]
+            heard = sides.hidden[k] >= settings.birth_probability or alarmed[k]
             if heard and rearmed[k]:
                 # What came into view from here before was another vehicle: the new one starts without its
                 # mass.
                 explanation = explanation.forget_origin(k)
                 begun.append(k)
                 returning = _returning(kept, k, measurement.stamp_ns, site)
-                existence = min((sides or explanation).hidden[k], 1.0)
+                existence = min(sides.hidden[k], 1.0)
                 if returning is None:
                     kept.append(_born(k, counts[k], existence, measurement, site))
                     counts[k] += 1
@@ -61,7 +58,7 @@ def birth_death(
                     kept.append(_hidden_again(returning, k, existence, measurement, site))
         else:
             kept.remove(current)
-            existence = (sides or HiddenBelief.of_explanation(explanation)).existence(k)
+            existence = sides.existence(k)
             if existence >= settings.death_probability or alarmed[k]:
                 labels = heard_as(current, measurement.kinds)
                 kept.append(replace(current, existence=existence, labels=labels))

@@ -21,6 +21,8 @@ from worldstate.ground.typing import FloatArray
 _SPREAD = 0.2
 _PACES_HZ = 0.5 * np.exp(_SPREAD * math.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]))
 _PACE_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
+# v t / d in the middle of every group, shape (groups, paces).
+_PASSED = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None] * _PACES_HZ
 # Of the edge: corners of OVAD's junctions stand at 32 degrees, give or take this, from where the ego stops.
 EDGE_STD_RAD = math.radians(5.0)
 # Beyond, the street ahead ends or bends.
@@ -40,9 +42,7 @@ def hidden_bearing(coming: FloatArray, edge_rad: float) -> tuple[float, float]:
     [37, 5, 63, 6]
     """
     sign = math.copysign(1.0, edge_rad)
-    edges = np.array((0.0, *COMING_S))
-    middle_s = 0.5 * (edges[1:] + edges[:-1])
-    slope = math.tan(min(abs(edge_rad), _FARTHEST_RAD)) + middle_s[:, None] * _PACES_HZ
+    slope = math.tan(min(abs(edge_rad), _FARTHEST_RAD)) + _PASSED
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
     weight = coming[:, None] * _PACE_WEIGHTS
     weight = weight / weight.sum()

@@ -31,7 +31,6 @@ _SMALLEST = 1e-12
 _ROUNDS = 1000  # After 200 the prior still drifts by a percent, after these by 1e-9
 
 _COMING = len(COMING_S)
-_REST = len(GROUPS) - _COMING
 # Who comes does so with nobody in view or behind somebody who is: of the sequence's groups each coming one is
 # two states here. Taken as one, every second of an empty view would count against whoever comes.
 STATES = (*GROUPS[:_COMING], *(f"{group}_behind" for group in GROUPS[:_COMING]), *GROUPS[_COMING:])

@@ -65,9 +65,12 @@ class Memory:
     @property
     def sides(self) -> HiddenBelief:
         """What is believed of hidden vehicles: by the sequence where one is read, or the explanations."""
-        if self.sequence is None:
-            return HiddenBelief.of_explanation(self.explanation)
-        return self.sequence.hidden
+        return sides_of(self.explanation, self.sequence)
+
+
+def sides_of(explanation: ExplanationBelief, sequence: SequenceMemory | None) -> HiddenBelief:
+    """Return the sides as a sequence has them; without one, as explanations that exclude each other."""
+    return HiddenBelief.of_explanation(explanation) if sequence is None else sequence.hidden
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

@@ -71,9 +71,10 @@ class SequenceMemory:
             finite_array(f"memory.sequence.{name}", array, shape)
             if (array < 0.0).any() or not np.allclose(array.sum(axis=-1), 1.0, atol=1e-3):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected probabilities")
-        if len(self.over_ns) != len(SIDES):
-            got = len(self.over_ns)
-            raise InvalidArgumentError(f"memory.sequence.over_ns: expected {len(SIDES)}, got {got}")
+        for name, stamps_ns in (("over_ns", self.over_ns), ("emerged_ns", self.emerged_ns)):
+            if len(stamps_ns) != len(SIDES):
+                got = len(stamps_ns)
+                raise InvalidArgumentError(f"memory.sequence.{name}: expected {len(SIDES)}, got {got}")
 
     @cached_property
     def posterior(self) -> SequencePosterior:
@@ -139,8 +140,7 @@ def informed(
     if look is not None:
         looks = (*(one for one in looks if one.sensor != look.sensor), look)
     looks = tuple(sorted(looks, key=attrgetter("sensor")))
-    stamp_ns = measurement.stamp_ns
-    return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=stamp_ns), stamp_ns)
+    return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=measurement.stamp_ns))
 
 
 def _prior(share: FloatArray, context: Context) -> FloatArray:
@@ -148,15 +148,15 @@ def _prior(share: FloatArray, context: Context) -> FloatArray:
     return context_prior(share, None if priors is None else priors.hidden / len(SIDES))
 
 
-def _alerted(kept: SequenceMemory, stamp_ns: int) -> SequenceMemory:
+def _alerted(kept: SequenceMemory) -> SequenceMemory:
     """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
     left, right = soon_log_odds(kept.posterior)[0].tolist()
-    since_ns = stamp_ns - _SMOOTHED_NS + _SLACK_NS
-    recent = (*(one for one in kept.recent if one[0] > since_ns), (stamp_ns, left, right))
+    since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
+    recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
     kept = replace(kept, recent=recent)
     if kept.alarm is None:
         return kept
     means = np.mean([one[1:] for one in recent], axis=0)
     over = (means >= kept.alarm.threshold_nats).tolist()
-    over_ns = tuple(stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
+    over_ns = tuple(kept.stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
     return replace(kept, over_ns=over_ns)

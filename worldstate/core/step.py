@@ -23,7 +23,7 @@ from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseco
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 
-from .memory import CountedLook, Memory, SourceRule, priors_of
+from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
 from .sequence_memory import carried, informed
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
@@ -136,7 +136,7 @@ def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, 
         tracks=acoustic_update(
             memory.tracks,
             measurement,
-            replace(memory, explanation=explanation).sides,
+            sides_of(explanation, memory.sequence),
             explanation.visible,
             weights.sound,
             settings,
@@ -256,7 +256,7 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
     hidden = birth_death(
         memory.tracks,
         memory.explanation,
-        None if memory.sequence is None else memory.sides,
+        memory.sides,
         memory.births,
         alarmed(memory),
         [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
