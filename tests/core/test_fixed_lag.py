@@ -12,6 +12,7 @@ from worldstate import Measurement, NotUsable, Sighting, SignatureEvidence, Worl
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 from worldstate.state import Delivery, WorldState
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -19,9 +20,17 @@ SILENT = NotUsable("not scripted")
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
-def script(rng: np.random.Generator, hops: int = 18) -> list[Measurement]:
-    """Return sound every tenth of a second, a camera in it, and a radio that speaks now and then."""
-    measured = []
+def scan(rng: np.random.Generator, stamp_ns: int, searches: bool) -> PositionScan:
+    """Return what a radar finds ahead, or where vehicles say that they are."""
+    at = (Position((rng.uniform(5, 20), rng.uniform(-20, 20)), ((1.0, 0.2), (0.2, 0.5))) for _ in range(2))
+    at = (replace(one, existence_probability=float(rng.uniform(0.1, 0.9))) for one in at)
+    searched = SearchedSector(Sector(0.0, 1.0), 50.0, 0.8) if searches else None
+    return PositionScan("radar" if searches else "messages", stamp_ns, tuple(at), searched)
+
+
+def script(rng: np.random.Generator, hops: int = 18) -> list[Measurement | PositionScan]:
+    """Return sound every tenth of a second, a camera in it, and a radio and a radar now and then."""
+    measured: list[Measurement | PositionScan] = []
     for hop in range(1, hops + 1):
         left, right, visible, none = rng.normal(0.0, 1.0, 4).tolist()
         heard = SignatureEvidence(("left", "right"), (left, right), visible, none)
@@ -37,10 +46,13 @@ def script(rng: np.random.Generator, hops: int = 18) -> list[Measurement]:
             unasked = Unqueried("no camera")
             stamp_ns = own.stamp_ns + int(rng.integers(0, 10**8))
             measured.append(replace(own, stamp_ns=stamp_ns, co_evidence=unasked, sightings=(), source="v2x"))
+        if rng.random() < 0.2:
+            stamp_ns = own.stamp_ns + int(rng.integers(0, 10**8))
+            measured.append(scan(rng, stamp_ns, rng.random() < 0.5))
     return sorted(measured, key=lambda one: (one.stamp_ns, one.source))
 
 
-def filtered(measurements: list[Measurement], world: WorldFilter | None = None) -> WorldFilter:
+def filtered(measurements: list[Measurement | PositionScan], world: WorldFilter | None = None) -> WorldFilter:
     world = world or WorldFilter()
     for one in measurements:
         world = world.update(one)

@@ -7,7 +7,7 @@ from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
 from .hidden_belief import HiddenBelief
-from .motion import log_azimuth_likelihood, update_approach, update_azimuth
+from .kinematics.motion import log_azimuth_likelihood, update_approach, update_azimuth
 from .settings import FilterSettings
 from .track import Track, merged
 
@@ -30,14 +30,19 @@ def acoustic_update(
     if weight <= 0.0:
         return tracks
     return tuple(
-        _updated(track, measurement, sides, visible, weight, settings) if track.moving else track
+        _updated(track, measurement, sides, visible, weight, settings)
+        # A measured position tells more than a bearing that may be that of a wall.
+        if track.moving and track.place is None
+        else track
         for track in tracks
     )
 
 
 def hidden_share(track: Track, sides: HiddenBelief) -> float:
     """Return P(hidden | exists) of a track, 0 once it was seen."""
-    return 0.0 if track.seen else sides.hidden_share(track.side)
+    if track.seen:
+        return 0.0
+    return sides.hidden_share(track.side) if track.place is None else track.behind
 
 
 def association_probability(

@@ -1,6 +1,7 @@
 """Association of sightings with entities, in view and at the edge of an occluder, all at once."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from .site_geometry import SiteGeometry
 from .track import Track
 
 # Of a pair outside the gate; below any sum of scores within it.
-_FORBIDDEN = -1e6
+FORBIDDEN = -1e6
 # Of pairing a parked with a moving object, nats: below the gate's 4 deviations, so that any free partner is
 # preferred, and finite, so that a parked car that drives off keeps its id.
 _PARKED_MISMATCH = -10.0
@@ -40,15 +41,29 @@ def associated(
     if not tracks or not sightings:
         return {}
     unheard = math.log(site.settings.unheard_probability / (2.0 * site.view_half_angle_rad))
-    scores = np.full((len(sightings), len(tracks) + len(sightings)), _FORBIDDEN)
-    scores[:, : len(tracks)] = _scores(tracks, sightings, unheard, site)
-    np.fill_diagonal(scores[:, len(tracks) :], unheard)
+    return assigned(_scores(tracks, sightings, unheard, site), unheard)
+
+
+def assigned(scores: FloatArray, new: float) -> dict[int, int]:
+    """Return {column: row} of the largest sum of scores, where every row may be somebody new instead.
+
+    Examples
+    --------
+    >>> assigned(np.array([[3.0, 2.0], [2.5, FORBIDDEN]]), new=-1.0)
+    {1: 0, 0: 1}
+    """
+    n, known = scores.shape
+    if not n or not known:
+        return {}
+    every = np.full((n, known + n), FORBIDDEN)
+    every[:, :known] = scores
+    np.fill_diagonal(every[:, known:], new)
     # Imported where it is needed: scipy.optimize takes longer than all else that the core imports.
     from scipy.optimize import linear_sum_assignment
 
-    rows, columns = linear_sum_assignment(-scores)
+    rows, columns = linear_sum_assignment(-every)
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return {column: row for row, column in pairs if column < len(tracks) and scores[row, column] > _FORBIDDEN}
+    return {column: row for row, column in pairs if column < known and every[row, column] > FORBIDDEN}
 
 
 def _scores(
@@ -58,9 +73,9 @@ def _scores(
     azimuth_rad = np.array([one.azimuth_rad for one in sightings])[:, None]
     std_rad = np.array([one.std_rad for one in sightings])[:, None]
     moving = np.array([one.moving for one in sightings])[:, None]
-    seen = np.array([track.seen for track in tracks])
+    known = np.array([track.seen or track.place is not None for track in tracks])
     in_view = _in_view(tracks, azimuth_rad, std_rad, moving, unheard, site.settings)
-    return np.where(seen, in_view, np.where(moving, _emergence(tracks, azimuth_rad, site), _FORBIDDEN))
+    return np.where(known, in_view, np.where(moving, _emergence(tracks, azimuth_rad, site), FORBIDDEN))
 
 
 def _in_view(
@@ -80,10 +95,17 @@ def _in_view(
     outside = (np.abs(residual) > settings.gate_rad) | (residual**2 > settings.gate_sigma**2 * variance)
     # Within its gate an entity in view takes a sighting before that counts as a new vehicle; a maximum of the
     # two would be a tie of all poor pairs, which the order of sightings would settle.
-    return np.where(outside, _FORBIDDEN, np.logaddexp(density + expected + mismatch, unheard))
+    return np.where(outside, FORBIDDEN, np.logaddexp(density + expected + mismatch, unheard))
 
 
 def _emergence(tracks: tuple[Track, ...], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
+    existence = np.array([track.existence for track in tracks])
+    own = emergence_density(tracks, azimuth_rad, site)
+    return np.asarray(np.log(np.maximum(existence * own, _LEAST)))
+
+
+def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
+    """Return the density of first sightings of hidden entities, 1/rad, shape (sightings, tracks)."""
     settings = site.settings
     edges_rad = np.array([side.edge_azimuth_rad for side in site.sides])
     deviations = wrap_angle(azimuth_rad - edges_rad) / settings.edge_std_rad
@@ -94,6 +116,4 @@ def _emergence(tracks: tuple[Track, ...], azimuth_rad: FloatArray, site: SiteGeo
         others = np.delete(near, side, axis=1).max(axis=1) if len(edges_rad) > 1 else near[:, side]
         confused = settings.side_confusion
         heard[:, side] = (1.0 - confused) * near[:, side] + confused * others
-    existence = np.array([track.existence for track in tracks])
-    own = heard[:, [track.side for track in tracks]]
-    return np.asarray(np.log(np.maximum(existence * own, _LEAST)))
+    return np.asarray(heard[:, [track.side for track in tracks]])

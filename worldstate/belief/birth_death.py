@@ -1,6 +1,6 @@
 """Birth and death of hidden entities, one at most on each side."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from worldstate.abduction.road_users import UNKNOWN
@@ -40,7 +40,7 @@ def birth_death(
     settings, kept, counts = site.settings, list(tracks), list(births)
     begun = []
     for k in range(len(site.sides)):
-        current = next((track for track in kept if not track.seen and track.side == k), None)
+        current = hidden_on(kept, k)
         if current is None:
             heard = sides.hidden[k] >= settings.birth_probability or alarmed[k]
             if heard and rearmed[k]:
@@ -59,10 +59,19 @@ def birth_death(
         else:
             kept.remove(current)
             existence = sides.existence(k)
-            if existence >= settings.death_probability or alarmed[k]:
-                labels = heard_as(current, measurement.kinds)
+            labels = heard_as(current, measurement.kinds)
+            if current.place is not None:
+                # It was announced, and is there until its place is lost.
+                kept.append(replace(current, labels=labels))
+            elif existence >= settings.death_probability or alarmed[k]:
                 kept.append(replace(current, existence=existence, labels=labels))
     return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))
+
+
+def hidden_on(tracks: Iterable[Track], k: int) -> Track | None:
+    """Return the likeliest hidden entity of a side; None where there is none."""
+    hidden = [one for one in tracks if not one.seen and one.side == k and one.behind >= 0.5]
+    return max(hidden, key=lambda one: one.existence, default=None)
 
 
 def _returning(tracks: list[Track], k: int, stamp_ns: int, site: SiteGeometry) -> Track | None:
@@ -91,6 +100,8 @@ def _hidden_again(
         existence=existence,
         motion=site.prior(k),
         updated_ns=measurement.stamp_ns,
+        place=None,
+        behind=1.0,
     )
 
 

@@ -1,5 +1,6 @@
 """The belief over explanations, a hidden Markov model filtered in log space."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,9 @@ LOG_FLOOR = -600.0
 # The co-evidence enters through the prior here, with the evidence of the other sources, and must not count
 # again.
 _IN_PRIOR = Unqueried("already weighed into the prior")
+
+# Certainty would take several windows of evidence to undo.
+_MOST_HIDDEN = 0.999
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +116,21 @@ class ExplanationBelief:
         p[direction] -= moved
         p[2 * k] += moved + p[k + direction]
         p[k + direction] = 0.0
+        return replace(self, log_probabilities=_logs(p))
+
+    def at_least(self, hidden: Sequence[float]) -> "ExplanationBelief":
+        """Return the belief with P(hidden_k) raised to at least those given; the rest shrinks alike.
+
+        Shapes: hidden (K,). Sides exclude each other here: given more than one in all, they share it.
+        """
+        p, k = self.probabilities, len(self.directions)
+        least = np.array(hidden) * min(_MOST_HIDDEN / max(sum(hidden), _MOST_HIDDEN), 1.0)
+        raised = np.maximum(least - p[:k], 0.0)
+        if not raised.any():
+            return self
+        free = np.where(raised > 0.0, 0.0, p[:k]).sum() + p[k:].sum()
+        p *= (1.0 - least[raised > 0.0].sum()) / max(free, 1e-300)
+        p[:k] = np.where(raised > 0.0, least, p[:k])
         return replace(self, log_probabilities=_logs(p))
 
     def forget_origin(self, direction: int) -> "ExplanationBelief":

@@ -5,8 +5,11 @@ from dataclasses import dataclass
 
 from worldstate.ground.values import wrap_angle
 
-from .motion import MotionBelief
+from .kinematics.motion import MotionBelief
 from .settings import FilterSettings
+
+# Who comes along a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.
+_WIDEST_RAD = math.radians(60.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +26,12 @@ class SideGeometry:
     edge_azimuth_rad: float  # Edge of the occluder
     azimuth_rad: float  # Where vehicles are while it hides them
     std_rad: float
+
+    def behind(self, azimuth_rad: float, std_rad: float) -> float:
+        """Return the probability that what stands at an azimuth is behind this side's occluder."""
+        outwards = math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
+        past = outwards * wrap_angle(azimuth_rad - self.edge_azimuth_rad) / std_rad
+        return normal_share(past) - normal_share(past - _WIDEST_RAD / std_rad)
 
     def distance_rad(self, azimuth_rad: float) -> float:
         """Return the angle between an azimuth and the occluder's edge, >= 0."""
@@ -44,6 +53,7 @@ class SiteGeometry:
     sides: tuple[SideGeometry, ...]  # Approach sides, in the order of the signature's directions
     view_half_angle_rad: float  # Half the field of view of the co-evidence channel, centred on the x axis
     settings: FilterSettings  # Noise levels, gates, births and deaths
+    ego_speed_mps: float = 0.0  # Along the x axis
 
     def prior(self, side: int) -> MotionBelief:
         """Return the prior motion of a vehicle hidden on a side."""
@@ -53,6 +63,17 @@ class SiteGeometry:
         """Return the index of the side whose edge is nearest to an azimuth."""
         return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
 
+    def hiding_side(self, azimuth_rad: float, std_rad: float) -> tuple[int, float]:
+        """Return the side that most likely hides what stands at an azimuth, and with which probability."""
+        chances = [side.behind(azimuth_rad, std_rad) for side in self.sides]
+        side = max(range(len(chances)), key=chances.__getitem__)
+        return side, chances[side]
+
     def in_view(self, azimuth_rad: float) -> bool:
         """Tell whether an azimuth is in the field of view of the co-evidence channel."""
         return abs(azimuth_rad) <= self.view_half_angle_rad
+
+
+def normal_share(deviations: float) -> float:
+    """Return the share of a normal distribution below so many deviations."""
+    return 0.5 * math.erfc(-deviations / math.sqrt(2.0))

@@ -6,12 +6,12 @@ from typing import Annotated, TypeAlias
 from uuid import UUID, uuid5
 
 from worldstate.abduction.road_users import ClassShares
-from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
+from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
-from worldstate.measurement.measurement import Sighting
 
 from .existence import after_time
-from .motion import MotionBelief, predict, relax
+from .kinematics.cartesian import CartesianBelief, polar_motion, predict_place
+from .kinematics.motion import MotionBelief, predict, relax
 from .site_geometry import SiteGeometry
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
@@ -26,6 +26,10 @@ _PARKED_ACCELERATION = 1e-4
 # Prior of a vehicle in view, of which only the azimuth is measured: neither closing nor receding, within .5
 # 1/s, at exp(3.2) = 25 m within a factor of 1.8.
 _IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
+
+# Of the position, m: five seconds after a sharp one, and twice what is published. Then only the azimuth is
+# tracked, or a hidden one's side.
+_LOST_PLACE_M = 10.0
 
 
 Label: TypeAlias = Annotated[tuple[str, float], Keys("label", "probability")]
@@ -51,6 +55,8 @@ class Track:
     approach_heard: bool = False  # Whether its approach rate was ever measured
     # Whether it was ever heard before it was seen, or lost from view and heard again.
     was_hidden: bool = False
+    place: CartesianBelief | None = field(default=None, metadata=ADDED)  # Then `motion` follows from it
+    behind: Probability = field(default=1.0, metadata=ADDED)  # P(behind its side's occluder), by that place
 
 
 def entity_id(stream: str, kind: str, number: int) -> str:
@@ -70,6 +76,13 @@ def predict_track(track: Track, hidden_share: float, step_s: float, site: SiteGe
     # has not passed the corner, whatever its last rates said.
     settings = site.settings
     acceleration = settings.acceleration_psd if track.moving else _PARKED_ACCELERATION
+    if track.place is not None:
+        place = predict_place(track.place, step_s, acceleration, site.ego_speed_mps)
+        if place.position_std_m <= _LOST_PLACE_M:
+            # No life time here: who keeps sending is there, and who does not is lost within seconds.
+            return located(track, place, site)
+        motion = track.motion if track.seen else site.prior(track.side)
+        track = replace(track, place=None, behind=1.0, motion=motion)
     motion = predict(track.motion, step_s, acceleration)
     radial_kept = math.exp(-step_s / settings.relaxation_s)
     if track.seen:
@@ -79,15 +92,22 @@ def predict_track(track: Track, hidden_share: float, step_s: float, site: SiteGe
     return replace(track, motion=relax(motion, site.prior(track.side), bearing_kept, radial_kept))
 
 
-def relabelled(labels: tuple[Label, ...], sighting: Sighting) -> tuple[Label, ...]:
-    """Return class probabilities after one sighting, an exponential average over sightings.
+def located(track: Track, place: CartesianBelief, site: SiteGeometry) -> Track:
+    """Return the track at a place, from which its polar motion and its chance to be hidden follow."""
+    motion = polar_motion(place, site.ego_speed_mps)
+    behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
+    return replace(track, place=place, motion=motion, behind=behind)
+
+
+def relabelled(labels: tuple[Label, ...], seen_as: ClassShares) -> tuple[Label, ...]:
+    """Return class probabilities after one detection, an exponential average over detections.
 
     Examples
     --------
-    >>> relabelled((("car", 0.9),), Sighting(0.0, 0.01, "truck", 0.8))
+    >>> relabelled((("car", 0.9),), (("truck", 0.8),))
     (('car', 0.63), ('truck', 0.24))
     """
-    return _averaged(labels, ((sighting.label, sighting.score),), _LABEL_GAIN)
+    return _averaged(labels, seen_as, _LABEL_GAIN)
 
 
 def heard_as(track: Track, kinds: ClassShares) -> tuple[Label, ...]:

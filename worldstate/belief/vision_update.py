@@ -1,5 +1,6 @@
 """Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -12,11 +13,12 @@ from worldstate.measurement.measurement import Measurement, Sighting
 from .association import associated
 from .existence import after_empty_look, after_sighting
 from .explanation import ExplanationBelief
-from .motion import MotionBelief, update_azimuth
-from .polar import LOG_RANGE, RADIAL_RATE
+from .kinematics.cartesian import update_bearing
+from .kinematics.motion import MotionBelief, update_azimuth
+from .kinematics.polar import LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
-from .track import Track, entity_id, merged, relabelled
+from .track import Track, entity_id, located, merged, relabelled
 
 # Of (theta_dot rad/s, rho 1/s) at the first sighting: a car at 50 km/h passing at 15 m has .9 rad/s, two
 # deviations. A parked one has none, but zero would make the covariance singular.
@@ -62,17 +64,29 @@ def vision_update(
         if i not in found:
             after.append(_not_sighted(track, measurement.co_evidence, weight, site))
         elif track.seen:
-            after.append(_sighted(track, sightings[found[i]], measurement, site.settings))
+            after.append(_sighted(track, sightings[found[i]], measurement, site))
         else:
             after.append(_handed_over(track, sightings[found[i]], measurement, site))
     handed_over = tuple(tracks[i].side for i in found if not tracks[i].seen)
     for side in handed_over:
         explanation = explanation.emerge(side, site.settings.handover_residual)
-    fresh = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
-    after += [_born(s, measurement, born + n, site) for n, s in enumerate(fresh)]
-    unheard = (_emerged_from(sighting, site) for sighting in fresh)
-    emerged = {*handed_over, *(side for side in unheard if side is not None)}
-    return VisionUpdate(tuple(after), explanation, handed_over, tuple(sorted(emerged)), born + len(fresh))
+    unheard = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
+    fresh = [_born(sighting, measurement, born + n, site) for n, sighting in enumerate(unheard)]
+    emerged = emerged_sides(handed_over, fresh, site)
+    return VisionUpdate((*after, *fresh), explanation, handed_over, emerged, born + len(fresh))
+
+
+def emerged_sides(
+    handed_over: tuple[int, ...], fresh: Sequence[Track], site: SiteGeometry
+) -> tuple[int, ...]:
+    """Return the sides past whose edge somebody has just come: hidden before, or first seen there."""
+    near = (
+        track.side
+        for track in fresh
+        if track.seen and track.moving
+        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * site.settings.edge_std_rad
+    )
+    return tuple(sorted({*handed_over, *near}))
 
 
 def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
@@ -110,45 +124,46 @@ def _found(track: Track, measurement: Measurement, settings: FilterSettings) -> 
     )
 
 
-def _sighted(track: Track, sighting: Sighting, measurement: Measurement, settings: FilterSettings) -> Track:
-    if sighting.moving == track.moving:
-        motion = update_azimuth(track.motion, sighting.azimuth_rad, sighting.std_rad, weight=1.0)
-    else:
-        motion = _motion_at(sighting, track.motion)
-    labels = relabelled(track.labels, sighting)
-    changed = replace(track, motion=motion, labels=labels, moving=sighting.moving)
-    return _found(changed, measurement, settings)
+def _sighted(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
+    labels = relabelled(track.labels, ((sighting.label, sighting.score),))
+    changed = replace(_turned(track, sighting, site), labels=labels, moving=sighting.moving)
+    return _found(changed, measurement, site.settings)
 
 
 def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
     """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
     seen = replace(
-        track,
+        _turned(track, sighting, site),
         seen=True,
         side=site.nearest_side(sighting.azimuth_rad),
         existence=max(track.existence, site.settings.sighting_existence),
-        motion=_motion_at(sighting, track.motion),
         labels=((sighting.label, sighting.score),),
     )
     return _found(seen, measurement, site.settings)
 
 
-def _emerged_from(sighting: Sighting, site: SiteGeometry) -> int | None:
-    """Return the side past whose edge a moving object has just come, None where it came from elsewhere."""
-    side = site.nearest_side(sighting.azimuth_rad)
-    near = site.sides[side].distance_rad(sighting.azimuth_rad) <= 2.0 * site.settings.edge_std_rad
-    return side if near and sighting.moving else None
+def _turned(track: Track, sighting: Sighting, site: SiteGeometry) -> Track:
+    """Return a track with its motion after the bearing of a sighting."""
+    azimuth_rad, std_rad = sighting.azimuth_rad, sighting.std_rad
+    if track.place is not None:
+        return located(track, update_bearing(track.place, azimuth_rad, std_rad), site)
+    if track.seen and sighting.moving == track.moving:
+        return replace(track, motion=update_azimuth(track.motion, azimuth_rad, std_rad, weight=1.0))
+    return replace(track, motion=_motion_at(sighting, track.motion))
 
 
 def _not_sighted(track: Track, answer: CoEvidence, weight: float, site: SiteGeometry) -> Track:
-    if not track.seen:
+    if not track.seen and track.place is None:
         searched = isinstance(answer, Absent)
         miss = answer.miss_rate if isinstance(answer, Absent) else None
         return replace(track, answer="absent" if searched else "unqueried", miss_rate=miss)
     # Absent speaks of one sector; what stands outside the field of view was not looked for.
     if isinstance(answer, Unqueried) or not site.in_view(track.motion.azimuth_rad):
         return replace(track, answer="unqueried", miss_rate=None)
-    existence = after_empty_look(track.existence, answer.miss_rate**weight)
+    # Who may still be behind the corner is missed there for certain.
+    hidden = 0.0 if track.seen else track.behind
+    miss = hidden + (1.0 - hidden) * answer.miss_rate**weight
+    existence = after_empty_look(track.existence, miss)
     return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
 
 

@@ -17,6 +17,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing, Measurement
+from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, Delivery, Priors
 
 from .memory import CountedLook, Memory, SourceRule
@@ -69,7 +70,7 @@ class LagRecord:
 
     stamp_ns: int  # Of the belief, predicted since the last measurement
     base: _Memory
-    measurements: tuple[Measurement, ...]
+    measurements: tuple[Measurement | PositionScan, ...]
     delivery: Delivery
     late_since_ns: int | None
 
@@ -78,7 +79,7 @@ class LagRecord:
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.1.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.2.0")
 
     context: Context
     policy: CueingPolicy

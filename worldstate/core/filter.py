@@ -22,6 +22,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, Look, Measurement
+from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
 
 from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
@@ -37,6 +38,7 @@ from .step import (
     update_advisories,
     update_entities,
     update_evidence,
+    update_positions,
     update_sequence,
     update_sightings,
     weights_of,
@@ -44,6 +46,7 @@ from .step import (
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
+_FASTEST_EGO_MPS = 100.0
 _ABOVE_ZERO = math.ulp(0.0)
 _KINDS: dict[str, Any] = {
     "signature": SignatureEvidence,
@@ -125,6 +128,10 @@ class WorldFilter:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_ns", _integer_ns("start_ns", self.start_ns))
+        speed_mps = self.context.ego_speed_mps or 0.0
+        if not abs(speed_mps) <= _FASTEST_EGO_MPS:  # NaN compares false
+            wanted = f"expected a number within +-{_FASTEST_EGO_MPS}"
+            raise InvalidArgumentError(f"context.ego_speed_mps: {wanted}, got {speed_mps}")
         expected = len(self.context.directions) + 2
         if len(self.policy.reference_prior) != expected:
             got = len(self.policy.reference_prior)
@@ -168,14 +175,14 @@ class WorldFilter:
     def state(self) -> WorldState:
         """The snapshot S_t."""
         memory, context, settings, sides = self._memory, self.context, self.settings, self._memory.sides
+        # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
+        tracks = [one for one in memory.tracks if not one.place or one.existence >= settings.delete_existence]
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
-            entities=tuple(entity_of(track, memory, context, settings) for track in memory.tracks),
+            entities=tuple(entity_of(track, memory, context, settings) for track in tracks),
             relations=tuple(
-                edge
-                for track in memory.tracks
-                for edge in relations_of(track, sides, context, memory.stamp_ns)
+                edge for track in tracks for edge in relations_of(track, sides, context, memory.stamp_ns)
             ),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
             cues=cues_of(memory, self._model, self.risk, alarmed(memory)),
@@ -214,8 +221,8 @@ class WorldFilter:
         # From the last measurement on, so that many small steps are one step to the bit.
         return replace(self, memory=advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
 
-    def update(self, measurement: Measurement) -> "WorldFilter":
-        """Return the filter after a measurement, at its time stamp or, if that has passed, at the belief's.
+    def update(self, measurement: Measurement | PositionScan) -> "WorldFilter":
+        """Return the filter after a measurement or a scan, at its stamp or, if that has passed, the belief's.
 
         A measurement that is up to two seconds late is put where it belongs, as if it had come in time. One
         that was delivered before is dropped, and one that is later still; `WorldState.delivery` counts them.
@@ -235,12 +242,14 @@ class WorldFilter:
         world = replace(self, memory=lag.latest, lag=lag)
         return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
 
-    def _step(self, memory: Memory, measurement: Measurement) -> Memory:
+    def _step(self, memory: Memory, measurement: Measurement | PositionScan) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
         model = self._model
         # Within the slack the belief is not moved back.
         if measurement.stamp_ns > memory.stamp_ns:
             memory = advance(memory, measurement.stamp_ns, model)
+        if isinstance(measurement, PositionScan):
+            return update_positions(memory, measurement, model)
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
         memory, measurement, looked = counted_once(memory, measurement)
         # Evidence first: association and births need the explanations of this very window.
@@ -251,7 +260,7 @@ class WorldFilter:
         memory = update_sequence(memory, measurement, looked, model)
         return update_entities(memory, measurement, model)
 
-    def _begun_anew(self, measurement: Measurement) -> "WorldFilter":
+    def _begun_anew(self, measurement: Measurement | PositionScan) -> "WorldFilter":
         delivery = self._lag.delivery
         fresh = first_memory(self.context, self.policy, measurement.stamp_ns)
         counted = replace(delivery, reanchored=delivery.reanchored + 1)
@@ -321,8 +330,10 @@ def _integer_ns(name: str, value: object) -> int:
     return int(value)
 
 
-def _checked(measurement: Measurement, context: Context) -> Measurement:
+def _checked(measurement: Measurement | PositionScan, context: Context) -> Measurement | PositionScan:
     """Return the measurement in plain numbers; refuse what would poison the belief: it takes NaN as it is."""
+    if isinstance(measurement, PositionScan):
+        return replace(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0)
     for name, kind in _KINDS.items():
         if not isinstance(getattr(measurement, name), kind):
             expected = getattr(kind, "__name__", str(kind))

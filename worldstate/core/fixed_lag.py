@@ -7,9 +7,11 @@ and those after it once more. One that was delivered before is dropped, one olde
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.position import PositionScan
 from worldstate.state import Delivery
 
 from .memory import Memory
@@ -20,14 +22,15 @@ LAG_NS = nanoseconds(2.0)
 # before. The filter begins anew at the time that is told now.
 REANCHOR_NS = nanoseconds(1.0)
 
-Step = Callable[[Memory, Measurement], Memory]
+Timed: TypeAlias = Measurement | PositionScan
+Step: TypeAlias = Callable[[Memory, Timed], Memory]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
     """A measurement, and the memory that it was added to; None where that is still to be computed."""
 
-    measurement: Measurement
+    measurement: Timed
     before: Memory | None
 
     @property
@@ -51,7 +54,7 @@ class FixedLag:
         first = self.arrivals[0].before if self.arrivals else None
         return first or self.latest
 
-    def add(self, measurement: Measurement, step: Step) -> "FixedLag | None":
+    def add(self, measurement: Timed, step: Step) -> "FixedLag | None":
         """Return the buffer with one more measurement; None where all have been too late for a second."""
         stamp_ns, keys = measurement.stamp_ns, [one.key for one in self.arrivals]
         at = bisect_left(keys, (stamp_ns, measurement.source))
@@ -108,7 +111,7 @@ def _recent(arrivals: list[Arrival], oldest_ns: int) -> tuple[Arrival, ...]:
 def restored(
     latest: Memory,
     base: Memory,
-    measurements: tuple[Measurement, ...],
+    measurements: tuple[Timed, ...],
     delivery: Delivery,
     since_ns: int | None,
 ) -> FixedLag:

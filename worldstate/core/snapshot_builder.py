@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.belief.acoustic_update import hidden_share
+from worldstate.belief.announced import time_to_visible
+from worldstate.belief.birth_death import hidden_on
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
-from worldstate.belief.motion import MotionBelief
-from worldstate.belief.polar import AZIMUTH_RATE, LOG_RANGE
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.belief.kinematics.polar import AZIMUTH_RATE, LOG_RANGE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
 from worldstate.state import Classification, Context, Entity, Relation, RiskCue, Visibility
@@ -22,6 +25,9 @@ from .step import FilterModel
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
 _KNOWN_LOG_RANGE_STD = 0.25
+# A lane and a half, and a change of pace: beyond, a number would be taken for more than it says.
+_KNOWN_POSITION_STD_M, _KNOWN_VELOCITY_STD_MPS = 5.0, 5.0
+_NINE_OF_TEN = 1.645  # Standard deviations either side
 
 
 def entity_of(track: Track, memory: Memory, context: Context, settings: FilterSettings) -> Entity:
@@ -29,9 +35,9 @@ def entity_of(track: Track, memory: Memory, context: Context, settings: FilterSe
     sides = memory.sides
     share, existence = hidden_share(track, sides), existence_of(track, sides)
     hidden, motion = share >= 0.5, track.motion
-    range_m = _range(motion, hidden)
+    range_m = _range(motion, hidden and track.place is None)
     azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
-    if hidden:
+    if hidden and track.place is None:
         edge_rad = context.occluders[track.side].edge_azimuth_rad
         azimuth_rad, std_rad = hidden_azimuth(track.side, motion, memory.sequence, edge_rad, settings)
     return Entity(
@@ -46,7 +52,7 @@ def entity_of(track: Track, memory: Memory, context: Context, settings: FilterSe
         azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else float(motion.mean[AZIMUTH_RATE]),
         range_m=range_m,
-        position_m=None if range_m is None else _position(motion, range_m),
+        **_place(track, range_m, hidden, context),
         inverse_tta_hz=motion.inverse_tta_hz if track.approach_heard else None,
         inverse_tta_std_hz=motion.inverse_tta_std_hz if track.approach_heard else None,
         tta_s=time_to_arrival(track),
@@ -60,7 +66,12 @@ def entity_of(track: Track, memory: Memory, context: Context, settings: FilterSe
 
 def existence_of(track: Track, sides: HiddenBelief) -> float:
     """Return the existence of a track, from the belief of its side until it is seen."""
-    return track.existence if track.seen else sides.existence(track.side)
+    if track.seen or track.behind < 0.5:
+        return track.existence
+    if track.place is None:
+        return sides.existence(track.side)
+    # Not combined: what is believed of the side may rest on the same messages.
+    return max(track.existence, sides.hidden[track.side])
 
 
 def time_to_arrival(track: Track) -> float | None:
@@ -107,9 +118,11 @@ def cues_of(
 def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: bool) -> RiskCue:
     explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
     assert instant is not None
-    track = next((t for t in memory.tracks if not t.seen and t.side == k), None)
+    track = hidden_on(memory.tracks, k)
     motion, settings = model.site.prior(k) if track is None else track.motion, model.site.settings
-    azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, side.edge_azimuth_rad, settings)
+    azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
+    if track is None or track.place is None:
+        azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, side.edge_azimuth_rad, settings)
     # The floor only matters where P(hidden) has underflowed; then no direction has a share.
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     arrival_s = None if track is None else time_to_arrival(track)
@@ -155,6 +168,27 @@ def _range(motion: MotionBelief, hidden: bool) -> float | None:
     return math.exp(motion.mean[LOG_RANGE]) if known else None
 
 
-def _position(motion: MotionBelief, range_m: float) -> tuple[float, float, float]:
-    azimuth = motion.azimuth_rad
-    return range_m * math.cos(azimuth), range_m * math.sin(azimuth), 0.0
+def _place(track: Track, range_m: float | None, hidden: bool, context: Context) -> dict[str, Any]:
+    """Return position, velocity and covariance where known, and when a hidden one comes into view."""
+    place, motion = track.place, track.motion
+    if place is None and range_m is not None:
+        azimuth_rad = motion.azimuth_rad
+        return {"position_m": (range_m * math.cos(azimuth_rad), range_m * math.sin(azimuth_rad), 0.0)}
+    if place is None or place.position_std_m >= _KNOWN_POSITION_STD_M:
+        return {}
+    x, y, vx, vy = place.mean.tolist()
+    moves = place.velocity_std_mps < _KNOWN_VELOCITY_STD_MPS
+    times_s = None
+    if hidden and moves:
+        edge_rad, ego_speed_mps = context.occluders[track.side].edge_azimuth_rad, context.ego_speed_mps or 0.0
+        times_s = time_to_visible(place, edge_rad, ego_speed_mps)
+    return {
+        "position_m": (x, y, 0.0),
+        "velocity_mps": (vx, vy, 0.0) if moves else None,
+        "covariance": tuple(tuple(row) for row in place.covariance.tolist()),
+        "time_to_visible_s": None if times_s is None else _interval(*times_s),
+    }
+
+
+def _interval(mean_s: float, std_s: float) -> tuple[float, float, float]:
+    return max(mean_s - _NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + _NINE_OF_TEN * std_s

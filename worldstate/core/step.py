@@ -1,26 +1,31 @@
 """One step of the filter as pure functions: evidence, sightings, advisories, entities."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
+from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
+from worldstate.belief.position_update import position_update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.track import predict_track
-from worldstate.belief.vision_update import log_co_evidence, surviving, vision_update
+from worldstate.belief.track import Track, predict_track
+from worldstate.belief.vision_update import VisionUpdate, log_co_evidence, surviving, vision_update
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Look, Measurement
+from worldstate.measurement.position import PositionScan
 from worldstate.state import Context
 
 from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
@@ -29,6 +34,7 @@ from .sequence_memory import carried, informed
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
+_MOST_CERTAIN = 0.999  # Of a message
 RULE_HOLDS_NS = nanoseconds(1.0)
 
 
@@ -55,7 +61,7 @@ def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry
         SideGeometry(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
         for o in context.occluders
     )
-    return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings)
+    return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, context.ego_speed_mps or 0.0)
 
 
 def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
@@ -83,9 +89,8 @@ def counted_once(memory: Memory, measurement: Measurement) -> tuple[Memory, Meas
     sensor, stamp_ns = _searched(measurement)
     last = _last_look(memory, sensor)
     if last is None or stamp_ns > last.stamp_ns:
-        others = tuple(one for one in memory.looks if one.sensor != sensor)
-        looks = (*others, CountedLook(sensor, stamp_ns, measurement.source))
-        return replace(memory, looks=tuple(sorted(looks, key=attrgetter("sensor")))), measurement, True
+        looks = _with_look(memory, CountedLook(sensor, stamp_ns, measurement.source))
+        return replace(memory, looks=looks), measurement, True
     own = last.source == measurement.source
     answer = measurement.co_evidence if own else Unqueried(f"this look of {sensor} was counted before")
     return memory, replace(measurement, co_evidence=answer, sightings=(), look=None), False
@@ -95,6 +100,11 @@ def _searched(measurement: Measurement) -> tuple[str, int]:
     """Return whose look a measurement carries, and when it was made; of none, the source's own now."""
     look = measurement.look
     return (measurement.source, measurement.stamp_ns) if look is None else (look.sensor, look.stamp_ns)
+
+
+def _with_look(memory: Memory, look: CountedLook) -> tuple[CountedLook, ...]:
+    others = (one for one in memory.looks if one.sensor != look.sensor)
+    return tuple(sorted((*others, look), key=attrgetter("sensor")))
 
 
 def _last_look(memory: Memory, sensor: str) -> CountedLook | None:
@@ -108,13 +118,29 @@ def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
         predict_track(track, hidden_share(track, sides), seconds(step_ns), model.site)
         for track in memory.tracks
     )
-    return replace(
+    predicted = replace(
         memory,
         stamp_ns=stamp_ns,
         explanation=explanation.predict(model.context.rates.values_hz, step_ns),
         tracks=surviving(tracks, model.site.settings),
         sequence=memory.sequence and carried(memory.sequence, stamp_ns, step_ns, model.context),
     )
+    announced_before = [track for track in memory.tracks if not track.seen and track.place is not None]
+    return _places_passed(announced_before, predicted, model) if announced_before else predicted
+
+
+def _places_passed(before: Sequence[Track], memory: Memory, model: FilterModel) -> Memory:
+    """Return the memory after announced entities have come past their edge, or their place was lost."""
+    now = {track.id: track for track in memory.tracks}
+    emerged = tuple(old.side for old in before if old.behind >= 0.5 > now[old.id].behind)
+    # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
+    heard = [chance >= model.site.settings.birth_probability for chance in memory.sides.hidden]
+    for old in before:
+        others = [one for one in memory.tracks if not one.seen and one.place is None and one.side == old.side]
+        if now[old.id] in others and (len(others) > 1 or not heard[old.side]):
+            memory = replace(memory, tracks=tuple(one for one in memory.tracks if one.id != old.id))
+    look = VisionUpdate(memory.tracks, memory.explanation, emerged, emerged, memory.sighted)
+    return _after_look(memory, look, memory.stamp_ns, model)
 
 
 def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel) -> Memory:
@@ -169,9 +195,13 @@ def update_sightings(
         memory.sighted,
         model.site,
     )
+    return _after_look(memory, seen, measurement.stamp_ns, model)
+
+
+def _after_look(memory: Memory, seen: VisionUpdate, stamp_ns: int, model: FilterModel) -> Memory:
+    """Return the memory after what a look, or a scan, has made of entities and explanations."""
     handover_ns = tuple(
-        measurement.stamp_ns if k in seen.handed_over else before_ns
-        for k, before_ns in enumerate(memory.handover_ns)
+        stamp_ns if k in seen.handed_over else before_ns for k, before_ns in enumerate(memory.handover_ns)
     )
     # The lagged beliefs are what the next windows build on: they have to know of the hand-over, too.
     residual, lag = model.site.settings.handover_residual, memory.lag
@@ -184,23 +214,62 @@ def update_sightings(
         lag=lag,
         handover_ns=handover_ns,
         sighted=seen.born,
-        sequence=memory.sequence and memory.sequence.emerged(seen.emerged, measurement.stamp_ns),
+        sequence=memory.sequence and memory.sequence.emerged(seen.emerged, stamp_ns),
     )
+
+
+def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> Memory:
+    """Return the memory after the positions of a radar or a radio: entities, and who is announced hidden."""
+    settings, last = model.site.settings, _last_look(memory, scan.source)
+    elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
+    weight = min(elapsed_s / settings.look_interval_s, 1.0)
+    found = position_update(
+        memory.tracks, memory.explanation, scan, weight, memory.sighted, memory.births, model.site
+    )
+    memory = _after_look(memory, found.seen, scan.stamp_ns, model)
+    looks = _with_look(memory, CountedLook(scan.source, scan.stamp_ns, scan.source))
+    memory = replace(memory, births=found.births, looks=looks, seq=memory.seq + 1)
+    chances = announced(memory.tracks, model.site)
+    raised = partial(ExplanationBelief.at_least, hidden=chances)
+    memory = replace(memory, explanation=raised(memory.explanation), lag=memory.lag.map(raised))
+    if not any(chances) or scan.searched is not None:
+        # Whoever has come into view, or is gone, ends the rule of the source that announced it.
+        return replace(memory, rules=tuple(one for one in memory.rules if one.source != scan.source))
+    said = SignatureEvidence(model.context.directions, tuple(map(_log_odds, chances)), 0.0, 0.0)
+    return _ruled(memory, scan.source, scan.stamp_ns, said, Unqueried("messages search nothing"), model)
+
+
+def _log_odds(probability: float) -> float:
+    # At even odds and below a message claims nothing, as the prior of the rule.
+    known = min(max(probability, 0.5), _MOST_CERTAIN)
+    return math.log(known / (1.0 - known))
 
 
 def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
     """Return the memory after the sustained rule has seen this window's statistic."""
+    stamp_ns, said, answer = measurement.stamp_ns, measurement.signature, measurement.co_evidence
+    memory = _ruled(memory, measurement.source, stamp_ns, said, answer, model)
+    return replace(memory, threshold=_adapted(memory, stamp_ns, model.policy))
+
+
+def _ruled(
+    memory: Memory,
+    source: str,
+    stamp_ns: int,
+    said: SignatureEvidence,
+    answer: CoEvidence,
+    model: FilterModel,
+) -> Memory:
+    """Return the memory after one source's sustained rule has seen what it says."""
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
     log_prior = np.log(model.policy.reference_prior)
-    instant = posterior_of(log_prior, measurement.signature, measurement.co_evidence)
+    instant = posterior_of(log_prior, said, answer)
     held = instant.hidden_total >= model.policy.gamma_at(memory.threshold.shift_nats)
-    source, stamp_ns = measurement.source, measurement.stamp_ns
     run = next((one.run for one in memory.rules if one.source == source), 0)
     rule = replace(model.policy.rule(), run=run).advance(held)
     others = (one for one in memory.rules if one.source != source)
     rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns))
-    alerted = replace(memory, instant=instant, rules=tuple(sorted(rules, key=attrgetter("source"))))
-    return replace(alerted, threshold=_adapted(alerted, stamp_ns, model.policy))
+    return replace(memory, instant=instant, rules=tuple(sorted(rules, key=attrgetter("source"))))
 
 
 def update_sequence(memory: Memory, measurement: Measurement, looked: bool, model: FilterModel) -> Memory:

@@ -3,6 +3,9 @@ from .measurement import Bearing as Bearing
 from .measurement import Look as Look
 from .measurement import Measurement as Measurement
 from .measurement import Sighting as Sighting
+from .position import Position as Position
+from .position import PositionScan as PositionScan
+from .position import SearchedSector as SearchedSector
 from .protocols import CoEvidenceChannel as CoEvidenceChannel
 from .protocols import MeasurementAdapter as MeasurementAdapter
 from .sector import Sector as Sector

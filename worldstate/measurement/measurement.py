@@ -1,12 +1,14 @@
 """Measurements: evidence of one modality at one instant."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import ClassShares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
+from worldstate.ground.serialisation import Layout
 from worldstate.ground.values import NotUsable
 
 
@@ -149,6 +151,9 @@ class Measurement:
     >>> measurement.source, measurement.bearing.reason
     ('v2x', 'not measured')
     """
+
+    # Written without a kind, as in checkpoints of before there were scans of positions.
+    LAYOUT: ClassVar = Layout()
 
     stamp_ns: int
     signature: SignatureEvidence

@@ -1,9 +1,9 @@
 """Entities: road users of the world-state, seen or hidden."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal, TypeAlias
 
-from worldstate.ground.serialisation import Layout, Probability
+from worldstate.ground.serialisation import ADDED, Layout, Probability
 from worldstate.ground.values import Answer
 
 Status: TypeAlias = Literal["hidden", "emerged", "visible"]
@@ -80,8 +80,15 @@ class Entity:
         d azimuth / dt, rad/s; None while hidden.
     range_m : float or None
         None while it cannot be observed, as from a standing ego without a ranging sensor.
-    position_m, velocity_mps : tuple of three floats or None
-        None without a range.
+    position_m : tuple of three floats or None
+        None without a range; of a measured position, unless its standard deviation is below 5 m.
+    velocity_mps : tuple of three floats or None
+        Over ground; None without a measured position, and while its standard deviation exceeds 5 m/s.
+    covariance : nested tuple of floats, shape (4, 4), or None
+        Of (x, y, vx, vy), m and m/s; None unless a sensor has measured the position.
+    time_to_visible_s : (float, float, float) or None
+        Low, best and high of a hidden entity with a position, nine of ten in between; None where it may not
+        come into view.
     inverse_tta_hz, inverse_tta_std_hz : float or None
         1/TTA = -r_dot/r, 1/s, positive while closing, and its standard deviation; None until measured.
     tta_s : float or None
@@ -128,3 +135,5 @@ class Entity:
     visibility: Visibility = Visibility("unqueried")
     sources: tuple[str, ...] = ()
     last_seen_ns: int | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = field(default=None, metadata=ADDED)
+    time_to_visible_s: tuple[float, float, float] | None = field(default=None, metadata=ADDED)

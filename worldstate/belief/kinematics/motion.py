@@ -24,7 +24,7 @@ _CLOSEST_SHARE = 0.5
 _LEAST_STD, _LARGEST_STD = 1e-4, 1e2
 
 
-def _covariance(row: FloatArray) -> FloatArray:
+def checked_covariance(row: FloatArray) -> FloatArray:
     """Return the covariance that a checkpoint holds as one row."""
     covariance = row.reshape(4, 4)
     if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
@@ -39,7 +39,7 @@ class MotionBelief:
     # shape (4,): theta wrapped into (-pi, pi]
     mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]
     # shape (4, 4): Symmetric positive definite
-    covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, _covariance)]
+    covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, checked_covariance)]
 
     @classmethod
     def around(

@@ -1,0 +1,326 @@
+"""Positions of radar and radio: Cartesian motion, existence, association, hand-over; filterpy's answers."""
+
+import math
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter, WorldState
+from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
+
+SEEDS = st.integers(0, 2**32 - 1)
+SILENT = NotUsable("not scripted")
+NEUTRAL = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+RADAR = SearchedSector(Sector(0.0, 1.05), range_m=70.0, detection_probability=0.5)
+
+
+def diagonal(*std: float) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in np.diag(np.square(std)).tolist())
+
+
+def radar(time_s: float, *positions: Position) -> PositionScan:
+    return PositionScan("radar", round(time_s * 1e9), positions, RADAR)
+
+
+def radio(time_s: float, *positions: Position) -> PositionScan:
+    return PositionScan("v2x", round(time_s * 1e9), positions)
+
+
+def heard(time_s: float, left: float = 0.0, boxes: tuple[Sighting, ...] = ()) -> Measurement:
+    said = replace(NEUTRAL, hidden=(left, 0.0))
+    answer = Present(0.04, 0.01) if boxes else Absent(0.04, 0.01)
+    return Measurement(round(time_s * 1e9), said, answer, SILENT, SILENT, boxes)
+
+
+def after(*measured: Measurement | PositionScan, world: WorldFilter | None = None) -> WorldFilter:
+    world = world or WorldFilter()
+    for one in measured:
+        world = world.update(one)
+    return world
+
+
+def crossing(time_s: float, trust: float = 0.95, noise: tuple[float, ...] = (0.0,) * 4) -> Position:
+    """Return a car on the cross street 10 m ahead, behind the left corner until 4.1 s."""
+    x, y, vx, vy = np.array([10.0, 7.0 + 8.0 * (4.0 - time_s), 0.0, -8.0]) + noise
+    return Position((x, y), diagonal(0.5, 0.5, 0.3, 0.3), (vx, vy), trust, (("car", 0.9),))
+
+
+def covariances(rng: np.random.Generator, size: int) -> np.ndarray:
+    turn, _ = np.linalg.qr(rng.normal(size=(size, size)))
+    spread = turn @ np.diag(rng.uniform(0.1, 1.0, size)) @ turn.T
+    return 0.5 * (spread + spread.T)
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_what_is_published_is_a_kalman_filters_mean_and_covariance(seed: int) -> None:
+    """One car, positions with and without velocity, at uneven times; filterpy is the oracle."""
+    rng, now_ns, world = np.random.default_rng(seed), 10**9, WorldFilter()
+    truth, kalman = np.array([30.0, 5.0, -4.0, 1.0]), KalmanFilter(dim_x=4, dim_z=2)
+    for step in range(12):
+        step_ns = int(rng.integers(3 * 10**7, 3 * 10**8)) if step else 0
+        now_ns, dt_s = now_ns + step_ns, step_ns * 1e-9
+        known = 4 if rng.random() < 0.5 else 2
+        R = covariances(rng, known)
+        truth = truth + np.array([*truth[2:], 0.0, 0.0]) * dt_s
+        z = rng.multivariate_normal(truth[:known], R)
+        velocity = (z[2], z[3]) if known == 4 else None
+        found = Position((z[0], z[1]), tuple(map(tuple, R)), velocity)
+        world = world.update(
+            PositionScan("radar", now_ns, (found,), replace(RADAR, detection_probability=0.9))
+        )
+        if step == 0:
+            kalman.x, kalman.P = np.zeros(4), np.diag([0.0, 0.0, 100.0, 100.0])
+            kalman.x[:known], kalman.P[:known, :known] = z, R
+            continue
+        kalman.F = np.eye(4) + dt_s * np.eye(4, k=2)
+        kalman.Q = Q_continuous_white_noise(2, dt_s, 2.0, block_size=2, order_by_dim=False)
+        kalman.predict()
+        kalman.update(z, R=R, H=np.eye(4)[:known])
+    (car,) = world.state.entities
+    assert car.velocity_mps is not None and car.position_m is not None
+    assert (*car.position_m[:2], *car.velocity_mps[:2]) == pytest.approx(kalman.x, abs=1e-9)
+    np.testing.assert_allclose(car.covariance, kalman.P, atol=1e-9)
+
+
+def belief(rng: np.random.Generator) -> CartesianBelief:
+    away = rng.uniform(-3.0, 3.0)
+    mean = [*(rng.uniform(5.0, 60.0) * np.array([math.cos(away), math.sin(away)])), *rng.normal(0.0, 8.0, 2)]
+    return CartesianBelief(np.array(mean), covariances(rng, 4))
+
+
+@given(SEEDS, st.floats(-0.2, 0.2), st.floats(0.01, 0.2))
+@settings(max_examples=30)
+def test_a_bearing_is_taken_in_as_by_an_extended_kalman_filter(seed: int, off: float, std: float) -> None:
+    start = belief(np.random.default_rng(seed))
+    x, y = start.mean[:2]
+    azimuth = math.atan2(y, x) + off
+    kalman = ExtendedKalmanFilter(dim_x=4, dim_z=1)
+    kalman.x, kalman.P = start.mean.copy(), start.covariance.copy()
+    kalman.update(
+        np.array([azimuth]),
+        HJacobian=lambda m: np.array([[-m[1], m[0], 0.0, 0.0]]) / (m[0] ** 2 + m[1] ** 2),
+        Hx=lambda m: np.array([math.atan2(m[1], m[0])]),
+        R=np.array([[std**2]]),
+    )
+    now = update_bearing(start, azimuth, std)
+    np.testing.assert_allclose(now.mean, kalman.x, atol=1e-9)
+    np.testing.assert_allclose(now.covariance, kalman.P, atol=1e-9)
+
+
+@given(SEEDS)
+@settings(max_examples=30)
+def test_polar_motion_is_where_a_vehicle_driving_on_is_seen(seed: int) -> None:
+    """Its rates and their covariance are those of difference quotients of azimuth and log range."""
+    start, small = belief(np.random.default_rng(seed)), 1e-5
+    speed_mps = 3.0
+
+    def polar(mean: np.ndarray) -> np.ndarray:
+        ahead = [mean[:2] + sign * small * (mean[2:] - [speed_mps, 0.0]) for sign in (-1.0, 1.0)]
+        before, then = (np.array([math.atan2(y, x), math.log(math.hypot(x, y))]) for x, y in ahead)
+        rates = (then - before) / (2.0 * small)
+        middle = (then + before) / 2.0
+        return np.array([middle[0], *rates, middle[1]])
+
+    motion = polar_motion(start, speed_mps)
+    np.testing.assert_allclose(motion.mean, polar(start.mean), atol=1e-6)
+    slope = np.stack(
+        [(polar(start.mean + 1e-4 * e) - polar(start.mean - 1e-4 * e)) / 2e-4 for e in np.eye(4)], 1
+    )
+    np.testing.assert_allclose(motion.covariance, slope @ start.covariance @ slope.T, atol=1e-4)
+
+
+@pytest.mark.parametrize("detection", [0.3, 0.5, 0.9])
+def test_empty_scans_take_existence_down_by_the_bernoulli_rule(detection: float) -> None:
+    searched = replace(RADAR, detection_probability=detection)
+    there = Position((20.0, 2.0), diagonal(0.3, 0.3, 0.3, 0.3), (0.0, 0.0))
+    world = after(*[replace(radar(t, there), searched=searched) for t in (0.5, 1.0)])
+    (car,) = world.state.entities
+    r = car.existence_probability
+    for scan in range(1, 4):
+        world = world.update(replace(radar(1.0 + 0.5 * scan), searched=searched))
+        r = r * (1.0 - detection) / (1.0 - r * detection)
+        assert [one.existence_probability for one in world.state.entities] == pytest.approx([r], abs=1e-12)
+
+
+@pytest.mark.parametrize("searched", [replace(RADAR, range_m=15.0), replace(RADAR, sector=Sector(0.9, 0.2))])
+def test_a_scan_of_elsewhere_says_nothing_of_whom_it_cannot_see(searched: SearchedSector) -> None:
+    there = Position((20.0, 2.0), diagonal(0.1, 0.1, 0.1, 0.1), (0.0, 0.0))
+    world = after(*[radar(t, there) for t in (0.1, 0.2, 0.3)])
+    later = after(*[PositionScan("radar", 4 * 10**8, (), searched)], world=world)
+    before, now = (one.state.entities[0].existence_probability for one in (world, later))
+    assert now == pytest.approx(before, abs=1e-9)
+
+
+def test_radar_alone_gives_position_and_velocity_with_their_covariance() -> None:
+    """NEES of twenty cars within the 99.9 % band of chi-square."""
+    rng, nees = np.random.default_rng(5), []
+    for _ in range(20):
+        truth = np.array([rng.uniform(15, 50), rng.uniform(-3, 3), rng.normal(0, 5), rng.normal(0, 3)])
+        world = WorldFilter()
+        for scan in range(1, 25):
+            kick = rng.multivariate_normal(
+                np.zeros(4), Q_continuous_white_noise(2, 0.1, 2.0, block_size=2, order_by_dim=False)
+            )
+            truth = truth + 0.1 * np.array([*truth[2:], 0.0, 0.0]) + kick
+            seen = rng.random() < 0.9
+            found = Position(tuple(truth[:2] + rng.normal(0, 0.4, 2)), diagonal(0.4, 0.4))
+            sensor = replace(RADAR, detection_probability=0.9)
+            world = world.update(replace(radar(scan / 10, *([found] if seen else [])), searched=sensor))
+        (car,) = world.state.entities
+        error = np.array([*car.position_m[:2], *car.velocity_mps[:2]]) - truth
+        nees.append(error @ np.linalg.solve(np.array(car.covariance), error))
+        assert car.status == "visible" and car.existence_probability > 0.9
+    assert 2.3 < np.mean(nees) < 6.4
+
+
+def test_a_hidden_vehicle_announced_by_radio_alone_is_an_entity_with_a_place() -> None:
+    rng, inside = np.random.default_rng(2), []
+    world, noises = WorldFilter(), rng.normal(0.0, (0.5, 0.5, 0.3, 0.3), (40, 4))
+    for hop in range(1, 36):
+        world = world.update(radio(hop / 10, crossing(hop / 10, noise=tuple(noises[hop]))))
+        (car,) = world.state.entities
+        low, _, high = car.time_to_visible_s
+        inside.append(low <= 4.0 + (7.0 - 10.0 * math.tan(math.radians(32.0))) / 8.0 - hop / 10 <= high)
+    assert (car.status, car.direction, car.sources) == ("hidden", "left", ("v2x",))
+    assert car.existence_probability == pytest.approx(0.95, abs=1e-9)  # What one source repeats counts once
+    assert np.hypot(car.position_m[0] - 10.0, car.position_m[1] - 11.0) < 1.0
+    assert car.velocity_mps[1] == pytest.approx(-8.0, abs=1.0)
+    assert np.mean(inside) > 0.8
+    left, right = world.state.cues
+    assert left.advisory and not right.advisory and left.risk > 0.9 > 0.1 > right.risk
+    assert left.entity_id == car.id
+    assert WorldState.from_json(world.state.to_json()) == world.state
+
+
+def test_an_announced_vehicle_keeps_its_identity_when_camera_or_radar_find_it() -> None:
+    announced = after(*[radio(hop / 10, crossing(hop / 10)) for hop in range(1, 42)])
+    (before,) = announced.state.entities
+    for sensor in ("camera", "radar"):
+        world = announced
+        for hop in range(42, 47):
+            now = crossing(hop / 10)
+            azimuth = math.atan2(now.position_m[1], now.position_m[0])
+            boxes = (Sighting(azimuth, 0.03, "car", 0.9),)
+            world = world.update(heard(hop / 10, boxes=boxes) if sensor == "camera" else radar(hop / 10, now))
+            world = world.update(radio(hop / 10 + 0.01, crossing(hop / 10 + 0.01)))
+        (seen,) = world.state.entities
+        assert (seen.id, seen.status) == (before.id, "visible")
+        assert not any(cue.advisory for cue in world.predict(1.0).state.cues)
+        assert world.state.risk < 0.2
+
+
+def test_a_message_joins_the_vehicle_that_is_heard() -> None:
+    world = after(*[heard(hop / 10, left=4.0) for hop in range(1, 15)])
+    (before,) = world.state.entities
+    assert before.position_m is None
+    (joined,) = after(radio(1.45, crossing(1.45)), world=world).state.entities
+    assert (joined.id, joined.status) == (before.id, "hidden")
+    assert joined.existence_probability > before.existence_probability
+    np.testing.assert_allclose(joined.position_m, (10.0, 27.4, 0.0), atol=1e-9)
+
+
+def test_a_forged_claim_in_plain_view_is_refuted_and_stays_so_however_often_it_is_repeated() -> None:
+    world, ghosts = WorldFilter(), []
+    forged = Position((15.0, 1.0), diagonal(0.5, 0.5, 0.3, 0.3), (-1.0, 0.0), 0.99)
+    for hop in range(1, 60):
+        world = after(radio(hop / 10, forged), heard(hop / 10 + 0.02), world=world)
+        ghosts.append(max((one.existence_probability for one in world.state.entities), default=0.0))
+    assert max(ghosts[:2]) > 0.5 and max(ghosts[10:]) < 0.05
+    # Beside a camera that misses nearly everything it is believed.
+    blind = [replace(heard(hop / 10 + 0.02), co_evidence=Absent(0.99, 0.01)) for hop in range(1, 30)]
+    believed = [one for hop in range(1, 30) for one in (radio(hop / 10, forged), blind[hop - 1])]
+    assert after(*believed).state.entities[0].existence_probability > 0.7
+
+
+def test_a_place_is_published_while_it_is_known_and_the_entity_gone_when_it_is_lost() -> None:
+    world = after(*[radio(hop / 10, crossing(hop / 10 - 40.0)) for hop in range(1, 5)])
+    later = [world.predict(wait_s).state.entities for wait_s in (0.0, 2.0, 4.5, 7.0)]
+    assert [[one.position_m is not None for one in entities] for entities in later] == [
+        [True],
+        [True],
+        [False],
+        [],
+    ]
+
+
+def test_two_cars_that_meet_keep_their_identities() -> None:
+    """They pass 1 m apart at 10 m/s each; positions of .5 m alone would not tell them apart."""
+    ids, world = set(), WorldFilter()
+    for scan in range(1, 31):
+        time_s, std = scan / 10, diagonal(0.5, 0.5, 0.5, 0.5)
+        going = Position((10.0 + 10.0 * time_s, 0.5), std, (10.0, 0.0))
+        coming = Position((40.0 - 10.0 * time_s, -0.5), std, (-10.0, 0.0))
+        world = world.update(
+            replace(radar(time_s, going, coming), searched=replace(RADAR, detection_probability=0.9))
+        )
+        ids.add(tuple(one.id for one in sorted(world.state.entities, key=lambda one: one.velocity_mps)))
+    assert len(ids) == 1 and len(*ids) == 2
+
+
+def test_the_example_shows_both() -> None:
+    example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "examples" / "positions.py"))
+    (seen,), (hidden,) = example["radar_alone"](10).entities, example["announced"](10).entities
+    assert (seen.status, hidden.status) == ("visible", "hidden")
+    assert seen.position_m == pytest.approx((26.0, 2.0, 0.0)) and seen.velocity_mps == pytest.approx(
+        (-4.0, 0.0, 0.0)
+    )
+    low, _, high = hidden.time_to_visible_s
+    assert low < (23.0 - 10.0 * math.tan(math.radians(32.0))) / 8.0 < high
+
+
+def test_the_ego_vehicle_drives_towards_what_stands() -> None:
+    post = Position((40.0, 3.0), diagonal(0.1, 0.1, 0.1, 0.1), (0.0, 0.0))
+    world = after(radar(1.0, post), world=WorldFilter(Context(ego_speed_mps=10.0)))
+    (later,) = world.predict(1.0).state.entities
+    assert later.position_m == pytest.approx((30.0, 3.0, 0.0)) and later.velocity_mps == pytest.approx(
+        (0.0,) * 3
+    )
+    assert later.azimuth_rate_rad_s == pytest.approx(10.0 * 3.0 / (30.0**2 + 3.0**2))
+
+
+def test_the_latency_of_a_scan_puts_it_where_it_was_taken() -> None:
+    late = replace(radar(1.3, crossing(1.0)), latency_s=0.3)
+    assert after(late).state == after(radar(1.0, crossing(1.0))).state
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda: Position((1.0, math.nan), diagonal(1.0, 1.0)), r"position_m: expected finite"),
+        (lambda: Position((1e6, 0.0), diagonal(1.0, 1.0)), r"position_m\[0\]: expected a number in"),
+        (
+            lambda: Position((1.0, 0.0), diagonal(1.0, 1.0), (1.0, 0.0)),
+            r"covariance: expected shape \(4, 4\)",
+        ),
+        (lambda: Position((1.0, 0.0), ((1.0, 2.0), (2.0, 1.0))), "covariance: expected a symmetric"),
+        (lambda: Position((1.0, 0.0), ((1.0, 0.5), (0.0, 1.0))), "covariance: expected a symmetric"),
+        (lambda: Position((1.0, 0.0), diagonal(1e4, 1.0)), "covariance: expected eigenvalues of at most"),
+        (
+            lambda: Position((1.0, 0.0), diagonal(1.0, 1.0), existence_probability=1.0),
+            "existence_probability",
+        ),
+        (lambda: Position((1.0, 0.0), diagonal(1.0, 1.0), classes=(("car", 2.0),)), "classes"),
+        (lambda: SearchedSector(Sector(0.0, 1.0), -1.0, 0.5), "range_m"),
+        (lambda: SearchedSector(Sector(0.0, 9.0), 10.0, 0.5), "half_width_rad"),
+        (lambda: PositionScan("", 0), "source: expected a name"),
+        (lambda: PositionScan("radar", 0.5), "stamp_ns: expected integer"),
+        (lambda: PositionScan("radar", 0, (crossing(1.0),) * 129), "positions: expected at most 128"),
+        (lambda: PositionScan("radar", 0, (1.0,)), "positions: expected"),
+        (lambda: PositionScan("radar", 0, (), RADAR, -1.0), "latency_s"),
+        (lambda: WorldFilter(Context(ego_speed_mps=math.nan)), "ego_speed_mps: expected a number within"),
+    ],
+)
+def test_what_is_no_position_is_refused_by_name(wrong, words: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=words):
+        wrong()

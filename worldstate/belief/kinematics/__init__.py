@@ -1,0 +1,1 @@
+"""Motion of one entity: modified polar and Cartesian coordinates with constant velocity."""

@@ -1,0 +1,281 @@
+"""Update the entities with the positions of a radar, a lidar or a radio: found, missed, announced."""
+
+import math
+from dataclasses import dataclass, replace
+from operator import attrgetter
+
+import numpy as np
+
+from worldstate.abduction.road_users import UNKNOWN
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import NANOSECONDS_PER_SECOND, wrap_angle
+from worldstate.measurement.position import Position, PositionScan, SearchedSector
+
+from .association import FORBIDDEN, assigned, emergence_density
+from .existence import after_empty_look, after_sighting
+from .explanation import ExplanationBelief
+from .kinematics.cartesian import (
+    CartesianBelief,
+    at_position,
+    full_measurement,
+    update_bearing,
+    update_position,
+)
+from .kinematics.polar import AZIMUTH, LOG_RANGE
+from .site_geometry import SiteGeometry, normal_share
+from .track import Track, entity_id, located, merged, relabelled
+from .vision_update import VisionUpdate, emerged_sides
+
+# m/s, of a velocity that was not measured: wide, so that it decides nothing.
+_ANY_SPEED_STD = 100.0
+# m/s, of vehicles in a street: twice the speed limit in town covers nearly all.
+_SPEED_STD = 15.0
+# Of the squared Mahalanobis distance: .9997 of chi-square with four degrees of freedom, as four deviations of
+# a bearing are.
+_GATE = 21.0
+# m^2: messages tell of half a disc of 100 m.
+_RADIO_AREA_M2 = 0.5 * math.pi * 100.0**2
+# m/s: slower is parked, as far as a radar or a positioning receiver can tell.
+_PARKED_MPS = 0.5
+# Which side of an edge somebody is on is asked of the mean position.
+_SHARP_RAD = 1e-3
+# No statement is certain, and a refuted claim that is repeated can still turn out to be true: who was taken
+# to be in view stood behind something that the context does not name.
+_MOST_EXISTENCE, _LEAST_EXISTENCE = 0.999, 1e-3
+# A bus of forged messages must not slow the step down: beyond these nobody new is taken.
+_MOST_ENTITIES = 128
+_BY_ALL = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
+
+
+@dataclass(frozen=True, slots=True)
+class PositionUpdate:
+    """Result of a scan: as of a look, and the hidden entities born so far on each side."""
+
+    seen: VisionUpdate
+    births: tuple[int, ...]
+
+
+def position_update(
+    tracks: tuple[Track, ...],
+    explanation: ExplanationBelief,
+    scan: PositionScan,
+    weight: float,
+    born: int,
+    births: tuple[int, ...],
+    site: SiteGeometry,
+) -> PositionUpdate:
+    """Return tracks and explanations after one scan; its misses count by `weight`."""
+    # Sorted, so that the state does not depend on the order in which a sensor lists what it found.
+    positions = tuple(sorted(scan.positions, key=_BY_ALL))
+    found = assigned(_scores(tracks, positions, scan, site), _log_new(scan, site))
+    after = [
+        _found(track, positions[found[i]], scan, site)
+        if i in found
+        else _missed(track, scan.searched, weight, site)
+        for i, track in enumerate(tracks)
+    ]
+    handed_over = tuple(tracks[i].side for i in found if after[i].seen and not tracks[i].seen)
+    for side in handed_over:
+        explanation = explanation.emerge(side, site.settings.handover_residual)
+    counts, fresh = list(births), []
+    unknown = [one for j, one in enumerate(positions) if j not in found.values()]
+    for position in unknown[: max(_MOST_ENTITIES - len(tracks), 0)]:
+        track = _born(position, scan, counts, born, site)
+        counts[track.side] += track.was_hidden
+        born += not track.was_hidden
+        fresh.append(track)
+    emerged = emerged_sides(handed_over, fresh, site)
+    seen = VisionUpdate((*after, *fresh), explanation, handed_over, emerged, born)
+    return PositionUpdate(seen, tuple(counts))
+
+
+def _log_new(scan: PositionScan, site: SiteGeometry) -> float:
+    """Return the log density of objects that nobody knows of, 1/m^2."""
+    searched = scan.searched
+    area_m2 = _RADIO_AREA_M2
+    if searched is not None:
+        area_m2 = max(searched.sector.half_width_rad * searched.range_m**2, 1.0)
+    return math.log(site.settings.unheard_probability / area_m2)
+
+
+def _scores(
+    tracks: tuple[Track, ...], positions: tuple[Position, ...], scan: PositionScan, site: SiteGeometry
+) -> FloatArray:
+    r"""Return the score of every position and track, shape (positions, tracks), nats.
+
+    .. math:: \log \frac{r\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, N(z_v; 0, V + R_v)}
+
+    The velocity enters by how much likelier it is than that of anybody, so that an entity without a place is
+    scored in the same units, by its azimuth and range.
+    """
+    if not tracks or not positions:
+        return np.empty((len(positions), len(tracks)))
+    measured = [full_measurement(one, _ANY_SPEED_STD) for one in positions]
+    z, noise = np.array([one[0] for one in measured]), np.array([one[1] for one in measured])
+    scores = np.full((len(positions), len(tracks)), FORBIDDEN)
+    placed = [i for i, track in enumerate(tracks) if track.place is not None]
+    others = [i for i, track in enumerate(tracks) if track.place is None]
+    if placed:
+        scores[:, placed] = _cartesian([tracks[i] for i in placed], z, noise)
+    if others:
+        scores[:, others] = _polar([tracks[i] for i in others], z, noise, scan.searched is not None, site)
+    found = 0.0 if scan.searched is None else scan.searched.detection_probability
+    existence = np.array([track.existence for track in tracks]).clip(_LEAST_EXISTENCE, _MOST_EXISTENCE)
+    expected = scores + np.log(existence) - np.log1p(-existence * found)
+    # Within its gate a detected entity takes a position before that counts as somebody new.
+    detected = np.array([track.seen or track.place is not None for track in tracks])
+    expected = np.where(detected, np.logaddexp(expected, _log_new(scan, site)), expected)
+    return np.where(scores > FORBIDDEN, expected, FORBIDDEN)
+
+
+def _cartesian(tracks: list[Track], z: FloatArray, noise: FloatArray) -> FloatArray:
+    places = [track.place for track in tracks if track.place is not None]
+    residual = z[:, None] - np.array([place.mean for place in places])
+    spread = noise[:, None] + np.array([place.covariance for place in places])
+    distance = np.einsum("ijk,ijk->ij", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
+    density = -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
+    anybody = noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2)
+    usual = np.einsum("ik,ik->i", z[:, 2:], np.linalg.solve(anybody, z[:, 2:, None])[..., 0])
+    usual = -0.5 * (usual + np.linalg.slogdet(2.0 * math.pi * anybody)[1])
+    return np.where(distance > _GATE, FORBIDDEN, density - usual[:, None])
+
+
+def _polar(
+    tracks: list[Track], z: FloatArray, noise: FloatArray, line_of_sight: bool, site: SiteGeometry
+) -> FloatArray:
+    """Return the scores of entities of which only azimuth and log range are believed."""
+    range_m = np.maximum(np.hypot(z[:, 0], z[:, 1]), 1.0)
+    azimuth = np.arctan2(z[:, 1], z[:, 0])
+    along = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    noises = [np.einsum("ij,ijk,ik->i", axis, noise[:, :2, :2], axis) for axis in (across, along)]
+    means = np.array([track.motion.mean for track in tracks])
+    variances = np.array([np.diag(track.motion.covariance) for track in tracks])
+    turned = wrap_angle(azimuth[:, None] - means[:, AZIMUTH])
+    # The sound of a hidden one may come from the edge instead.
+    hidden = np.array([not track.seen for track in tracks])
+    bias = np.where(hidden, site.settings.hidden_bias_std_rad, 0.0)
+    variance = variances[:, AZIMUTH] + bias**2 + (noises[0] / range_m**2)[:, None]
+    farther = np.log(range_m)[:, None] - means[:, LOG_RANGE]
+    range_variance = variances[:, LOG_RANGE] + (noises[1] / range_m**2)[:, None]
+    distance, log_azimuth = turned**2 / variance, -0.5 * np.log(2.0 * math.pi * variance)
+    if line_of_sight:
+        # Who was only heard is found where it comes into view.
+        peak = 1.0 / (site.settings.edge_std_rad * math.sqrt(2.0 * math.pi))
+        near = np.maximum(emergence_density(tracks, azimuth[:, None], site) / peak, 1e-300)
+        distance = np.where(hidden, -2.0 * np.log(near), distance)
+        log_azimuth = np.where(hidden, math.log(peak), log_azimuth)
+    distance = distance + farther**2 / range_variance
+    # From 1 / (rad log m) to 1 / m^2.
+    log_range = -0.5 * np.log(2.0 * math.pi * range_variance) - 2.0 * np.log(range_m)[:, None]
+    return np.where(distance > _GATE, FORBIDDEN, log_azimuth + log_range - 0.5 * distance)
+
+
+def _found(track: Track, position: Position, scan: PositionScan, site: SiteGeometry) -> Track:
+    """Return a track after a position of its own."""
+    labels = track.labels
+    if position.classes:
+        detected = track.seen or track.place is not None
+        labels = relabelled(labels, position.classes) if detected else position.classes
+    changed = replace(
+        track,
+        existence=_existence(track, position, scan),
+        labels=labels,
+        moving=_moving(position, track.moving),
+        sources=merged(track.sources, scan.source),
+        updated_ns=scan.stamp_ns,
+        approach_heard=True,
+    )
+    if scan.searched is not None:
+        changed = _sighted(changed, scan.stamp_ns, scan.searched)
+    if track.place is not None:
+        place = update_position(track.place, position)
+    else:
+        place = at_position(position)
+        if track.seen:
+            place = update_bearing(place, track.motion.azimuth_rad, track.motion.azimuth_std_rad)
+    return _at_side(changed, place, site)
+
+
+def _at_side(track: Track, place: CartesianBelief, site: SiteGeometry) -> Track:
+    """Return the track at a place, on the side whose occluder hides it there, if one does."""
+    side, behind = site.hiding_side(math.atan2(place.mean[1], place.mean[0]), _SHARP_RAD)
+    unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
+    unseen = not track.seen or unseen_ns > site.settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
+    if behind >= 0.5 and unseen:
+        track = replace(track, side=side, seen=False, was_hidden=True)
+    return located(track, place, site)
+
+
+def _sighted(track: Track, stamp_ns: int, searched: SearchedSector) -> Track:
+    miss_rate = 1.0 - searched.detection_probability
+    return replace(track, seen=True, last_seen_ns=stamp_ns, answer="visible", miss_rate=miss_rate)
+
+
+def _existence(track: Track, position: Position, scan: PositionScan) -> float:
+    """Return the existence after a detection, or after a message."""
+    if scan.searched is not None:
+        return _detected(track.existence, scan.searched)
+    # Whoever lies in one message lies in the next: what a source repeats counts once.
+    if scan.source in track.sources:
+        return track.existence
+    odds = position.existence_probability / (1.0 - position.existence_probability)
+    exists = track.existence * odds / (track.existence * odds + 1.0 - track.existence)
+    return min(exists, _MOST_EXISTENCE)
+
+
+def _detected(existence: float, searched: SearchedSector) -> float:
+    return after_sighting(existence, 1.0 - searched.detection_probability, searched.clutter_rate)
+
+
+def _moving(position: Position, before: bool) -> bool:
+    velocity = position.velocity_mps
+    return before if velocity is None else math.hypot(*velocity) > _PARKED_MPS
+
+
+def _missed(track: Track, searched: SearchedSector | None, weight: float, site: SiteGeometry) -> Track:
+    r"""Return a track that a scan has not found, by its chances to be in range and not hidden.
+
+    .. math:: r \leftarrow \frac{r (1 - p)}{1 - r p}, \qquad p = p_D\, P_{range}\, (1 - P_{hidden})
+    """
+    detectable = track.seen or track.place is not None
+    if searched is None or not detectable or not searched.sector.touches(track.motion.azimuth_rad):
+        return track
+    mean, variance = track.motion.mean[LOG_RANGE], track.motion.covariance[LOG_RANGE, LOG_RANGE]
+    in_range = normal_share((math.log(searched.range_m) - mean) / math.sqrt(variance))
+    in_sight = 1.0 if track.seen else 1.0 - track.behind
+    miss = 1.0 - in_range * in_sight * (1.0 - (1.0 - searched.detection_probability) ** weight)
+    existence = after_empty_look(track.existence, miss)
+    if not track.seen:
+        existence = max(existence, _LEAST_EXISTENCE)
+    return replace(
+        track, existence=existence, answer="absent", miss_rate=1.0 - searched.detection_probability
+    )
+
+
+def _born(
+    position: Position, scan: PositionScan, births: list[int], sighted: int, site: SiteGeometry
+) -> Track:
+    """Return an entity that nobody knew of, hidden where a message places it behind an occluder."""
+    x, y = position.position_m
+    side, behind = site.hiding_side(math.atan2(y, x), _SHARP_RAD)
+    hidden = scan.searched is None and behind >= 0.5
+    stream, label = site.settings.stream, site.sides[side].label
+    track = Track(
+        id=entity_id(stream, label, births[side]) if hidden else entity_id(stream, "visible", sighted),
+        side=side if hidden else site.nearest_side(math.atan2(y, x)),
+        seen=False,
+        existence=min(position.existence_probability, _MOST_EXISTENCE),
+        motion=site.prior(side),
+        labels=position.classes or ((UNKNOWN, 1.0),),
+        moving=_moving(position, before=True),
+        sources=(scan.source,),
+        created_ns=scan.stamp_ns,
+        updated_ns=scan.stamp_ns,
+        approach_heard=True,
+        was_hidden=hidden,
+    )
+    if scan.searched is not None:
+        existence = _detected(track.existence, scan.searched)
+        track = _sighted(replace(track, existence=existence), scan.stamp_ns, scan.searched)
+    return located(track, at_position(position), site)

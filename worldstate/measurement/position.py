@@ -1,0 +1,182 @@
+"""Positions: what a radar, a lidar or a radio message says of where road users are."""
+
+from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
+
+from worldstate.abduction.road_users import ClassShares
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import nanoseconds
+
+from .sector import Sector
+
+# Bounds of what is taken: farther away nobody matters within the times that the filter speaks of, and beyond
+# these deviations a covariance is singular to rounding or says nothing.
+_FARTHEST_M, _FASTEST_MPS = 1e4, 200.0
+_LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-6, 1e6
+# A scan is associated as a whole, at a cost that grows with the cube of its size.
+MOST_POSITIONS = 128
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where one object is, as a sensor or a message states it, in `base_link`.
+
+    Parameters
+    ----------
+    position_m : (float, float)
+        x forward and y left, m.
+    covariance : nested tuple of floats, shape (2, 2) or (4, 4)
+        Of (x, y), m^2; of (x, y, vx, vy) where a velocity is given. Symmetric and positive definite.
+    velocity_mps : (float, float) or None
+        Over ground, along x and y.
+    existence_probability : float
+        Probability that there is such an object, as the sensor or the sender's credentials say it, in (0, 1);
+        0.5 where nothing tells.
+    classes : tuple of (str, float)
+        Classes with their probabilities, empty where nothing tells.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is not finite or out of range, or the covariance is no covariance of what is given.
+
+    Examples
+    --------
+    >>> Position((12.0, 3.0), ((0.2, 0.0), (0.0, 0.4))).velocity_mps is None
+    True
+    """
+
+    position_m: tuple[float, float]
+    covariance: tuple[tuple[float, ...], ...]
+    velocity_mps: tuple[float, float] | None = None
+    existence_probability: float = 0.5
+    classes: ClassShares = ()
+
+    def __post_init__(self) -> None:
+        known = 2 if self.velocity_mps is None else 4
+        covariance = finite_array("covariance", self.covariance, (known, known))
+        spread = np.linalg.eigvalsh(covariance)
+        if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=1e-9) or spread[0] < _LEAST_VARIANCE:
+            raise InvalidArgumentError(
+                "covariance: expected a symmetric matrix with eigenvalues of at least "
+                f"{_LEAST_VARIANCE}, got {covariance.tolist()}"
+            )
+        if spread[-1] > _LARGEST_VARIANCE:
+            raise InvalidArgumentError(
+                f"covariance: expected eigenvalues of at most {_LARGEST_VARIANCE:g}, got {spread[-1]:g}"
+            )
+        even = 0.5 * (covariance + covariance.T)
+        object.__setattr__(self, "covariance", tuple(tuple(row) for row in even.tolist()))
+        object.__setattr__(self, "position_m", _pair("position_m", self.position_m, _FARTHEST_M))
+        if self.velocity_mps is not None:
+            velocity = _pair("velocity_mps", self.velocity_mps, _FASTEST_MPS)
+            object.__setattr__(self, "velocity_mps", velocity)
+        exists = self.existence_probability
+        exists = in_range("existence_probability", exists, 0.0, 1.0, open_low=True, open_high=True)
+        object.__setattr__(self, "existence_probability", exists)
+        classes = [(str(name), in_range("classes", share, 0.0, 1.0)) for name, share in self.classes]
+        object.__setattr__(self, "classes", tuple(sorted(classes)))
+
+
+@dataclass(frozen=True, slots=True)
+class SearchedSector:
+    """Where a sensor has looked: whoever stands there in line of sight it would have found.
+
+    Parameters
+    ----------
+    sector : Sector
+        Azimuths of its field of view.
+    range_m : float
+        How far it sees.
+    detection_probability : float
+        Probability that it detects a road user there in one scan, in [0, 1).
+    clutter_rate : float
+        Probability that a detection is of nobody, in (0, 1).
+
+    Examples
+    --------
+    >>> SearchedSector(Sector(0.0, 1.05), range_m=70.0, detection_probability=0.9).clutter_rate
+    0.01
+    """
+
+    sector: Sector
+    range_m: float
+    detection_probability: float
+    clutter_rate: float = 0.01
+
+    def __post_init__(self) -> None:
+        in_range("centre_rad", self.sector.centre_rad, -np.pi, np.pi)
+        in_range("half_width_rad", self.sector.half_width_rad, 0.0, np.pi, open_low=True)
+        found, clutter = self.detection_probability, self.clutter_rate
+        numbers = {
+            "range_m": in_range("range_m", self.range_m, 0.0, _FARTHEST_M, open_low=True),
+            "detection_probability": in_range("detection_probability", found, 0.0, 1.0, open_high=True),
+            "clutter_rate": in_range("clutter_rate", clutter, 0.0, 1.0, open_low=True, open_high=True),
+        }
+        for name, number in numbers.items():
+            object.__setattr__(self, name, number)
+
+
+@dataclass(frozen=True, slots=True)
+class PositionScan:
+    """All positions that one source states at one instant, and where it has searched.
+
+    Parameters
+    ----------
+    source : str
+        Name of the sensor or of the receiver.
+    stamp_ns : int
+        When the objects were there, ns on the stream's clock; with a latency, when the scan came.
+    positions : tuple of Position
+        At most 128.
+    searched : SearchedSector or None
+        What a sensor in line of sight has searched: an empty scan of it is evidence of absence. None of
+        messages, which come round corners, and say nothing of who sends none.
+    latency_s : float
+        How long before its stamp the scan was taken.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
+    Examples
+    --------
+    >>> car = Position((10.0, 14.0), ((1.0, 0.0), (0.0, 1.0)), existence_probability=0.95)
+    >>> PositionScan("v2x", 100_000_000, (car,)).searched is None
+    True
+    """
+
+    source: str
+    stamp_ns: int
+    positions: tuple[Position, ...] = ()
+    searched: SearchedSector | None = None
+    latency_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.source, str) or not self.source:
+            raise InvalidArgumentError(f"source: expected a name, got {self.source!r:.40}")
+        if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, Integral):
+            raise InvalidArgumentError(f"stamp_ns: expected integer nanoseconds, got {self.stamp_ns!r:.40}")
+        positions = tuple(self.positions)
+        if len(positions) > MOST_POSITIONS or not all(isinstance(one, Position) for one in positions):
+            got = f"{len(positions)} items"
+            raise InvalidArgumentError(f"positions: expected at most {MOST_POSITIONS} Position, got {got}")
+        if not isinstance(self.searched, SearchedSector | None):
+            raise InvalidArgumentError(f"searched: expected a SearchedSector, got {self.searched!r:.40}")
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
+        object.__setattr__(self, "latency_s", in_range("latency_s", self.latency_s, 0.0, 1e3))
+
+    @property
+    def observed_ns(self) -> int:
+        """When the scan was taken."""
+        return self.stamp_ns - nanoseconds(self.latency_s)
+
+
+def _pair(name: str, value: tuple[float, float], largest: float) -> tuple[float, float]:
+    x, y = finite_array(name, value, (2,)).tolist()
+    return in_range(f"{name}[0]", x, -largest, largest), in_range(f"{name}[1]", y, -largest, largest)
