@@ -42,6 +42,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--streams", type=Path, metavar="DIR", help=streams)
     windows = "labelled windows of this array at real junctions, learned too: feat0..feat59, Class, ..."
     add("--labelled", type=Path, metavar="CSV", help=windows)
+    ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
+    add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
+    add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
     quiet = "recordings in which nobody came: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add("--onsets", type=float, default=20.0, metavar="N", help="alarms an hour allowed (default: 20)")
@@ -59,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.datasets.feature_table import read_features
+    from worldstate.adapters.datasets.feature_table import read_features, read_ids
     from worldstate.adapters.files.model_file import save_model
     from worldstate.cli.common.output import write_report
     from worldstate.frontend.array.ovad_array import ovad_array
@@ -77,7 +80,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
     array = given_array(arguments) or ovad_array()
-    table = None if arguments.labelled is None else read_features(arguments.labelled).group("static")
+    table, source = None, arguments.source
+    if arguments.labelled is not None:
+        table, source = read_features(arguments.labelled).group("static"), source or arguments.labelled.name
+        table = table.without([name for path in arguments.exclude for name in read_ids(path)])
     # Streams take nearly all of the time; what is learned from them counts as a few more.
     steps = len(learned_streams(settings)) + LEARNING_STEPS
     with progress_bar("commissioning", steps) as bar:
@@ -86,6 +92,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             settings,
             folder,
             table=table,
+            source=source or "",
+            excluded_lists=[path.name for path in arguments.exclude],
             quiet=arguments.quiet,
             jobs=arguments.jobs,
             on_step=bar.advance,

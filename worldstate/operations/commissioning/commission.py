@@ -156,13 +156,16 @@ def commission(
     folder: Path,
     *,
     table: FeatureTable | None = None,
+    source: str = "labelled windows",
+    excluded_lists: Sequence[str] = (),
     quiet: Sequence[Path] = (),
     jobs: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> Model:
     """Make a model for an array from simulated streets, and from labelled windows where there are any.
 
-    Recordings in which nobody came set the alarm in place of the simulated streets without hazards.
+    Recordings in which nobody came set the alarm in place of the simulated streets without hazards. The model
+    says where the labelled windows come from and which lists of them were left out.
     """
     streams, rng = [], np.random.default_rng(settings.seed)
     for one in heard_streams(learned_streams(settings), array, folder, jobs):
@@ -180,9 +183,9 @@ def commission(
     model = train_model(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1, method="worldstate"),
-        dataset=SIMULATED if real is None else f"{SIMULATED} and labelled windows",
+        dataset=SIMULATED if real is None else f"{source}; {SIMULATED}",
         group="static",
-        excluded_lists=settings.leave_out,
+        excluded_lists=(*excluded_lists, *settings.leave_out),
         simulated=beside,
     )
     on_step()
