@@ -1,6 +1,7 @@
 """Acoustic measurement adapter: blocks of samples in, measurements out."""
 
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -15,6 +16,7 @@ from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.direct_sound import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -254,6 +256,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             kinds=kinds,
             sequence=sequence,
             source=self.source,
+            fault=_array_fault(frame.health),
         )
         return asked_again(measured, self._vision, self._settings)
 
@@ -299,6 +302,14 @@ def _bearing(frame: AcousticFrame, settings: AcousticSettings) -> Bearing | NotU
         ratio = f"{frame.prominence:.2f}, not above {least:.2f}"
         return NotUsable(f"peak-to-median ratio {ratio}")
     return Bearing(wrap_angle(frame.bearing_rad), frame.bearing_std_rad, frame.prominence)
+
+
+def _array_fault(health: ArrayHealth | NotUsable) -> str | None:
+    """Return how many microphones have which fault, None where none has one."""
+    if isinstance(health, NotUsable) or not health.faults:
+        return None
+    counts = Counter(one.fault.value for one in health.faults)
+    return "microphones: " + ", ".join(f"{count} {fault}" for fault, count in sorted(counts.items()))
 
 
 def _likelier_side(signature: SignatureEvidence) -> Side | None:

@@ -28,6 +28,8 @@ GROUPS = (*(f"coming_{end_s:g}s" for end_s in COMING_S), *OTHERS)
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
 # Times are stated of vehicles that come within so long: beyond, nothing in the sound says when.
 LONGEST_S = 5.0
+_HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
+_LEVELS = np.array([[0.05], [0.95]])
 SMOOTHED_HOPS, HELD_HOPS = 3, 10
 _SMALLEST = 1e-9
 
@@ -41,9 +43,7 @@ class SequencePosterior:
 
     def within(self) -> FloatArray:
         """Return the probability of coming into view within each of `HORIZONS_S`, shape (n, 2, 4)."""
-        ends = np.array(COMING_S)
-        sums = [self.groups[..., : len(COMING_S)][..., ends <= end_s].sum(axis=-1) for end_s in HORIZONS_S]
-        return np.stack(sums, axis=-1)
+        return np.asarray(np.cumsum(self.groups[..., : len(COMING_S)], axis=-1)[..., _HORIZONS])
 
     def time_to_visible_s(self) -> FloatArray:
         """Return the time to visible of what comes within five seconds: low, mean, high, shape (n, 2, 3).
@@ -55,17 +55,11 @@ class SequencePosterior:
         edges = np.concatenate([[0.0], ends])
         share = mass / mass.sum(axis=-1, keepdims=True)
         mean = share @ (0.5 * (edges[1:] + edges[:-1]))
-        below = np.concatenate([np.zeros((*share.shape[:-1], 1)), np.cumsum(share, axis=-1)], axis=-1)
-        low, high = (_crossing(below, edges, level) for level in (0.05, 0.95))
+        below = np.cumsum(share, axis=-1) - share
+        # Of every bin the part that lies below the level, linear within the bin.
+        parts = (_LEVELS - below[..., None, :]) / np.maximum(share[..., None, :], 1e-12)
+        low, high = np.moveaxis(np.clip(parts, 0.0, 1.0) @ np.diff(edges), -1, 0)
         return np.stack([np.maximum(low - self.margin_s, 0.0), mean, high + self.margin_s], axis=-1)
-
-
-def _crossing(below: FloatArray, edges: FloatArray, level: float) -> FloatArray:
-    """Return where a rising sum, shape (..., edges), crosses a level, linear between the edges."""
-    upper = np.clip((below < level).sum(axis=-1), 1, len(edges) - 1)
-    after, before = (np.take_along_axis(below, at[..., None], -1)[..., 0] for at in (upper, upper - 1))
-    part = (level - before) / np.maximum(after - before, 1e-12)
-    return np.asarray(edges[upper - 1] + np.clip(part, 0.0, 1.0) * (edges[upper] - edges[upper - 1]))
 
 
 @dataclass(frozen=True, slots=True)

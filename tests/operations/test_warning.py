@@ -2,14 +2,15 @@
 
 from worldstate.ground.values import nanoseconds
 from worldstate.operations.recordings.warning import WarningMeter
-from worldstate.state import Context, Entity, RiskCue, WorldState
+from worldstate.state import Advisory, Context, Entity, RiskCue, WorldState
 from worldstate.state.context import Priors
 
 HYPOTHESES = Priors(0.5, 0.2, 0.3)
 
 
 def state(time_s: float, advisory: bool, entity_id: str = "a", *entities: Entity) -> WorldState:
-    cue = RiskCue("left", 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, HYPOTHESES, advisory, entity_id=entity_id)
+    told = Advisory(0, 10**9) if advisory else None
+    cue = RiskCue("left", 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, HYPOTHESES, told, entity_id=entity_id)
     return WorldState(nanoseconds(time_s), 0, entities=entities, relations=(), context=Context(), cues=(cue,))
 
 

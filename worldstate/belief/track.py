@@ -22,7 +22,7 @@ _LABEL_GAIN = 0.3
 # Hops share nineteen twentieths of the two seconds that they are classified by.
 _HEARD_GAIN = 0.2
 # m^2/s^3 where moving vehicles have 2: a parked one must not drift with its boxes, but stay updatable.
-_PARKED_ACCELERATION = 1e-4
+PARKED_ACCELERATION = 1e-4
 # Prior of a vehicle in view, of which only the azimuth is measured: neither closing nor receding, within .5
 # 1/s, at exp(3.2) = 25 m within a factor of 1.8.
 _IN_VIEW = MotionBelief.around((0.0, 0.0, 0.0, 3.2), (1.0, 1.0, 0.5, 0.6))
@@ -75,7 +75,7 @@ def predict_track(track: Track, hidden_share: float, step_s: float, site: SiteGe
     # The azimuth relaxes to the hidden prior by `hidden_share` = P(hidden | exists): a vehicle still hidden
     # has not passed the corner, whatever its last rates said.
     settings = site.settings
-    acceleration = settings.acceleration_psd if track.moving else _PARKED_ACCELERATION
+    acceleration = settings.acceleration_psd if track.moving else PARKED_ACCELERATION
     if track.place is not None:
         place = predict_place(track.place, step_s, acceleration, site.ego_speed_mps)
         if place.position_std_m <= _LOST_PLACE_M:

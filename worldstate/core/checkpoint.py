@@ -18,7 +18,7 @@ from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing, Measurement
 from worldstate.measurement.position import PositionScan
-from worldstate.state import Context, Delivery, Priors
+from worldstate.state import Context, Delivery, Event, Priors
 
 from .memory import CountedLook, Memory, SourceRule
 from .sequence_memory import SequenceMemory
@@ -62,6 +62,9 @@ class _Memory:
     domain: DomainVerdict | None = field(default=None, metadata=ADDED)
     sequence: SequenceMemory | None = field(default=None, metadata=ADDED)
     no_sequence: NotUsable | None = field(default=None, metadata=ADDED)
+    heard_nats: float = field(default=0.0, metadata=ADDED)
+    advised_ns: tuple[Annotated[int | None, Keys("stamp_ns")], ...] = field(default=(), metadata=ADDED)
+    events: tuple[Event, ...] = field(default=(), metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +104,7 @@ class FilterRecord:
             "trail.heard": ([heard.log_likelihoods for heard in memory.trail.heard], k + 2),
             "births": ([memory.births], k),
             "handover_ns": ([memory.handover_ns], k),
+            "advised_ns": ([memory.advised_ns] if memory.advised_ns else [], k),
             "instant": ([memory.instant.log_probabilities] if memory.instant else [], k + 2),
         }
         for name, (rows, length) in lengths.items():
@@ -139,6 +143,9 @@ def memory_record(memory: Memory) -> _Memory:
         domain=memory.domain,
         sequence=memory.sequence,
         no_sequence=memory.no_sequence,
+        heard_nats=memory.heard_nats,
+        advised_ns=memory.advised_ns,
+        events=memory.events,
     )
 
 
@@ -165,6 +172,9 @@ def memory_of(kept: _Memory, record: FilterRecord) -> Memory:
         domain=kept.domain,
         sequence=kept.sequence,
         no_sequence=kept.no_sequence,
+        heard_nats=kept.heard_nats,
+        advised_ns=kept.advised_ns or (None,) * len(directions),
+        events=kept.events,
     )
 
 

@@ -26,13 +26,16 @@ from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
 
 from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
+from .cue_builder import cues_of
+from .entity_events import published
 from .fixed_lag import FixedLag, restored
 from .memory import Memory, first_memory, priors_of
-from .snapshot_builder import cues_of, entity_of, relations_of
+from .snapshot_builder import entities_of, relations_of, searched_views, sensors_of
 from .step import (
+    NEWS_HOLDS_NS,
     FilterModel,
     advance,
-    alarmed,
+    chronicled,
     counted_once,
     site_geometry_of,
     update_advisories,
@@ -55,6 +58,7 @@ _KINDS: dict[str, Any] = {
     "approach": Approach | NotUsable,
     "look": Look | None,
     "sequence": SequenceReading | NotUsable | None,
+    "fault": str | None,
 }
 
 
@@ -174,23 +178,26 @@ class WorldFilter:
     @cached_property
     def state(self) -> WorldState:
         """The snapshot S_t."""
-        memory, context, settings, sides = self._memory, self.context, self.settings, self._memory.sides
-        # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
-        tracks = [one for one in memory.tracks if not one.place or one.existence >= settings.delete_existence]
+        memory, context, settings = self._memory, self.context, self.settings
+        sides, sensors, tracks = memory.sides, sensors_of(memory), published(memory.tracks, settings)
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
-            entities=tuple(entity_of(track, memory, context, settings) for track in tracks),
+            entities=entities_of(tracks, memory, context, settings),
             relations=tuple(
                 edge for track in tracks for edge in relations_of(track, sides, context, memory.stamp_ns)
             ),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
-            cues=cues_of(memory, self._model, self.risk, alarmed(memory)),
+            cues=cues_of(memory, self._model, self.risk, sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=memory.bearing,
             domain=memory.domain,
             no_sequence=memory.no_sequence,
             delivery=self._lag.delivery,
+            valid_until_ns=max((one.stamp_ns + NEWS_HOLDS_NS for one in sensors), default=None),
+            sensors=sensors,
+            searched=searched_views(memory, context),
+            events=memory.events,
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":
@@ -244,12 +251,13 @@ class WorldFilter:
 
     def _step(self, memory: Memory, measurement: Measurement | PositionScan) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
-        model = self._model
+        model, before = self._model, memory
         # Within the slack the belief is not moved back.
         if measurement.stamp_ns > memory.stamp_ns:
             memory = advance(memory, measurement.stamp_ns, model)
+        carried = memory
         if isinstance(measurement, PositionScan):
-            return update_positions(memory, measurement, model)
+            return chronicled(before, carried, update_positions(memory, measurement, model), model)
         weights = weights_of(memory, measurement, self.start_ns, self.settings)
         memory, measurement, looked = counted_once(memory, measurement)
         # Evidence first: association and births need the explanations of this very window.
@@ -258,7 +266,7 @@ class WorldFilter:
             memory = update_sightings(memory, measurement, weights, model)
         memory = update_advisories(memory, measurement, model)
         memory = update_sequence(memory, measurement, looked, model)
-        return update_entities(memory, measurement, model)
+        return chronicled(before, carried, update_entities(memory, measurement, model), model)
 
     def _begun_anew(self, measurement: Measurement | PositionScan) -> "WorldFilter":
         delivery = self._lag.delivery

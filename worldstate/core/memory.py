@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
@@ -10,10 +11,10 @@ from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.track import Track
-from worldstate.ground.serialisation import Count
+from worldstate.ground.serialisation import ADDED, Count
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
-from worldstate.state import Context, Priors
+from worldstate.state import Context, Event, Priors
 
 from .sequence_memory import SequenceMemory
 
@@ -26,15 +27,18 @@ class SourceRule:
     run: Count  # Hops in a row, counted up to those that the rule asks for
     alarm: bool
     stamp_ns: int  # Of its last measurement
+    fault: str | None = None  # What was wrong with it then
 
 
 @dataclass(frozen=True, slots=True)
 class CountedLook:
-    """The last look of a sensor, and the source whose measurement carried it first."""
+    """The last look of a sensor, what it said, and the source whose measurement carried it first."""
 
     sensor: str
     stamp_ns: int
     source: str
+    answer: CoEvidence = field(default=Unqueried("messages search nothing"), metadata=ADDED)
+    sector_rad: tuple[float, float] | None = None  # Where it searched; None for the view of the context
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +59,15 @@ class Memory:
     predicted: Priors | None = None  # Explanation priors of the last update; None before the first
     # Posterior of the last window alone, at the policy's reference prior; None before the first.
     instant: Posterior | None = None
+    heard_nats: float = 0.0  # Log-odds of hidden in it by sound alone
     # How far the threshold has moved, where the policy lets it.
     threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
     bearing: Bearing | None = None  # Of the last measurement
     domain: DomainVerdict | None = None  # Of the last measurement
     sequence: SequenceMemory | None = None  # Who comes into view and when; None without such a model
     no_sequence: NotUsable | None = None  # Why the last one that should have said so could not
+    advised_ns: tuple[int | None, ...] = ()  # Since when an advisory has been out on each side
+    events: tuple[Event, ...] = ()  # Of the last measurement
 
     @property
     def sides(self) -> HiddenBelief:
@@ -83,6 +90,7 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
         rules=(),
         births=(0,) * len(directions),
         handover_ns=(None,) * len(directions),
+        advised_ns=(None,) * len(directions),
     )
 
 

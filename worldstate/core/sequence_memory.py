@@ -42,6 +42,9 @@ _LOOK_NS = 500_000_000
 # A window and the smoothing of the alarm; then a follower is told like anybody. In dense traffic one in six
 # has another one right behind.
 _EXPLAINED_NS, _FOLLOWED = 1_300_000_000, 0.2
+# States of those who come into view within three seconds.
+_SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
+_LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
 
 
 # No slots: what is derived is computed once, and read by every entity and cue.
@@ -79,10 +82,16 @@ class SequenceMemory:
     @cached_property
     def posterior(self) -> SequencePosterior:
         """The belief, as one hop of a stream."""
-        told = sum((look_log_likelihoods(look.answer) for look in self.looks), np.zeros(len(STATES)))
-        told = told + self._explained()[:, None] * COMES
+        told = sum(self._told.values(), np.zeros(len(STATES)))
         weighed = self.sides.belief * np.exp(told - told.max())
         return SequencePosterior(groups_of(weighed / weighed.sum(axis=1, keepdims=True))[None], self.margin_s)
+
+    @cached_property
+    def _told(self) -> dict[str, FloatArray]:
+        """Log-likelihoods of everything but the sound, in the order of their names, each (2, states)."""
+        looks = ((f"look {look.sensor}", look_log_likelihoods(look.answer)) for look in self.looks)
+        told = {name: np.stack([nats] * len(SIDES)) for name, nats in looks}
+        return told | {"emerged": self._explained()[:, None] * COMES}
 
     def emerged(self, sides: Collection[int], stamp_ns: int) -> "SequenceMemory":
         """Return the memory after somebody came into view past the edge of some sides."""
@@ -104,10 +113,32 @@ class SequenceMemory:
         coming = self.posterior.groups[0, :, : len(COMING_S)].sum(axis=1)
         return HiddenBelief(tuple(np.minimum(coming, 1.0).tolist()), (0.0,) * len(SIDES))
 
-    def alarmed(self, stamp_ns: int) -> tuple[bool, ...]:
-        """Return for each side whether it was above the threshold within the last second."""
-        last_ns = stamp_ns - _HELD_NS - _SLACK_NS
-        return tuple(over_ns is not None and over_ns >= last_ns for over_ns in self.over_ns)
+    def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
+        """Return for each side when its alarm ends: a second after it was last above the threshold."""
+        ends_ns = (None if over_ns is None else over_ns + _HELD_NS + _SLACK_NS for over_ns in self.over_ns)
+        return tuple(None if end_ns is None or end_ns < stamp_ns else end_ns for end_ns in ends_ns)
+
+    def log_odds_terms(self, context: Context) -> dict[str, list[float]]:
+        r"""Return what each piece of evidence adds to the log-odds of coming into view within three seconds.
+
+        .. math:: t_j = L_j - L_{j-1}
+
+        with L of both sides after the prior, the sequence, every look, and who has just come into view.
+        """
+        told = np.cumsum([np.zeros_like(self.sides.belief), *self._told.values()], axis=0)
+        prior = _prior(self.share, context)
+        # States and groups count alike: those who come soon behind somebody come soon.
+        before = np.broadcast_to(states_of(prior, prior), self.sides.belief.shape)
+        weights = np.concatenate([before[None], self.sides.belief * np.exp(told)])
+        soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
+        log_odds = np.log(soon) - np.log(later)
+        terms = np.diff(log_odds, axis=0, prepend=np.zeros((1, len(SIDES))))
+        return dict(zip(("prior", "sequence", *self._told), terms.tolist(), strict=True))
+
+    @property
+    def mean_log_odds(self) -> FloatArray:
+        """Mean log-odds of coming into view within three seconds over the last .3 s, shape (2,)."""
+        return np.asarray(np.mean([one[1:] for one in self.recent], axis=0))
 
 
 def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
@@ -156,7 +187,6 @@ def _alerted(kept: SequenceMemory) -> SequenceMemory:
     kept = replace(kept, recent=recent)
     if kept.alarm is None:
         return kept
-    means = np.mean([one[1:] for one in recent], axis=0)
-    over = (means >= kept.alarm.threshold_nats).tolist()
+    over = (kept.mean_log_odds >= kept.alarm.threshold_nats).tolist()
     over_ns = tuple(kept.stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
     return replace(kept, over_ns=over_ns)

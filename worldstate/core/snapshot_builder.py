@@ -1,67 +1,136 @@
 """Build the public WorldState from the internal beliefs."""
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.abduction.co_evidence import Present, Unqueried
+from worldstate.abduction.road_users import UNKNOWN
+from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.announced import time_to_visible
-from worldstate.belief.birth_death import hidden_on
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.belief.kinematics.polar import AZIMUTH_RATE, LOG_RANGE
+from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
-from worldstate.state import Classification, Context, Entity, Relation, RiskCue, Visibility
+from worldstate.ground.values import seconds
+from worldstate.state import (
+    Classification,
+    Context,
+    Entity,
+    Relation,
+    SearchedView,
+    SensorHealth,
+    Visibility,
+)
 from worldstate.state.relation import EGO
 
-from .memory import Memory, priors_of
+from .forecast import Forecast, forecasts
+from .memory import CountedLook, Memory
 from .sequence_memory import SequenceMemory
-from .step import FilterModel
+from .step import NEWS_HOLDS_NS
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
 _KNOWN_LOG_RANGE_STD = 0.25
 # A lane and a half, and a change of pace: beyond, a number would be taken for more than it says.
 _KNOWN_POSITION_STD_M, _KNOWN_VELOCITY_STD_MPS = 5.0, 5.0
-_NINE_OF_TEN = 1.645  # Standard deviations either side
+_NINE_OF_TEN = 1.645  # Standard deviations to either side
+_ROUNDING = 1e-9
+_UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
+# Of what is published: numbers in full precision take twice as long to write.
+_DIGITS = 9
+# A look that misses more than it finds tells little of who is not there.
+_MOSTLY_MISSED = 0.5
 
 
-def entity_of(track: Track, memory: Memory, context: Context, settings: FilterSettings) -> Entity:
-    """Return the published entity of a track."""
-    sides = memory.sides
+class _Moments(NamedTuple):
+    """Mean and deviations of a track's motion, and what follows from them, as Python numbers."""
+
+    mean: list[float]
+    std: list[float]
+    azimuth_covariance: list[float]
+    forecast: Forecast
+
+
+def entities_of(
+    tracks: tuple[Track, ...], memory: Memory, context: Context, settings: FilterSettings
+) -> tuple[Entity, ...]:
+    """Return some tracks as published entities."""
+    if not tracks:
+        return ()
+    # All at once: a number taken out of an array by itself costs as much as a row.
+    means = np.array([track.motion.mean for track in tracks])
+    covariances = np.array([track.motion.covariance for track in tracks])
+    stds = np.sqrt(covariances.diagonal(axis1=1, axis2=2))
+    lists = (array.round(_DIGITS).tolist() for array in (means, stds, covariances[:, *_UPPER]))
+    moments = map(_Moments, *lists, forecasts(tracks, means, covariances, settings))
+    build = partial(_entity, memory, memory.sides, context, settings)
+    return tuple(map(build, tracks, moments))
+
+
+def _entity(
+    memory: Memory,
+    sides: HiddenBelief,
+    context: Context,
+    settings: FilterSettings,
+    track: Track,
+    moments: _Moments,
+) -> Entity:
+    mean, std, (variance, mixed, rate_variance), forecast = moments
     share, existence = hidden_share(track, sides), existence_of(track, sides)
-    hidden, motion = share >= 0.5, track.motion
-    range_m = _range(motion, hidden and track.place is None)
-    azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
-    if hidden and track.place is None:
+    hidden = share >= 0.5
+    heard_only = hidden and track.place is None
+    range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
+    azimuth_rad, std_rad = mean[AZIMUTH], std[AZIMUTH]
+    if heard_only:
         edge_rad = context.occluders[track.side].edge_azimuth_rad
-        azimuth_rad, std_rad = hidden_azimuth(track.side, motion, memory.sequence, edge_rad, settings)
+        azimuth_rad, std_rad = hidden_azimuth(track.side, track.motion, memory.sequence, edge_rad, settings)
     return Entity(
         id=track.id,
         status="hidden" if hidden else "visible" if track.seen else "emerged",
         existence_probability=existence,
         hidden_probability=share * existence,
-        classification=tuple(Classification(label, probability) for label, probability in track.labels),
+        classification=_classes(track),
         moving=track.moving,
         direction=context.directions[track.side],
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
-        azimuth_rate_rad_s=None if hidden else float(motion.mean[AZIMUTH_RATE]),
+        azimuth_rate_rad_s=None if hidden else mean[AZIMUTH_RATE],
         range_m=range_m,
         **_place(track, range_m, hidden, context),
-        inverse_tta_hz=motion.inverse_tta_hz if track.approach_heard else None,
-        inverse_tta_std_hz=motion.inverse_tta_std_hz if track.approach_heard else None,
+        inverse_tta_hz=-mean[RADIAL_RATE] if track.approach_heard else None,
+        inverse_tta_std_hz=std[RADIAL_RATE] if track.approach_heard else None,
         tta_s=time_to_arrival(track),
         visibility=Visibility(track.answer, track.miss_rate),
         sources=track.sources,
         created_ns=track.created_ns,
         updated_ns=track.updated_ns,
         last_seen_ns=track.last_seen_ns,
+        sector_rad=sector(azimuth_rad, std_rad) if hidden else None,
+        azimuth_covariance=None if heard_only else (variance, mixed, rate_variance),
+        forecast=None if heard_only else forecast,
     )
+
+
+def _classes(track: Track) -> tuple[Classification, ...]:
+    """Return the class probabilities of a track; what no label has is unknown, so that they sum to one."""
+    classes = [Classification(label, share) for label, share in track.labels if label != UNKNOWN]
+    rest = 1.0 - sum(one.probability for one in classes)
+    return (*classes, Classification(UNKNOWN, round(rest, _DIGITS))) if rest > _ROUNDING else tuple(classes)
+
+
+def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
+    """Return the sector that holds nine of ten, from its right end to its left one."""
+    half_rad = _NINE_OF_TEN * std_rad
+    if half_rad >= math.pi:
+        return -math.pi, math.pi
+    # wrap_angle goes through arrays, which takes ten times as long for one number.
+    right_rad, left_rad = azimuth_rad - half_rad, azimuth_rad + half_rad
+    return round(math.remainder(right_rad, math.tau), 6), round(math.remainder(left_rad, math.tau), 6)
 
 
 def existence_of(track: Track, sides: HiddenBelief) -> float:
@@ -106,68 +175,6 @@ def relations_of(track: Track, sides: HiddenBelief, context: Context, stamp_ns: 
     return edges
 
 
-def cues_of(
-    memory: Memory, model: FilterModel, hazard_risk: float, alarmed: Sequence[bool]
-) -> tuple[RiskCue, ...]:
-    """Return one risk cue per side, none before the first measurement."""
-    if memory.instant is None:
-        return ()
-    return tuple(_cue(k, memory, model, hazard_risk, named) for k, named in enumerate(alarmed))
-
-
-def _cue(k: int, memory: Memory, model: FilterModel, hazard_risk: float, named: bool) -> RiskCue:
-    explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
-    assert instant is not None
-    track = hidden_on(memory.tracks, k)
-    motion, settings = model.site.prior(k) if track is None else track.motion, model.site.settings
-    azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
-    if track is None or track.place is None:
-        azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, side.edge_azimuth_rad, settings)
-    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
-    share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
-    arrival_s = None if track is None else time_to_arrival(track)
-    within, times_s = _times(memory.sequence, k, named)
-    own_alarm = memory.sequence is not None and memory.sequence.alarm is not None
-    return RiskCue(
-        direction=side.label,
-        azimuth_rad=azimuth_rad,
-        azimuth_std_rad=std_rad,
-        risk=hazard_risk * share,
-        confidence=share,
-        statistic=min(instant.hidden_total, 1.0),
-        log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
-        hypotheses=priors_of(explanation),
-        advisory=named,
-        alpha=None if own_alarm else model.policy.alpha or None,
-        entity_id=None if track is None else track.id,
-        horizon_s=arrival_s if times_s is None else times_s[1],
-        within=within,
-        time_to_visible_s=times_s,
-    )
-
-
-def _times(
-    kept: SequenceMemory | None, k: int, named: bool
-) -> tuple[dict[str, float] | None, tuple[float, float, float] | None]:
-    """Return the probabilities of coming into view, and the time to it where somebody is expected."""
-    if kept is None:
-        return None, None
-    posterior = kept.posterior
-    # A sum of probabilities may exceed one by rounding, which readers of a snapshot refuse.
-    probabilities = np.minimum(posterior.within()[0, k], 1.0).tolist()
-    within = dict(zip((f"{end_s:g}" for end_s in HORIZONS_S), probabilities, strict=True))
-    # The times are those of whoever comes: of a street where nobody does they would say nothing.
-    if not named and posterior.groups[0, k, : COMING_S.index(LONGEST_S) + 1].sum() <= 0.5:
-        return within, None
-    low, best, high = posterior.time_to_visible_s()[0, k].tolist()
-    return within, (low, best, high)
-
-
-def _range(motion: MotionBelief, hidden: bool) -> float | None:
-    known = not hidden and math.sqrt(motion.covariance[LOG_RANGE, LOG_RANGE]) < _KNOWN_LOG_RANGE_STD
-    return math.exp(motion.mean[LOG_RANGE]) if known else None
-
-
 def _place(track: Track, range_m: float | None, hidden: bool, context: Context) -> dict[str, Any]:
     """Return position, velocity and covariance where known, and when a hidden one comes into view."""
     place, motion = track.place, track.motion
@@ -192,3 +199,41 @@ def _place(track: Track, range_m: float | None, hidden: bool, context: Context) 
 
 def _interval(mean_s: float, std_s: float) -> tuple[float, float, float]:
     return max(mean_s - _NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + _NINE_OF_TEN * std_s
+
+
+def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
+    """Return how every sensor is that spoke or looked."""
+    spoke = {rule.source: (rule.stamp_ns, rule.fault) for rule in memory.rules}
+    looked = {look.sensor: (look.stamp_ns, _look_fault(look)) for look in memory.looks}
+    told = sorted((looked | spoke).items())
+    return tuple(_health(name, ns, fault, memory.stamp_ns) for name, (ns, fault) in told)
+
+
+def _health(sensor: str, stamp_ns: int, fault: str | None, now_ns: int) -> SensorHealth:
+    if now_ns > stamp_ns + NEWS_HOLDS_NS:
+        return SensorHealth(sensor, "silent", stamp_ns, f"nothing for {seconds(now_ns - stamp_ns):.1f} s")
+    return SensorHealth(sensor, "working" if fault is None else "impaired", stamp_ns, fault)
+
+
+def _look_fault(look: CountedLook) -> str | None:
+    answer = look.answer
+    if isinstance(answer, Unqueried) or answer.miss_rate < _MOSTLY_MISSED:
+        return None
+    return f"misses {answer.miss_rate:.0%} of what is in view"
+
+
+def searched_views(memory: Memory, context: Context) -> tuple[SearchedView, ...]:
+    """Return the last look of every sensor that searched its view."""
+    half_rad = context.view_half_angle_rad
+    return tuple(
+        SearchedView(
+            look.sensor,
+            look.stamp_ns,
+            isinstance(look.answer, Present),
+            look.answer.miss_rate,
+            look.answer.clutter_rate,
+            look.sector_rad or (-half_rad, half_rad),
+        )
+        for look in memory.looks
+        if not isinstance(look.answer, Unqueried)
+    )

@@ -8,11 +8,12 @@ from operator import attrgetter
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import CoEvidence, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
+from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
@@ -28,14 +29,16 @@ from worldstate.measurement.measurement import Look, Measurement
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context
 
+from .entity_events import events_between, published
 from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
 from .sequence_memory import carried, informed
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
+NEWS_HOLDS_NS = nanoseconds(1.0)
 _MOST_CERTAIN = 0.999  # Of a message
-RULE_HOLDS_NS = nanoseconds(1.0)
+_NO_LOOK = Unqueried("sound alone")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,9 @@ def counted_once(memory: Memory, measurement: Measurement) -> tuple[Memory, Meas
     sensor, stamp_ns = _searched(measurement)
     last = _last_look(memory, sensor)
     if last is None or stamp_ns > last.stamp_ns:
-        looks = _with_look(memory, CountedLook(sensor, stamp_ns, measurement.source))
+        look = measurement.look
+        said = measurement.co_evidence if look is None else look.answer
+        looks = _with_look(memory, CountedLook(sensor, stamp_ns, measurement.source, said))
         return replace(memory, looks=looks), measurement, True
     own = last.source == measurement.source
     answer = measurement.co_evidence if own else Unqueried(f"this look of {sensor} was counted before")
@@ -227,7 +232,7 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
         memory.tracks, memory.explanation, scan, weight, memory.sighted, memory.births, model.site
     )
     memory = _after_look(memory, found.seen, scan.stamp_ns, model)
-    looks = _with_look(memory, CountedLook(scan.source, scan.stamp_ns, scan.source))
+    looks = _with_look(memory, _scan_look(scan))
     memory = replace(memory, births=found.births, looks=looks, seq=memory.seq + 1)
     chances = announced(memory.tracks, model.site)
     raised = partial(ExplanationBelief.at_least, hidden=chances)
@@ -239,6 +244,17 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     return _ruled(memory, scan.source, scan.stamp_ns, said, Unqueried("messages search nothing"), model)
 
 
+def _scan_look(scan: PositionScan) -> CountedLook:
+    """Return a scan as a look at its sector, or at none where it is of messages."""
+    source, stamp_ns, searched = scan.source, scan.stamp_ns, scan.searched
+    if searched is None:
+        return CountedLook(source, stamp_ns, source)
+    miss, half_rad = 1.0 - searched.detection_probability, searched.sector.half_width_rad
+    answer = (Present if scan.positions else Absent)(miss, searched.clutter_rate)
+    ends_rad = (searched.sector.centre_rad - half_rad, searched.sector.centre_rad + half_rad)
+    return CountedLook(source, stamp_ns, source, answer, ends_rad)
+
+
 def _log_odds(probability: float) -> float:
     # At even odds and below a message claims nothing, as the prior of the rule.
     known = min(max(probability, 0.5), _MOST_CERTAIN)
@@ -248,7 +264,9 @@ def _log_odds(probability: float) -> float:
 def update_advisories(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
     """Return the memory after the sustained rule has seen this window's statistic."""
     stamp_ns, said, answer = measurement.stamp_ns, measurement.signature, measurement.co_evidence
-    memory = _ruled(memory, measurement.source, stamp_ns, said, answer, model)
+    domain = measurement.domain
+    fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
+    memory = _ruled(memory, measurement.source, stamp_ns, said, answer, model, fault)
     return replace(memory, threshold=_adapted(memory, stamp_ns, model.policy))
 
 
@@ -259,6 +277,7 @@ def _ruled(
     said: SignatureEvidence,
     answer: CoEvidence,
     model: FilterModel,
+    fault: str | None = None,
 ) -> Memory:
     """Return the memory after one source's sustained rule has seen what it says."""
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
@@ -268,8 +287,13 @@ def _ruled(
     run = next((one.run for one in memory.rules if one.source == source), 0)
     rule = replace(model.policy.rule(), run=run).advance(held)
     others = (one for one in memory.rules if one.source != source)
-    rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns))
-    return replace(memory, instant=instant, rules=tuple(sorted(rules, key=attrgetter("source"))))
+    rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns, fault))
+    return replace(
+        memory,
+        instant=instant,
+        heard_nats=posterior_of(log_prior, said, _NO_LOOK).log_lambda,
+        rules=tuple(sorted(rules, key=attrgetter("source"))),
+    )
 
 
 def update_sequence(memory: Memory, measurement: Measurement, looked: bool, model: FilterModel) -> Memory:
@@ -295,28 +319,33 @@ def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThr
         policy.adaptive,
         visible=memory.explanation.visible,
         none=memory.explanation.none,
-        alarm=sustained(memory),
+        alarm=_rule_ends_ns(memory) is not None,
         elapsed_s=max(seconds(stamp_ns - before_ns), 0.0),
     )
 
 
-def alarmed(memory: Memory) -> tuple[bool, ...]:
-    """Return for each side whether an advisory names it: the likeliest side, or all in a tie.
+def advisory_ends_ns(memory: Memory) -> tuple[int | None, ...]:
+    """Return for each side when its advisory ends without news, None where there is none.
 
-    With the alarm of a sequence model each side is named by itself.
+    The rule names the likeliest side, or all in a tie; the alarm of a sequence model each side by itself.
     """
     sequence = memory.sequence
     if sequence is not None and sequence.alarm is not None:
-        return sequence.alarmed(memory.stamp_ns)
-    hidden = memory.explanation.hidden
+        return sequence.alarm_ends_ns(memory.stamp_ns)
+    hidden, end_ns = memory.explanation.hidden, _rule_ends_ns(memory)
     least = max(hidden) * (1.0 - _TIE)
-    return tuple(sustained(memory) and p >= least for p in hidden)
+    return tuple(end_ns if p >= least else None for p in hidden)
 
 
-def sustained(memory: Memory) -> bool:
-    """Return whether the rule of any source is in alarm; one that is silent for a second says nothing."""
-    latest_ns = memory.stamp_ns - RULE_HOLDS_NS
-    return any(one.alarm and one.stamp_ns >= latest_ns for one in memory.rules)
+def alarmed(memory: Memory) -> tuple[bool, ...]:
+    """Return for each side whether an advisory names it."""
+    return tuple(end_ns is not None for end_ns in advisory_ends_ns(memory))
+
+
+def _rule_ends_ns(memory: Memory) -> int | None:
+    """Return when the last rule in alarm ends; that of a source that is silent for a second has ended."""
+    ends_ns = (one.stamp_ns + NEWS_HOLDS_NS for one in memory.rules if one.alarm)
+    return max((end_ns for end_ns in ends_ns if end_ns >= memory.stamp_ns), default=None)
 
 
 def update_entities(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
@@ -347,3 +376,18 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
         domain=measurement.domain,
         last_ns=tuple(sorted(last_ns.items())),
     )
+
+
+def chronicled(before: Memory, carried: Memory, after: Memory, model: FilterModel) -> Memory:
+    """Return the memory after a step with its events, and since when advisories have been out.
+
+    An advisory that had ended in the memory that was carried to the time of the step begins anew.
+    """
+    sides = zip(before.advised_ns, alarmed(carried), alarmed(after), strict=True)
+    advised_ns = tuple(
+        (since_ns if since_ns is not None and held else after.stamp_ns) if named else None
+        for since_ns, held, named in sides
+    )
+    known, now = (published(one.tracks, model.site.settings) for one in (before, after))
+    events = events_between(known, now, after.stamp_ns)
+    return replace(after, advised_ns=advised_ns, events=events)

@@ -141,6 +141,8 @@ class Measurement:
         What the last seconds say of who comes into view, and when; None of a modality that has no such model.
     source : str
         Name of the modality.
+    fault : str or None
+        What is known to be wrong with the sensor, in words; the snapshot says it.
 
     Examples
     --------
@@ -168,3 +170,4 @@ class Measurement:
     # Overlap is discounted within a source and evidence multiplied across sources: two with one name would
     # count as one that repeats itself.
     source: str = "acoustic"
+    fault: str | None = None

@@ -1,12 +1,69 @@
 """Predictive cues: the calibrated, direction-resolved risk of a hidden road user."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
-from worldstate.ground.serialisation import ADDED, Layout, Probability
+from worldstate.ground.serialisation import Layout, Probability
 
 from .context import Priors
+from .sensor import SensorHealth
+
+
+@dataclass(frozen=True, slots=True)
+class Advisory:
+    """An advisory for the side and the entity of its cue; never a control command.
+
+    Parameters
+    ----------
+    since_ns : int
+        Since when it has been out without a break, ns.
+    valid_until_ns : int
+        When it ends without news, ns: a reader must not use it after that.
+    sensors : tuple of SensorHealth
+        Those that it rests on: all that spoke while it can have been raised.
+
+    Examples
+    --------
+    >>> advisory = Advisory(since_ns=0, valid_until_ns=1_000_000_000)
+    >>> advisory.valid_until_ns - advisory.since_ns
+    1000000000
+    """
+
+    since_ns: int
+    valid_until_ns: int
+    sensors: tuple[SensorHealth, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceTerms:
+    r"""What every piece of evidence adds to the log-odds that an alarm goes by.
+
+    .. math:: \log \frac{p}{1 - p} = \sum_j t_j
+
+    Parameters
+    ----------
+    hypothesis : {"coming", "hidden"}
+        Somebody comes into view from this side within three seconds, by the alarm of a sequence model; or
+        somebody is hidden on any side, by the sustained rule.
+    terms_nats : mapping of str to float
+        By what was said: the prior, the sequence or the window, each sensor's look, and what has just
+        come into view; each given those before it, so that they add up.
+    compared_nats : float
+        What is held against the threshold: for a sequence the mean of the log-odds over .3 s.
+    threshold_nats : float
+        Not below it an advisory is raised, by the rule after so many hops.
+
+    Examples
+    --------
+    >>> EvidenceTerms("coming", {"prior": -3.0, "sequence": 4.5}, 1.2, 0.9).terms_nats["sequence"]
+    4.5
+    """
+
+    hypothesis: Literal["coming", "hidden"]
+    terms_nats: Mapping[str, float]
+    compared_nats: float
+    threshold_nats: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +91,9 @@ class RiskCue:
         log Lambda of the last window, nats; None where it is infinite.
     hypotheses : Priors
         Filtered P(hidden), P(visible), P(none).
-    advisory : bool
-        Whether the sustained rule is in alarm and names this direction; with the alarm of a sequence model,
-        whether it is raised for it.
+    advisory : Advisory or None
+        Given where the sustained rule is in alarm and names this direction; with the alarm of a sequence
+        model, where it is raised for it.
     alpha : float or None
         False-positive budget that the rule was calibrated for; None for an uncalibrated policy, and where the
         alarm of a sequence model stands in for the rule, which has a budget of onsets an hour.
@@ -50,16 +107,20 @@ class RiskCue:
     time_to_visible_s : (float, float, float) or None
         Low, best and high; the interval holds nine of ten. None where no advisory names the direction and it
         is likelier than not that nobody comes within five seconds.
+    sector_rad : (float, float) or None
+        Where it is in nine of ten cases: from this azimuth to the left until that one.
+    evidence : EvidenceTerms or None
+        What an advisory is raised by, piece by piece.
 
     Examples
     --------
-    >>> RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, Priors(0.9, 0.05, 0.05), True).advisory
+    >>> RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, Priors(0.9, 0.05, 0.05)).advisory is None
     True
     """
 
     LAYOUT: ClassVar = Layout(
-        order="entity_id direction azimuth_rad azimuth_std_rad risk confidence statistic log_lambda "
-        "hypotheses horizon_s"
+        order="entity_id direction azimuth_rad azimuth_std_rad sector_rad risk confidence statistic "
+        "log_lambda hypotheses horizon_s"
     )
 
     direction: str
@@ -70,10 +131,12 @@ class RiskCue:
     statistic: Probability
     log_lambda: float | None
     hypotheses: Priors
-    advisory: bool
+    advisory: Advisory | None = None
     # None, not 0: a threshold without calibration has no budget, while 0 would promise no false alarms.
     alpha: Probability | None = None
     entity_id: str | None = None
     horizon_s: float | None = None
-    within: Mapping[str, Probability] | None = field(default=None, metadata=ADDED)
-    time_to_visible_s: tuple[float, float, float] | None = field(default=None, metadata=ADDED)
+    within: Mapping[str, Probability] | None = None
+    time_to_visible_s: tuple[float, float, float] | None = None
+    sector_rad: tuple[float, float] | None = None
+    evidence: EvidenceTerms | None = None

@@ -1,9 +1,10 @@
 """Entities: road users of the world-state, seen or hidden."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias
 
-from worldstate.ground.serialisation import ADDED, Layout, Probability
+from worldstate.ground.serialisation import Layout, Probability
 from worldstate.ground.values import Answer
 
 Status: TypeAlias = Literal["hidden", "emerged", "visible"]
@@ -71,7 +72,7 @@ class Entity:
     created_ns, updated_ns : int
         First and last time stamps of the belief, ns.
     classification : tuple of Classification
-        Labels of the signature while hidden, of the detector once seen.
+        Labels of the signature while hidden, of the detector once seen, and "unknown" for the rest.
     moving : bool
         False for an object that vision holds for parked.
     direction : str or None
@@ -99,6 +100,13 @@ class Entity:
         Modalities that contributed.
     last_seen_ns : int or None
         Last sighting; None if never seen.
+    sector_rad : (float, float) or None
+        Where a hidden one is in nine of ten cases: from this azimuth to the left until that one.
+    azimuth_covariance : (float, float, float) or None
+        Variance of the azimuth, its covariance with its rate, variance of the rate; None while only heard.
+    forecast : mapping of str to (float, float), or None
+        Azimuth and its standard deviation in so many seconds ("1", "2") if it goes on as it does; None while
+        only heard: the cue of its side tells when it comes into view.
 
     Examples
     --------
@@ -109,8 +117,8 @@ class Entity:
 
     LAYOUT: ClassVar = Layout(
         order="id status existence_probability hidden_probability classification moving direction "
-        "azimuth_rad azimuth_std_rad azimuth_rate_rad_s range_m position_m velocity_mps inverse_tta_hz "
-        "inverse_tta_std_hz tta_s visibility sources created_ns updated_ns"
+        "azimuth_rad azimuth_std_rad sector_rad azimuth_rate_rad_s range_m position_m velocity_mps "
+        "inverse_tta_hz inverse_tta_std_hz tta_s visibility sources created_ns updated_ns"
     )
 
     id: str
@@ -135,5 +143,8 @@ class Entity:
     visibility: Visibility = Visibility("unqueried")
     sources: tuple[str, ...] = ()
     last_seen_ns: int | None = None
-    covariance: tuple[tuple[float, ...], ...] | None = field(default=None, metadata=ADDED)
-    time_to_visible_s: tuple[float, float, float] | None = field(default=None, metadata=ADDED)
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    time_to_visible_s: tuple[float, float, float] | None = None
+    sector_rad: tuple[float, float] | None = None
+    azimuth_covariance: Vector | None = None
+    forecast: Mapping[str, tuple[float, float]] | None = None

@@ -15,7 +15,7 @@ from .polar import AZIMUTH, LOG_RANGE, RADIAL_RATE, jacobian, process_noise, pro
 
 # Range only scales the angular noise of an acceleration, and bearings from a standing ego do not measure it:
 # outside these limits the noise would vanish or throw the bearing.
-_NEAREST_M, _FARTHEST_M = 3.0, 200.0
+NEAREST_M, FARTHEST_M = 3.0, 200.0
 # Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
 # array.
 _CLOSEST_SHARE = 0.5
@@ -79,7 +79,7 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: float) -> Mot
         start[RADIAL_RATE] = max(start[RADIAL_RATE], -_CLOSEST_SHARE / step_s)
     # Clipped before exp: approach rates that contradict each other drive log r, which nobody measures, so far
     # that exp overflows.
-    log_range = min(max(float(belief.mean[LOG_RANGE]), math.log(_NEAREST_M)), math.log(_FARTHEST_M))
+    log_range = min(max(float(belief.mean[LOG_RANGE]), math.log(NEAREST_M)), math.log(FARTHEST_M))
     flow = jacobian(start, step_s)
     covariance = flow @ belief.covariance @ flow.T + process_noise(
         acceleration_psd, math.exp(log_range), step_s

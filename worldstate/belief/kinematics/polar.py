@@ -27,7 +27,7 @@ from worldstate.ground.typing import FloatArray
 AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(4)
 
 # q = 0 is a vehicle at the array itself, where the coordinates are singular; 1e-3 is 3 % of the first range.
-_LEAST_Q = 1e-3
+LEAST_Q = 1e-3
 
 
 def propagate(state: FloatArray, step_s: float) -> FloatArray:
@@ -37,7 +37,7 @@ def propagate(state: FloatArray, step_s: float) -> FloatArray:
     """
     theta, omega, rho, log_range = state.tolist()
     a, b = 1.0 + rho * step_s, omega * step_s
-    q = max(a * a + b * b, _LEAST_Q)
+    q = max(a * a + b * b, LEAST_Q)
     return np.array(
         [theta + math.atan2(b, a), omega / q, (a * rho + b * omega) / q, log_range + 0.5 * math.log(q)]
     )
@@ -51,7 +51,7 @@ def jacobian(state: FloatArray, step_s: float) -> FloatArray:
     _, omega, rho, _ = state.tolist()
     t = step_s
     a, b = 1.0 + rho * t, omega * t
-    q = max(a * a + b * b, _LEAST_Q)
+    q = max(a * a + b * b, LEAST_Q)
     radial = a * rho + b * omega
     u, v = a / q, b / q
     return np.array(

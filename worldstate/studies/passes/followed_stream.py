@@ -43,7 +43,7 @@ def followed(world: WorldFilter, measurements: Iterable[Measurement]) -> Followe
     nothing, never = [np.nan] * len(HORIZONS_S), [np.nan] * 3
     return FollowedStream(
         time_s=np.array([state.stamp_ns for state in states]) * 1e-9,
-        advisory=np.array([[cue.advisory for cue in hop] for hop in cues]),
+        advisory=np.array([[cue.advisory is not None for cue in hop] for hop in cues]),
         within=np.array([[list((cue.within or {}).values()) or nothing for cue in hop] for hop in cues]),
         time_to_visible_s=np.array([[cue.time_to_visible_s or never for cue in hop] for hop in cues]),
         entities=tuple(state.entities for state in states),

@@ -1,0 +1,222 @@
+"""What a snapshot says beyond its entities: advisories in time, evidence, sensors, events, forecasts."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.signature.domain_guard import Foreign
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.ground.values import NotUsable
+from worldstate.measurement import Look
+from worldstate.state import Event, Priors
+
+SEEDS = st.integers(0, 2**32 - 1)
+SILENT, UNASKED = NotUsable("not scripted"), Unqueried("no camera")
+SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
+SOON = [name.startswith("coming") and float(name[7:-1]) <= 3.0 for name in GROUPS]
+
+
+def script(rng: np.random.Generator, hops: int, sequence: bool) -> list[Measurement]:
+    """Return sound that wavers about its threshold, looks and boxes now and then, and gaps of two seconds."""
+    measured, stamp_ns = [], 0
+    for _ in range(hops):
+        stamp_ns += 10**8 if rng.random() < 0.9 else 2 * 10**9
+        levels = rng.normal(0.0, 2.0, 4).tolist()
+        heard = SignatureEvidence(("left", "right"), (levels[0] + 2.0, levels[1]), levels[2], levels[3])
+        groups = rng.dirichlet(np.full(len(GROUPS), 0.2), 2)
+        said = SequenceReading(groups, SHARE, 0.0, SequenceAlarm(-0.5, 20.0)) if sequence else None
+        answer: CoEvidence = (UNASKED, Absent(0.1, 0.01), Present(0.1, 0.01))[int(rng.integers(0, 3))]
+        look = None if isinstance(answer, Unqueried) else Look("camera", stamp_ns, answer)
+        azimuths = rng.uniform(-0.55, 0.55, 2) if isinstance(answer, Present) else ()
+        boxes = tuple(Sighting(float(azimuth), 0.02, "car", 0.9) for azimuth in azimuths)
+        measured.append(Measurement(stamp_ns, heard, answer, SILENT, SILENT, boxes, look=look, sequence=said))
+    return measured
+
+
+def run(measured: list[Measurement], world: WorldFilter | None = None) -> list[WorldFilter]:
+    world = world or WorldFilter()
+    return [world := world.update(one) for one in measured]
+
+
+@given(SEEDS, st.booleans())
+@settings(max_examples=3)
+def test_an_advisory_says_since_when_and_ends_when_it_says(seed: int, sequence: bool) -> None:
+    worlds = run(script(np.random.default_rng(seed), 20, sequence))
+    since: dict[str, int] = {}
+    for before, world in zip([None, *worlds], worlds, strict=False):
+        for cue in world.state.cues:
+            told = cue.advisory
+            ended = before is None or not _named(before.predict_to(world.stamp_ns).state, cue.direction)
+            if told is None:
+                since.pop(cue.direction, None)
+                continue
+            begun = since.get(cue.direction) if not ended else None
+            since[cue.direction] = world.stamp_ns if begun is None else begun
+            assert told.since_ns == since[cue.direction] <= world.stamp_ns <= told.valid_until_ns
+            assert told.valid_until_ns - world.stamp_ns <= 1.005e9
+            assert {one.sensor for one in told.sensors} <= {one.sensor for one in world.state.sensors}
+            if sequence:  # Nothing but time ends that of a sequence; the rule names the likelier side
+                assert _named(world.predict_to(told.valid_until_ns).state, cue.direction)
+            assert not _named(world.predict_to(told.valid_until_ns + 1).state, cue.direction)
+    assert since or not any(cue.advisory for cue in worlds[-1].state.cues)
+
+
+def _named(state: WorldState, side: str) -> bool:
+    return any(cue.advisory is not None for cue in state.cues if cue.direction == side)
+
+
+@given(SEEDS, st.floats(0.01, 0.9))
+@settings(max_examples=3)
+def test_what_evidence_adds_to_a_sequence_adds_up_to_what_is_believed(seed: int, hidden: float) -> None:
+    context = Context(priors=Priors(hidden, 0.0, 1.0 - hidden))
+    for world in run(script(np.random.default_rng(seed), 20, sequence=True), WorldFilter(context)):
+        memory = world.memory
+        assert memory is not None and memory.sequence is not None
+        for k, cue in enumerate(world.state.cues):
+            soon = memory.sequence.posterior.groups[0, k][SOON].sum()
+            assert cue.evidence is not None and cue.evidence.hypothesis == "coming"
+            terms = cue.evidence.terms_nats
+            assert sum(terms.values()) == pytest.approx(math.log(soon / (1.0 - soon)), abs=1e-9)
+            assert list(terms)[:2] == ["prior", "sequence"] and terms["emerged"] <= 0.0
+            assert cue.within is not None and cue.within["3"] == pytest.approx(soon)
+
+
+def test_a_look_that_finds_somebody_weighs_against_whoever_comes() -> None:
+    said = script(np.random.default_rng(0), 1, sequence=True)[0]
+    terms = {}
+    for answer in (Absent(0.1, 0.01), Present(0.1, 0.01)):
+        hop = replace(said, co_evidence=answer, look=Look("camera", said.stamp_ns, answer), sightings=())
+        evidence = run([hop])[0].state.cues[0].evidence
+        assert evidence is not None
+        terms[type(answer)] = evidence.terms_nats
+    assert terms[Absent]["look camera"] > 0.0 > terms[Present]["look camera"]
+    assert terms[Absent]["sequence"] == terms[Present]["sequence"]
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_what_evidence_adds_to_the_rule_adds_up_to_the_statistic(seed: int) -> None:
+    for world in run(script(np.random.default_rng(seed), 20, sequence=False)):
+        for cue in world.state.cues:
+            odds = math.log(cue.statistic / (1.0 - cue.statistic))
+            assert cue.evidence is not None and cue.evidence.hypothesis == "hidden"
+            assert sum(cue.evidence.terms_nats.values()) == pytest.approx(odds, abs=1e-9)
+            assert cue.evidence.compared_nats == pytest.approx(odds, abs=1e-9)
+            assert cue.evidence.threshold_nats == pytest.approx(math.log(9.0))  # gamma .9
+            assert (cue.evidence.terms_nats["look"] == 0.0) == isinstance(_last(world), Unqueried)
+
+
+def _last(world: WorldFilter) -> CoEvidence:
+    assert world.lag is not None
+    return world.lag.arrivals[-1].measurement.co_evidence
+
+
+def test_sensors_are_working_impaired_or_silent() -> None:
+    flat = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    dark = Look("camera", 9 * 10**8, Absent(0.83, 0.01))
+    hop = Measurement(
+        10**9, flat, dark.answer, SILENT, SILENT, look=dark, domain=Foreign("sounds like speech", 2.0)
+    )
+    radio = Measurement(11 * 10**8, flat, UNASKED, SILENT, SILENT, source="v2x", fault="antenna fault")
+    world = WorldFilter().update(hop).update(radio)
+    told = {one.sensor: (one.condition, one.stamp_ns, one.reason) for one in world.state.sensors}
+    assert told == {
+        "acoustic": ("impaired", 10**9, "sounds like speech"),
+        "camera": ("impaired", 9 * 10**8, "misses 83% of what is in view"),
+        "v2x": ("impaired", 11 * 10**8, "antenna fault"),
+    }
+    (view,) = world.state.searched
+    assert (view.sensor, view.stamp_ns, view.found, view.miss_rate) == ("camera", 9 * 10**8, False, 0.83)
+    later = world.update(replace(radio, stamp_ns=2 * 10**9, fault=None)).state
+    assert [one.condition for one in later.sensors] == [
+        "working" if s == "v2x" else c
+        for s, c in (("acoustic", "impaired"), ("camera", "silent"), ("v2x", "working"))
+    ]
+    assert later.valid_until_ns == 3 * 10**9
+    assert WorldFilter().state.valid_until_ns is None
+
+
+@given(SEEDS, st.booleans())
+@settings(max_examples=4)
+def test_events_account_for_every_entity(seed: int, sequence: bool) -> None:
+    alive: dict[str, str] = {}
+    kinds = set()
+    for world in run(script(np.random.default_rng(seed), 40, sequence)):
+        for event in world.state.events:
+            kinds.add(event.kind)
+            assert event.stamp_ns == world.stamp_ns
+            assert (event.kind == "born") == (event.entity_id not in alive)
+            if event.kind == "handed_over":
+                assert alive[event.entity_id] != "visible"
+            alive[event.entity_id] = event.kind
+            if event.kind == "died":
+                del alive[event.entity_id]
+        now = {one.id: one.status for one in world.state.entities}
+        assert set(now) == set(alive)
+        for name, status in now.items():
+            seen_now = alive[name] == "handed_over"
+            assert not seen_now or status == "visible"
+            alive[name] = status
+    assert {"born", "handed_over", "coasting", "died"} <= kinds
+
+
+def test_a_pass_is_born_handed_over_coasts_and_dies() -> None:
+    loud, quiet = (SignatureEvidence(("left", "right"), (one, -1.0), -1.0, -one) for one in (4.0, -4.0))
+    told: list[Event] = []
+    world = WorldFilter()
+    for hop in range(1, 120):
+        seen = (Sighting(0.55 - 0.05 * (hop - 20), 0.02, "car", 0.9),) if 20 <= hop < 30 else ()
+        answer = Present(0.04) if seen else Absent(0.04)
+        heard = loud if hop < 20 else quiet
+        world = world.update(Measurement(hop * 10**8, heard, answer, SILENT, SILENT, seen))
+        told += world.state.events
+    assert [one.kind for one in told] == ["born", "handed_over", "coasting", "died"]
+    assert len({one.entity_id for one in told}) == 1
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_the_forecast_is_that_of_straight_lines(seed: int) -> None:
+    """Oracle: places and velocities drawn from the belief, each moved on its line and shaken."""
+    rng = np.random.default_rng(seed)
+    flat = SignatureEvidence(("left", "right"), (-3.0, -3.0), 0.0, 0.0)
+    box = Sighting(0.1, 0.02, "car", 0.9)
+    world = WorldFilter().update(Measurement(10**8, flat, Present(0.04), SILENT, SILENT, (box,)))
+    assert world.memory is not None
+    mean = rng.uniform((-0.5, -0.3, -0.3, math.log(15.0)), (0.5, 0.3, 0.1, math.log(40.0)))
+    motion = MotionBelief.around(tuple(mean), (0.03, 0.04, 0.04, 0.01))
+    track = replace(world.memory.tracks[0], motion=motion)
+    (entity,) = replace(world, memory=replace(world.memory, tracks=(track,))).state.entities
+    assert entity.forecast is not None and entity.azimuth_covariance == pytest.approx((9e-4, 0.0, 1.6e-3))
+    theta, omega, rho, log_r = rng.multivariate_normal(motion.mean, motion.covariance, 20_000).T
+    place, rate = np.exp(log_r + 1j * theta), rho + 1j * omega
+    for after_s, (azimuth_rad, std_rad) in entity.forecast.items():
+        t = float(after_s)
+        shaken = rng.normal(0.0, math.sqrt(2.0 * t**3 / 3.0), (2, len(place)))
+        moved = np.angle((place * (1.0 + rate * t) + shaken[0] + 1j * shaken[1]) * np.exp(-1j * azimuth_rad))
+        assert np.median(moved) == pytest.approx(0.0, abs=0.1 * std_rad)
+        spread = 0.5 * np.diff(np.quantile(moved, [0.159, 0.841]))[0]
+        assert std_rad == pytest.approx(spread, rel=0.1)
+
+
+@given(SEEDS)
+@settings(max_examples=3)
+def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
+    for world in run(script(np.random.default_rng(seed), 30, sequence=True)):
+        for one in world.state.entities:
+            assert math.fsum(kind.probability for kind in one.classification) == pytest.approx(1.0, abs=1e-6)
+            hidden = one.status == "hidden"
+            assert (one.sector_rad is not None) == hidden == (one.forecast is None)
+        for cue in world.state.cues:
+            right, left = cue.sector_rad
+            assert right < cue.azimuth_rad < left
+            assert left - right == pytest.approx(3.29 * cue.azimuth_std_rad, abs=1e-5)

@@ -1,0 +1,126 @@
+"""Build the cues of a snapshot: risk, times, advisories, and what these are raised by."""
+
+import math
+from functools import partial
+
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.belief.birth_death import hidden_on
+from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
+
+from .memory import Memory, priors_of
+from .sequence_memory import SequenceMemory
+from .snapshot_builder import hidden_azimuth, sector, time_to_arrival
+from .step import FilterModel, advisory_ends_ns
+
+# Certainty has no end; e^-20 is once in fifteen years of hops.
+_MOST_NATS = 20.0
+_Times = tuple[dict[str, float], tuple[float, float, float] | None]
+
+
+def cues_of(
+    memory: Memory, model: FilterModel, hazard_risk: float, sensors: tuple[SensorHealth, ...]
+) -> tuple[RiskCue, ...]:
+    """Return one risk cue per side, none before the first measurement."""
+    if memory.instant is None:
+        return ()
+    ends_ns = advisory_ends_ns(memory)
+    rested_on = tuple(one for one in sensors if one.condition != "silent")
+    advisories = [
+        None
+        if end_ns is None
+        else Advisory(memory.stamp_ns if since_ns is None else since_ns, end_ns, rested_on)
+        for since_ns, end_ns in zip(memory.advised_ns, ends_ns, strict=True)
+    ]
+    times = _times(memory.sequence, advisories)
+    evidence = _evidence(memory, model)
+    build = partial(_cue, memory, model, hazard_risk)
+    return tuple(map(build, range(len(ends_ns)), advisories, times, evidence))
+
+
+def _cue(
+    memory: Memory,
+    model: FilterModel,
+    hazard_risk: float,
+    k: int,
+    advisory: Advisory | None,
+    times: _Times | None,
+    evidence: EvidenceTerms,
+) -> RiskCue:
+    explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
+    assert instant is not None
+    track = hidden_on(memory.tracks, k)
+    motion, settings = model.site.prior(k) if track is None else track.motion, model.site.settings
+    azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
+    if track is None or track.place is None:
+        azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, side.edge_azimuth_rad, settings)
+    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
+    share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
+    within, interval_s = (None, None) if times is None else times
+    arrival_s = None if track is None else time_to_arrival(track)
+    return RiskCue(
+        direction=side.label,
+        azimuth_rad=azimuth_rad,
+        azimuth_std_rad=std_rad,
+        risk=hazard_risk * share,
+        confidence=share,
+        statistic=min(instant.hidden_total, 1.0),
+        log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
+        hypotheses=priors_of(explanation),
+        advisory=advisory,
+        alpha=None if evidence.hypothesis == "coming" else model.policy.alpha or None,
+        entity_id=None if track is None else track.id,
+        horizon_s=arrival_s if interval_s is None else interval_s[1],
+        within=within,
+        time_to_visible_s=interval_s,
+        sector_rad=sector(azimuth_rad, std_rad),
+        evidence=evidence,
+    )
+
+
+def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> list[_Times | None]:
+    """Return the probabilities of coming into view, and the time to it where somebody is expected."""
+    if kept is None:
+        return [None] * len(advisories)
+    posterior = kept.posterior
+    # A sum of probabilities may exceed one by rounding, which readers of a snapshot refuse.
+    within = np.minimum(posterior.within()[0], 1.0).tolist()
+    soon = posterior.groups[0, :, : COMING_S.index(LONGEST_S) + 1].sum(axis=1) > 0.5
+    # The times are those of whoever comes: of a street where nobody does they would say nothing.
+    stated = [told is not None or likely for told, likely in zip(advisories, soon.tolist(), strict=True)]
+    intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within
+    names = [f"{end_s:g}" for end_s in HORIZONS_S]
+    return [
+        (dict(zip(names, chances, strict=True)), (row[0], row[1], row[2]) if told else None)
+        for chances, row, told in zip(within, intervals_s, stated, strict=True)
+    ]
+
+
+def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
+    """Return for each side what its alarm goes by: that of a sequence, or the rule of all sides together."""
+    kept, instant = memory.sequence, memory.instant
+    assert instant is not None
+    if kept is not None and kept.alarm is not None:
+        terms, means = kept.log_odds_terms(model.context), kept.mean_log_odds.tolist()
+        threshold = kept.alarm.threshold_nats
+        return [
+            EvidenceTerms("coming", {name: both[k] for name, both in terms.items()}, means[k], threshold)
+            for k in range(len(means))
+        ]
+    prior = _log_odds(sum(model.policy.reference_prior[:-2]))
+    heard, looked = _bounded(memory.heard_nats), _bounded(instant.log_lambda)
+    terms_nats = {"prior": prior, "window": heard, "look": looked - heard}
+    threshold = _log_odds(model.policy.gamma_at(memory.threshold.shift_nats))
+    told = EvidenceTerms("hidden", terms_nats, prior + looked, threshold)
+    return [told] * len(model.site.sides)
+
+
+def _log_odds(probability: float) -> float:
+    least = math.exp(-_MOST_NATS)
+    inside = min(max(probability, least), 1.0 - least)
+    return math.log(inside) - math.log1p(-inside)
+
+
+def _bounded(nats: float) -> float:
+    return min(max(nats, -_MOST_NATS), _MOST_NATS)
