@@ -7,7 +7,7 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test slow lint docs matrix dist clean
+.PHONY: demo test slow lint schema docs matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -34,6 +34,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p worldstate
 	$(BIN)/lint-imports
+
+# After a change of the snapshot's types.
+schema: $(VENV)/.core
+	$(BIN)/python -c 'import json; from worldstate.state import snapshot_schema as s; print(json.dumps(s(), indent=1))' > worldstate/data/snapshot.schema.json
 
 # Warnings are errors, and a page that would load something from the network is one too.
 $(VENV)/.docs: $(VENV)/bin/python pyproject.toml

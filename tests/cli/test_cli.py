@@ -5,11 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import soundfile
 
 from worldstate.cli.main import COMMANDS, build_parser, main
+from worldstate.state import snapshot_schema
 
 
 def help_of(command: str, capsys) -> str:
@@ -76,6 +78,8 @@ def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
     assert len(snapshots) == summary["hops"]
     stamps = [snapshot["stamp_ns"] for snapshot in snapshots]
     assert np.allclose(np.diff(stamps), 1e8, atol=3e4)
+    validator = jsonschema.Draft202012Validator(snapshot_schema())
+    assert [error.message for one in snapshots for error in validator.iter_errors(one)] == []
     assert (tmp_path / "t.png").read_bytes()[:4] == b"\x89PNG"
 
 

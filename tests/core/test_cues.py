@@ -16,7 +16,7 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.values import NotUsable
-from worldstate.measurement import Look
+from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector
 from worldstate.state import Event, Priors
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -143,6 +143,22 @@ def test_sensors_are_working_impaired_or_silent() -> None:
     ]
     assert later.valid_until_ns == 3 * 10**9
     assert WorldFilter().state.valid_until_ns is None
+
+
+def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
+    sector = SearchedSector(Sector(0.2, 0.5), range_m=70.0, detection_probability=0.9)
+    car = Position((12.0, 3.0), ((0.2, 0.0), (0.0, 0.4)))
+    world = WorldFilter().update(PositionScan("radar", 10**9, (), sector))
+    world = world.update(PositionScan("v2x", 10**9 + 1, (car,)))
+    (view,) = world.state.searched
+    assert (view.sensor, view.found) == ("radar", False)
+    assert (view.miss_rate, *view.sector_rad) == pytest.approx((0.1, -0.3, 0.7))
+    assert [(one.sensor, one.condition) for one in world.state.sensors] == [
+        ("radar", "working"),
+        ("v2x", "working"),
+    ]
+    assert world.state.valid_until_ns == 2 * 10**9 + 1
+    assert [event.kind for event in world.state.events] == ["born"]
 
 
 @given(SEEDS, st.booleans())

@@ -4,7 +4,9 @@ import copy
 import json
 import math
 from dataclasses import replace
+from importlib.resources import files
 
+import jsonschema
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,8 +29,11 @@ from worldstate.state import (
     SensorHealth,
     Visibility,
     WorldState,
+    snapshot_schema,
 )
 
+SCHEMA = json.loads(files("worldstate").joinpath("data/snapshot.schema.json").read_text(encoding="utf-8"))
+VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 unit = st.floats(0.0, 1.0)
 number = st.floats(allow_nan=False, allow_infinity=False, width=64)
 azimuth = st.floats(-math.pi, math.pi)
@@ -146,6 +151,17 @@ def test_what_is_written_is_read_back(state):
     assert WorldState.from_dict(state.to_dict()) == state
 
 
+@given(states)
+@settings(max_examples=20)
+def test_what_is_written_holds_to_the_schema_that_ships(state):
+    VALIDATOR.validate(json.loads(state.to_json()))
+
+
+def test_the_schema_that_ships_is_that_of_the_types():
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    assert snapshot_schema() == SCHEMA, "make schema"
+
+
 @given(states, st.randoms())
 def test_order_carries_no_meaning(state, random):
     parts = {key: list(getattr(state, key)) for key in ("entities", "relations", "cues")}
@@ -220,8 +236,11 @@ def test_damage_is_accepted_or_refused_by_a_typed_error(data):
     ],
 )
 def test_damage_is_named(path, new, words):
+    damaged = replaced(full_state().to_dict(), path, new)
     with pytest.raises(InvalidArgumentError, match=words):
-        WorldState.from_dict(replaced(full_state().to_dict(), path, new))
+        WorldState.from_dict(damaged)
+    # What only the constructor of a context knows stands in no type.
+    assert VALIDATOR.is_valid(damaged) == (path[0] == "context")
 
 
 @pytest.mark.parametrize("cut", [1, 40, 400, -1])
@@ -241,6 +260,7 @@ def test_unknown_keys_are_ignored_and_minor_versions_read():
     value |= {"mood": "fine", "schema": {"name": "worldstate.Snapshot", "version": "2.9.3"}}
     value["entities"][0]["colour"] = "red"
     assert WorldState.from_dict(value) == full_state()
+    VALIDATOR.validate(value)
 
 
 @pytest.mark.parametrize(
@@ -251,6 +271,7 @@ def test_another_major_version_is_refused_with_what_to_do(version, advice):
     value = full_state().to_dict() | {"schema": {"name": "worldstate.Snapshot", "version": version}}
     with pytest.raises(SchemaVersionError, match=rf"expected schema worldstate\.Snapshot 2\.x.*{advice}"):
         WorldState.from_dict(value)
+    assert not VALIDATOR.is_valid(value)
 
 
 def test_json_never_says_nan():

@@ -83,6 +83,7 @@ class Check:
 
     expected: str
     holds: Callable[[Any], object]
+    schema: Mapping[str, object] = field(default_factory=dict)  # The same in the words of JSON Schema
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,8 +117,9 @@ class Via:
     read: Read
 
 
-Probability: TypeAlias = Annotated[float, Check("a number in [0, 1]", lambda value: 0.0 <= value <= 1.0)]
-Count: TypeAlias = Annotated[int, Check("a count", lambda value: value >= 0)]
+_WITHIN_ONE = Check("a number in [0, 1]", lambda value: 0.0 <= value <= 1.0, {"minimum": 0, "maximum": 1})
+Probability: TypeAlias = Annotated[float, _WITHIN_ONE]
+Count: TypeAlias = Annotated[int, Check("a count", lambda value: value >= 0, {"minimum": 0})]
 
 # Metadata of a field: files of an earlier minor version do not hold it, and then its default stands.
 ADDED = {"added": True}

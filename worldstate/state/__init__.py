@@ -6,7 +6,7 @@ from .entity import Classification, Entity, Visibility
 from .event import Event
 from .relation import Relation
 from .sensor import SearchedView, SensorHealth
-from .world_state import Delivery, WorldState
+from .world_state import Delivery, WorldState, snapshot_schema
 
 __all__ = [
     "Advisory",
@@ -26,4 +26,5 @@ __all__ = [
     "Visibility",
     "WorldState",
     "blind_corner",
+    "snapshot_schema",
 ]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.json_schema import Schema, json_schema
 from worldstate.ground.serialisation import Count, Layout, decode, decode_json, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
@@ -178,3 +179,20 @@ class WorldState:
     def from_json(cls, text: str) -> "WorldState":
         """Return the snapshot that `to_json` wrote; errors are those of `from_dict`."""
         return cls.from_dict(decode_json(text, "snapshot"))
+
+
+def snapshot_schema() -> Schema:
+    """Return the JSON Schema (draft 2020-12) of a snapshot, which ships as ``data/snapshot.schema.json``.
+
+    Returns
+    -------
+    dict
+        For any validator; unknown keys are allowed.
+
+    Examples
+    --------
+    >>> schema = snapshot_schema()
+    >>> sorted(schema["$defs"])[:3], schema["properties"]["stamp_ns"]["type"]
+    (['Advisory', 'Bearing', 'Classification'], 'integer')
+    """
+    return json_schema(WorldState)
