@@ -16,6 +16,7 @@ from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.belief.hidden_bearing import hidden_bearing
+from worldstate.belief.site_geometry import SideGeometry
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_labels import stream_truth
 from worldstate.operations.recordings.hop_table import HopTable
@@ -116,9 +117,10 @@ def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:
 @settings(max_examples=10)
 def test_a_hidden_bearing_lies_behind_the_edge_and_is_mirrored(seed: int, edge_rad: float) -> None:
     coming = np.random.default_rng(seed).dirichlet(np.ones(len(COMING_S)))
-    (left, std), (right, same) = (hidden_bearing(coming, side * edge_rad) for side in (1.0, -1.0))
+    sides = [SideGeometry("left", s * edge_rad, s * 1.2, 0.35) for s in (1.0, -1.0)]
+    (left, std), (right, same) = (hidden_bearing(coming, side) for side in sides)
     assert (left, std) == pytest.approx((-right, same))
     assert edge_rad - 1e-9 <= left <= math.radians(80.0) and 0.0 < std < 0.6
     nearer = coming.copy()
     nearer[0], nearer[1:] = 0.9, 0.1 * coming[1:] / coming[1:].sum()
-    assert coming[0] > 0.9 or hidden_bearing(nearer, edge_rad)[0] <= left + 1e-9
+    assert coming[0] > 0.9 or hidden_bearing(nearer, sides[0])[0] <= left + 1e-9

@@ -13,9 +13,8 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S
 
-from .hidden_bearing import EDGE_STD_RAD
 from .kinematics.cartesian import CartesianBelief
-from .site_geometry import SiteGeometry
+from .site_geometry import SideGeometry, SiteGeometry
 from .track import Track
 
 # Slower towards the line of sight than so many standard deviations, and it may never cross it.
@@ -25,16 +24,17 @@ _UNKNOWN_SPEED_STD = 3.0
 
 
 def time_to_visible(
-    place: CartesianBelief, edge_rad: float, ego_speed_mps: float
+    place: CartesianBelief, side: SideGeometry, ego_speed_mps: float
 ) -> tuple[float, float] | None:
     """Return mean and standard deviation of the time until an entity passes an edge, s; None if it may not.
 
     Examples
     --------
     >>> coming = CartesianBelief(np.array([10.0, 20.0, 0.0, -8.0]), np.diag([0.2, 0.2, 0.1, 0.1]))
-    >>> [round(value, 1) for value in time_to_visible(coming, math.radians(32.0), 0.0)]
+    >>> [round(value, 1) for value in time_to_visible(coming, SideGeometry("left", 0.56, 0.96, 0.35), 0.0)]
     [1.7, 0.2]
     """
+    edge_rad = side.edge_azimuth_rad
     along = np.array([math.cos(edge_rad), math.sin(edge_rad)])
     normal = np.array([-along[1], along[0]])
     position, velocity = place.mean[:2], place.mean[2:] - np.array([ego_speed_mps, 0.0])
@@ -46,7 +46,7 @@ def time_to_visible(
     if time_s <= 0.0 or crossing_m <= 0.0:
         return None
     slope = np.concatenate([normal, time_s * normal])
-    variance = float(slope @ place.covariance @ slope) + (crossing_m * EDGE_STD_RAD) ** 2
+    variance = float(slope @ place.covariance @ slope) + (crossing_m * side.edge_std_rad) ** 2
     return time_s, math.sqrt(variance) / abs(rate)
 
 
@@ -63,5 +63,5 @@ def _comes(track: Track, place: CartesianBelief, site: SiteGeometry) -> bool:
     """Tell whether an entity may come into view within the times that a sequence model speaks of."""
     if place.velocity_std_mps > _UNKNOWN_SPEED_STD:
         return True
-    expected = time_to_visible(place, site.sides[track.side].edge_azimuth_rad, site.ego_speed_mps)
+    expected = time_to_visible(place, site.sides[track.side], site.ego_speed_mps)
     return track.moving and expected is not None and expected[0] <= COMING_S[-1]

@@ -16,20 +16,20 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.ground.typing import FloatArray
 
-# Of v / d, 1/s: real vehicles of OVAD pass T0 at 4 to 5 m/s, some 9 m ahead; within a factor of 1.2 (three
-# points of a lognormal distribution with the weights of Gauss and Hermite).
+from .site_geometry import SideGeometry
+
+# What is not known of v / d: within a factor of 1.2 (three points of a lognormal distribution with the
+# weights of Gauss and Hermite).
 _SPREAD = 0.2
-_PACES_HZ = 0.5 * np.exp(_SPREAD * math.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]))
+_PACES = np.exp(_SPREAD * math.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]))
 _PACE_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
-# v t / d in the middle of every group, shape (groups, paces).
-_PASSED = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None] * _PACES_HZ
-# Of the edge: corners of OVAD's junctions stand at 32 degrees, give or take this, from where the ego stops.
-EDGE_STD_RAD = math.radians(5.0)
+# v t / d in the middle of every group where v / d is 1/s, shape (groups, paces).
+_PASSED = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None] * _PACES
 # Beyond, the street ahead ends or bends.
 _FARTHEST_RAD = math.radians(80.0)
 
 
-def hidden_bearing(coming: FloatArray, edge_rad: float) -> tuple[float, float]:
+def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float]:
     """Return mean and standard deviation of the azimuth, radians, of who comes with these probabilities.
 
     Shapes: coming (9,), of the groups of `COMING_S`.
@@ -38,14 +38,15 @@ def hidden_bearing(coming: FloatArray, edge_rad: float) -> tuple[float, float]:
     --------
     >>> near, far = np.zeros((2, 9))
     >>> near[0] = far[5] = 1.0
-    >>> [round(math.degrees(value)) for value in (*hidden_bearing(near, 0.56), *hidden_bearing(far, 0.56))]
+    >>> side = SideGeometry("left", 0.56, 0.96, 0.35)
+    >>> [round(math.degrees(value)) for value in (*hidden_bearing(near, side), *hidden_bearing(far, side))]
     [37, 5, 63, 6]
     """
-    sign = math.copysign(1.0, edge_rad)
-    slope = math.tan(min(abs(edge_rad), _FARTHEST_RAD)) + _PASSED
+    sign, edge_rad = math.copysign(1.0, side.edge_azimuth_rad), abs(side.edge_azimuth_rad)
+    slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * _PASSED
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
     weight = coming[:, None] * _PACE_WEIGHTS
     weight = weight / weight.sum()
     mean = float((weight * azimuth).sum())
-    variance = float((weight * (azimuth - mean) ** 2).sum()) + EDGE_STD_RAD**2
+    variance = float((weight * (azimuth - mean) ** 2).sum()) + side.edge_std_rad**2
     return sign * mean, math.sqrt(variance)

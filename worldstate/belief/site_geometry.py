@@ -26,6 +26,8 @@ class SideGeometry:
     edge_azimuth_rad: float  # Edge of the occluder
     azimuth_rad: float  # Where vehicles are while it hides them
     std_rad: float
+    edge_std_rad: float = math.radians(5.0)
+    pace_hz: float = 0.5  # Speed over the distance of the crossing lane
 
     def behind(self, azimuth_rad: float, std_rad: float) -> float:
         """Return the probability that what stands at an azimuth is behind this side's occluder."""

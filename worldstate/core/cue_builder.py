@@ -51,10 +51,10 @@ def _cue(
     explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
     assert instant is not None
     track = hidden_on(memory.tracks, k)
-    motion, settings = model.site.prior(k) if track is None else track.motion, model.site.settings
+    motion = model.site.prior(k) if track is None else track.motion
     azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
     if track is None or track.place is None:
-        azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, side.edge_azimuth_rad, settings)
+        azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, model.site)
     # The floor only matters where P(hidden) has underflowed; then no direction has a share.
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     within, interval_s = (None, None) if times is None else times

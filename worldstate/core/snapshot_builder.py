@@ -15,7 +15,7 @@ from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
-from worldstate.belief.settings import FilterSettings
+from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track
 from worldstate.ground.values import seconds
 from worldstate.state import (
@@ -57,7 +57,7 @@ class _Moments(NamedTuple):
 
 
 def entities_of(
-    tracks: tuple[Track, ...], memory: Memory, context: Context, settings: FilterSettings
+    tracks: tuple[Track, ...], memory: Memory, context: Context, site: SiteGeometry
 ) -> tuple[Entity, ...]:
     """Return some tracks as published entities."""
     if not tracks:
@@ -67,8 +67,8 @@ def entities_of(
     covariances = np.array([track.motion.covariance for track in tracks])
     stds = np.sqrt(covariances.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (means, stds, covariances[:, *_UPPER]))
-    moments = map(_Moments, *lists, forecasts(tracks, means, covariances, settings))
-    build = partial(_entity, memory, memory.sides, context, settings)
+    moments = map(_Moments, *lists, forecasts(tracks, means, covariances, site.settings))
+    build = partial(_entity, memory, memory.sides, context, site)
     return tuple(map(build, tracks, moments))
 
 
@@ -76,7 +76,7 @@ def _entity(
     memory: Memory,
     sides: HiddenBelief,
     context: Context,
-    settings: FilterSettings,
+    site: SiteGeometry,
     track: Track,
     moments: _Moments,
 ) -> Entity:
@@ -87,8 +87,7 @@ def _entity(
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     azimuth_rad, std_rad = mean[AZIMUTH], std[AZIMUTH]
     if heard_only:
-        edge_rad = context.occluders[track.side].edge_azimuth_rad
-        azimuth_rad, std_rad = hidden_azimuth(track.side, track.motion, memory.sequence, edge_rad, settings)
+        azimuth_rad, std_rad = hidden_azimuth(track.side, track.motion, memory.sequence, site)
     return Entity(
         id=track.id,
         status="hidden" if hidden else "visible" if track.seen else "emerged",
@@ -101,7 +100,7 @@ def _entity(
         azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else mean[AZIMUTH_RATE],
         range_m=range_m,
-        **_place(track, range_m, hidden, context),
+        **_place(track, range_m, hidden, site),
         inverse_tta_hz=-mean[RADIAL_RATE] if track.approach_heard else None,
         inverse_tta_std_hz=std[RADIAL_RATE] if track.approach_heard else None,
         tta_s=time_to_arrival(track),
@@ -150,14 +149,14 @@ def time_to_arrival(track: Track) -> float | None:
 
 
 def hidden_azimuth(
-    side: int, motion: MotionBelief, kept: SequenceMemory | None, edge_rad: float, settings: FilterSettings
+    side: int, motion: MotionBelief, kept: SequenceMemory | None, site: SiteGeometry
 ) -> tuple[float, float]:
     """Return where a hidden vehicle is and how far that may be off: by its time to visible, or as heard."""
     if kept is not None:
-        return hidden_bearing(kept.posterior.groups[0, side, : len(COMING_S)], edge_rad)
+        return hidden_bearing(kept.posterior.groups[0, side, : len(COMING_S)], site.sides[side])
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
-    return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, settings.hidden_bias_std_rad)
+    return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, site.settings.hidden_bias_std_rad)
 
 
 def relations_of(track: Track, sides: HiddenBelief, context: Context, stamp_ns: int) -> list[Relation]:
@@ -175,7 +174,7 @@ def relations_of(track: Track, sides: HiddenBelief, context: Context, stamp_ns: 
     return edges
 
 
-def _place(track: Track, range_m: float | None, hidden: bool, context: Context) -> dict[str, Any]:
+def _place(track: Track, range_m: float | None, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
     """Return position, velocity and covariance where known, and when a hidden one comes into view."""
     place, motion = track.place, track.motion
     if place is None and range_m is not None:
@@ -187,8 +186,7 @@ def _place(track: Track, range_m: float | None, hidden: bool, context: Context) 
     moves = place.velocity_std_mps < _KNOWN_VELOCITY_STD_MPS
     times_s = None
     if hidden and moves:
-        edge_rad, ego_speed_mps = context.occluders[track.side].edge_azimuth_rad, context.ego_speed_mps or 0.0
-        times_s = time_to_visible(place, edge_rad, ego_speed_mps)
+        times_s = time_to_visible(place, site.sides[track.side], site.ego_speed_mps)
     return {
         "position_m": (x, y, 0.0),
         "velocity_mps": (vx, vy, 0.0) if moves else None,

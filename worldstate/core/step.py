@@ -61,8 +61,15 @@ class Weights:
 def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry:
     """Return the site geometry of a context."""
     sides = (
-        SideGeometry(o.direction, o.edge_azimuth_rad, o.hidden_azimuth_rad, o.hidden_std_rad)
-        for o in context.occluders
+        SideGeometry(
+            one.direction,
+            one.edge_azimuth_rad,
+            one.hidden_azimuth_rad,
+            one.hidden_std_rad,
+            one.edge_std_rad,
+            one.pace_hz,
+        )
+        for one in context.occluders
     )
     return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, context.ego_speed_mps or 0.0)
 

@@ -110,6 +110,13 @@ class Occluder:
         Azimuth of its edge, where hidden vehicles come into view; left positive.
     hidden_azimuth_rad, hidden_std_rad : float
         Where behind it vehicles are before they are seen, and how widely they spread.
+    edge_std_rad : float
+        Standard deviation of the edge.
+    pace_hz : float
+        Speed of who comes behind it over the distance of their lane, 1/s: how fast the tangent of their
+        azimuth falls.
+    assumed : bool
+        Whether this is the corner of a usual junction, since nobody said what stands here.
 
     Examples
     --------
@@ -122,11 +129,17 @@ class Occluder:
     edge_azimuth_rad: float
     hidden_azimuth_rad: float
     hidden_std_rad: float
+    # Corners of OVAD's junctions stand at 32 degrees, give or take this, from where the ego stops.
+    edge_std_rad: float = math.radians(5.0)
+    pace_hz: float = 0.5  # Real vehicles of OVAD pass T0 at 4 to 5 m/s, some 9 m ahead
+    assumed: bool = False
 
     def __post_init__(self) -> None:
         in_range("edge_azimuth_rad", self.edge_azimuth_rad, -math.pi, math.pi)
         in_range("hidden_azimuth_rad", self.hidden_azimuth_rad, -math.pi, math.pi)
         in_range("hidden_std_rad", self.hidden_std_rad, 0.0, math.pi, open_low=True)
+        in_range("edge_std_rad", self.edge_std_rad, 0.0, math.pi, open_low=True)
+        in_range("pace_hz", self.pace_hz, 0.0, 100.0, open_low=True)
 
 
 def blind_corner(direction: str, side: int) -> Occluder:
@@ -152,7 +165,71 @@ def blind_corner(direction: str, side: int) -> Occluder:
     # The nominal corner of OVAD's junctions; three quarters of the peaks in its real hidden windows stand at
     # 42 to 63 deg.
     edge, hidden, std = math.radians(32.0), math.radians(55.0), math.radians(20.0)
-    return Occluder(f"corner_{direction}", direction, side * edge, side * hidden, std)
+    return Occluder(f"corner_{direction}", direction, side * edge, side * hidden, std, assumed=True)
+
+
+def corner_at(
+    direction: str,
+    corner_m: tuple[float, float],
+    crossing_m: float,
+    *,
+    speed_mps: float = 4.5,
+    corner_std_m: float = 0.5,
+) -> Occluder:
+    r"""Return the occluder whose corner stands at a place.
+
+    Who comes along the crossing lane, ``crossing_m`` ahead, is seen past the corner once
+
+    .. math:: \tan\theta \le \tan a = y_c / x_c
+
+    Parameters
+    ----------
+    direction : str
+        Label of the approach side.
+    corner_m : tuple of float
+        The corner that hides it, x ahead and y to the left of the ego, metres (REP-103).
+    crossing_m : float
+        Distance ahead of the lane in which vehicles come from this side, metres; beyond the corner.
+    speed_mps : float
+        How fast they usually are where they come into view.
+    corner_std_m : float
+        Standard deviation of either coordinate of the corner.
+
+    Returns
+    -------
+    Occluder
+        Edge and pace as seen from the ego; hidden vehicles two seconds behind the edge, give or take one.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the corner is not ahead, on the x axis, or not nearer than the lane.
+
+    Examples
+    --------
+    >>> corner = corner_at("left", (5.0, 3.0), 9.0)
+    >>> round(math.degrees(corner.edge_azimuth_rad)), corner.pace_hz
+    (31, 0.5)
+    """
+    x_m, y_m = corner_m
+    if not (0.0 < x_m < crossing_m < math.inf) or y_m == 0.0 or not math.isfinite(y_m):
+        raise InvalidArgumentError(
+            f"corner_m: expected it ahead, beside the x axis, nearer than {crossing_m} m, got {corner_m}"
+        )
+    in_range("speed_mps", speed_mps, 0.0, 100.0, open_low=True)
+    in_range("corner_std_m", corner_std_m, 0.0, 100.0, open_low=True)
+    pace_hz, slope = speed_mps / crossing_m, abs(y_m) / x_m
+    near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
+    return Occluder(
+        f"corner_{direction}",
+        direction,
+        math.atan2(y_m, x_m),
+        math.copysign(middle, y_m),
+        0.5 * (far - near),
+        # Across the line of sight, the same for every direction of the error.
+        edge_std_rad=min(corner_std_m / math.hypot(x_m, y_m), math.pi),
+        pace_hz=pace_hz,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
     cameras = "boxes of everybody, of cars above 100 pixels, or none (default: %(default)s)"
     add("--camera", choices=("all", "cars", "none"), default="all", help=cameras)
+    place = "give the filter the corners and lanes of the junction (default: those of a usual one)"
+    add("--known-place", action="store_true", help=place)
     add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--report", type=Path, metavar="JSON", help="write the figures")
@@ -44,7 +46,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     check_outputs(arguments, "report")
     model = read_model(arguments.model)
-    follow = partial(passed_stream, model=model, camera=arguments.camera, seed=arguments.seed)
+    given = {"camera": arguments.camera, "seed": arguments.seed, "known_place": arguments.known_place}
+    follow = partial(passed_stream, model=model, **given)
     streams: dict[str, list[PassedStream]] = {}
     with progress_bar("following", len(arguments.streams)) as bar:
         for one in in_processes(follow, arguments.streams, arguments.jobs):
@@ -52,7 +55,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             bar.advance()
     figures = {site: pass_figures(streams[site]) for site in sorted(streams)}
     figures["all"] = pass_figures([one for every in streams.values() for one in every])
-    report = {"camera": arguments.camera, "seed": arguments.seed, "junctions": figures}
+    report = {**given, "junctions": figures}
     if arguments.report is not None:
         write_report(arguments.report, report)
     lines = [f"{'':24}" + "".join(f"{site:>9}" for site in figures)]

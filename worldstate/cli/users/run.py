@@ -8,6 +8,11 @@ Without detections the camera counts as not asked, which is neither presence nor
 before, with the recording that follows it by --start, its first sample's time on the state's clock (which is
 that of detections with stamps, too).
 
+--context says what stands at this place:
+  {"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}
+the corner that hides the arm (x ahead, y left of the ego) and the lane behind it, metres; optional
+"speed_mps" and "corner_std_m" of an arm, "rates", "priors", "ego_speed_mps", "site", "view_half_angle_deg".
+
 --gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
 coverage, where only prominent peaks are kept.
 """
@@ -37,6 +42,7 @@ EXAMPLE = """\
 examples:
   worldstate run some.wav --array mics.csv --detections d.json --camera camera.json --out states.jsonl
   worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
+  worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
   worldstate run second.wav --resume state.json --start 60 --save-state state2.json
   worldstate run drive.wav --ego-noise --engine-rpm rpm.csv"""
 
@@ -75,6 +81,10 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
     add("--engine-rpm", type=Path, metavar="CSV", help=rpm)
     firings = "firings a turn: half the cylinders (default: %(default)g)"
     add("--engine-lines", type=float, default=2.0, metavar="N", help=firings)
+    place = (
+        "corners, lanes and rates of this place, JSON (default: a usual blind junction, and states say so)"
+    )
+    add("--context", type=Path, metavar="FILE", help=place)
     add("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
     add("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
 
@@ -121,6 +131,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
     from dataclasses import replace
 
     from worldstate.adapters.acoustic_grounding import Grounding
+    from worldstate.adapters.files.context_file import read_context
     from worldstate.adapters.listen import open_source
 
     settings = replace(
@@ -141,6 +152,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         camera=arguments.camera,
         miss_rates=arguments.miss_rates,
         model=arguments.model,
+        context=None if arguments.context is None else read_context(arguments.context),
         resume=arguments.resume,
         start_s=arguments.start,
         engine=_engine(arguments),

@@ -4,6 +4,7 @@ An advisory belongs to an approach from five seconds before the first T0 on. Ide
 that was hidden on the vehicle's side at T0 is the one seen at its place a second later.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -169,8 +170,8 @@ def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
 
 
 def _bearing(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
-    """Return the squared error of hidden azimuths over their variance, in the three seconds before T0."""
-    squares = []
+    """Return how far hidden azimuths are off, and the same over their variance, in the 3 s before T0."""
+    errors_rad, stds_rad = [], []
     for stream in streams:
         for one in approaches(stream.heard):
             if one.quiet:
@@ -181,6 +182,12 @@ def _bearing(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
                 azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
                 for entity in stream.followed.hidden(hop, one.sides[0], EXISTS)[:1]:
                     if azimuth is not None:
-                        error = wrap_angle(entity.azimuth_rad - azimuth)
-                        squares.append(error**2 / entity.azimuth_std_rad**2)
-    return {"hidden_hops": len(squares), "hidden_nees": mean_of(squares)}
+                        errors_rad.append(wrap_angle(entity.azimuth_rad - azimuth))
+                        stds_rad.append(entity.azimuth_std_rad)
+    errors, stds = np.array(errors_rad), np.array(stds_rad)
+    found = errors.size > 0
+    return {
+        "hidden_hops": errors.size,
+        "hidden_rms_deg": math.degrees(np.sqrt(np.mean(errors**2))) if found else None,
+        "hidden_nees": float(np.mean(errors**2 / stds**2)) if found else None,
+    }

@@ -9,10 +9,12 @@ from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.files.model_file import Model
+from worldstate.adapters.simulation.scene.junction import site
 from worldstate.core.filter import WorldFilter
 from worldstate.operations.commissioning.commission import parts_of, stream_evidence
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_labels import stream_truth
+from worldstate.state.context import Context, corner_at
 
 from .followed_stream import followed
 from .measured_stream import measurements
@@ -25,9 +27,17 @@ EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcyc
 
 
 def passed_stream(
-    path: Path, model: Model, camera: CameraKind = "all", seed: int = 0, alpha: float = 0.02
+    path: Path,
+    model: Model,
+    camera: CameraKind = "all",
+    seed: int = 0,
+    alpha: float = 0.02,
+    *,
+    known_place: bool = False,
 ) -> PassedStream:
     """Return a stream with what the filter believed at every hop; `seed` draws the camera's misses.
+
+    Where the place is known, the filter has its corners and lanes as a context file would say them.
 
     Raises
     ------
@@ -41,5 +51,22 @@ def passed_stream(
         detections = stream_detections(heard, np.random.default_rng(seed))
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
     measured = measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
-    world = WorldFilter(policy=model.policies.for_alpha(alpha))
+    context = place_of(str(heard.hops.about["site"])) if known_place else Context()
+    world = WorldFilter(context, model.policies.for_alpha(alpha))
     return PassedStream(heard, stream_truth(heard), followed(world, measured))
+
+
+def place_of(name: str) -> Context:
+    """Return corners and lanes of a simulated site; who comes from the left drives in the nearer lane.
+
+    Examples
+    --------
+    >>> [round(one.edge_azimuth_rad, 2) for one in place_of("SB1").occluders]
+    [0.42, -0.52]
+    """
+    plan = site(name)
+    near_m, far_m = plan.lanes_m
+    left_m, right_m = (plan.corner_ahead_m, plan.corner_left_m), (plan.corner_ahead_m, -plan.corner_right_m)
+    return Context(
+        occluders=(corner_at("left", left_m, near_m), corner_at("right", right_m, far_m)), site=name
+    )

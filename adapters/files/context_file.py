@@ -1,0 +1,101 @@
+"""A context from JSON: corners and lanes of a junction, how fast people drive there, how often they come."""
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at
+
+from .json_file import read_json, read_record, refused_as_file
+
+
+@dataclass(frozen=True, slots=True)
+class _Arm:
+    """One approach side: the place of its corner and of the lane behind it."""
+
+    direction: str
+    corner_m: tuple[float, float]
+    crossing_m: float
+    speed_mps: float | None = None
+    corner_std_m: float | None = None
+
+    def occluder(self) -> Occluder:
+        given = {"speed_mps": self.speed_mps, "corner_std_m": self.corner_std_m}
+        known = {name: value for name, value in given.items() if value is not None}
+        return corner_at(self.direction, self.corner_m, self.crossing_m, **known)
+
+
+@dataclass(frozen=True, slots=True)
+class _ContextFile:
+    """What a context file holds."""
+
+    arms: tuple[_Arm, ...] | None = None
+    rates: Rates | None = None
+    priors: Priors | None = None
+    ego_speed_mps: float | None = None
+    site: str | None = None
+    view_half_angle_deg: float | None = None
+
+    def context(self) -> Context:
+        usual = Context()
+        known = usual.occluders if self.arms is None else tuple(arm.occluder() for arm in self.arms)
+        # In the usual order, which is that of a signature model's directions.
+        order = {direction: place for place, direction in enumerate(usual.directions)}
+        half_rad = usual.view_half_angle_rad
+        if self.view_half_angle_deg is not None:
+            half_rad = math.radians(self.view_half_angle_deg)
+        return Context(
+            rates=self.rates or usual.rates,
+            occluders=tuple(sorted(known, key=lambda one: order.get(one.direction, len(order)))),
+            priors=self.priors,
+            ego_speed_mps=self.ego_speed_mps,
+            site=self.site,
+            view_half_angle_rad=half_rad,
+        )
+
+
+def read_context(path: str | Path) -> Context:
+    """Read a context from JSON; whatever it does not say is as in `Context()`.
+
+    ``{"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}``: the corner that
+    hides an arm (x ahead, y to the left of the ego, metres) and the distance ahead of the lane in which
+    vehicles come from there; optional ``"speed_mps"`` of these and ``"corner_std_m"``. Beside the arms
+    ``"rates"`` and ``"priors"`` as `Rates` and `Priors` name them, ``"ego_speed_mps"``, ``"site"`` and
+    ``"view_half_angle_deg"``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Context
+        As the file says.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing, too large, no JSON, has a key that means nothing here, or a number is missing
+        or out of range.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> right = '{"direction": "right", "corner_m": [5.0, -4.0], "crossing_m": 9.0}'
+    >>> left = '{"direction": "left", "corner_m": [5.0, 3.0], "crossing_m": 12.0, "speed_mps": 8.0}'
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "elm_street.json"
+    ...     _ = name.write_text(f'{{"arms": [{right}, {left}]}}')
+    ...     context = read_context(name)
+    >>> [(one.direction, round(math.degrees(one.edge_azimuth_rad)), one.assumed) for one in context.occluders]
+    [('left', 31, False), ('right', -39, False)]
+    """
+    with refused_as_file(path):
+        given = read_json(path, "a context file")
+        # Written by hand: a name that is spelt wrong would be left out in silence.
+        known = {one.name for one in fields(_ContextFile)}
+        if isinstance(given, dict) and (unknown := sorted(set(given) - known)):
+            raise InvalidArgumentError(f"context: expected keys among {sorted(known)}, got {unknown}")
+        return read_record(_ContextFile, path, "context").context()

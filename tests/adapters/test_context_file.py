@@ -1,0 +1,106 @@
+"""A context file: edges by trigonometry, refusals by name, and a snapshot that says what it was told."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.adapters.files.context_file import read_context
+from worldstate.belief.hidden_bearing import hidden_bearing
+from worldstate.belief.site_geometry import SideGeometry
+from worldstate.cli.main import main
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.state.context import Context, Occluder, corner_at
+
+LEFT = {"direction": "left", "corner_m": [5.0, 3.0], "crossing_m": 9.0, "speed_mps": 6.0}
+RIGHT = {"direction": "right", "corner_m": [4.0, -2.5], "crossing_m": 12.0, "corner_std_m": 0.1}
+
+
+def written(folder: Path, **keys: object) -> Path:
+    path = folder / "context.json"
+    path.write_text(json.dumps(keys))
+    return path
+
+
+def side_of(one: Occluder) -> SideGeometry:
+    measures = one.edge_azimuth_rad, one.hidden_azimuth_rad, one.hidden_std_rad, one.edge_std_rad, one.pace_hz
+    return SideGeometry(one.direction, *measures)
+
+
+@given(
+    st.floats(2.0, 9.0), st.floats(1.5, 8.0), st.floats(1.0, 15.0), st.floats(1.0, 15.0), st.integers(0, 8)
+)
+def test_who_comes_stands_where_the_plan_says(
+    x_m: float, y_m: float, beyond_m: float, speed_mps: float, group: int
+) -> None:
+    """Oracle: the place on the lane, so many seconds before the line of sight past the corner is crossed."""
+    crossing_m = x_m + beyond_m
+    coming = np.zeros(len(COMING_S))
+    coming[group] = 1.0
+    remaining_s = 0.5 * (COMING_S[group] + (0.0, *COMING_S)[group])
+    seen_at_m = crossing_m * y_m / x_m
+    azimuth_rad = math.atan2(seen_at_m + speed_mps * remaining_s, crossing_m)
+    for sign, direction in ((1.0, "left"), (-1.0, "right")):
+        corner = corner_at(direction, (x_m, sign * y_m), crossing_m, speed_mps=speed_mps)
+        said_rad, std_rad = hidden_bearing(coming, side_of(corner))
+        assert math.copysign(1.0, said_rad) == sign
+        if azimuth_rad < math.radians(75.0):
+            assert abs(said_rad) == pytest.approx(azimuth_rad, abs=0.02)
+        assert std_rad >= corner.edge_std_rad
+
+
+def test_a_file_says_what_stands_there_and_the_rest_is_usual(tmp_path: Path) -> None:
+    context = read_context(
+        written(tmp_path, arms=[RIGHT, LEFT], site="Elm Street", rates={**rates(), "arrival_hz": 0.01})
+    )
+    assert context.directions == ("left", "right") and context.site == "Elm Street"
+    assert context.rates.arrival_hz == 0.01 and context.view_half_angle_rad == Context().view_half_angle_rad
+    assert [one.assumed for one in context.occluders] == [False, False]
+    assert [one.assumed for one in read_context(written(tmp_path)).occluders] == [True, True]
+    # The snapshot says it, too, and a checkpoint keeps it.
+    world = WorldFilter(context)
+    said = json.loads(world.state.to_json())["context"]
+    assert [one["assumed"] for one in said["occluders"]] == [False, False]
+    assert WorldFilter.from_dict(world.to_dict()).context == context
+
+
+def rates() -> dict[str, float]:
+    return {name: getattr(Context().rates, name) for name in Context().rates.__dataclass_fields__}
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"arm": [LEFT, RIGHT]}, "expected keys among"),
+        ({"arms": [LEFT]}, "priors for"),
+        ({"arms": [LEFT, LEFT]}, "different"),
+        ({"arms": [{**LEFT, "corner_m": [5.0, 0.0]}, RIGHT]}, "corner_m"),
+        ({"arms": [{**LEFT, "corner_m": [9.5, 3.0]}, RIGHT]}, "nearer than 9"),
+        ({"arms": [{**LEFT, "speed_mps": -1.0}, RIGHT]}, "speed_mps"),
+        ({"arms": [{**LEFT, "crossing_m": None}, RIGHT]}, "crossing_m"),
+        ({"ego_speed_mps": "fast"}, "ego_speed_mps"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(tmp_path: Path, keys: dict[str, object], said: str) -> None:
+    with pytest.raises((InputFileError, InvalidArgumentError), match=said):
+        WorldFilter(read_context(written(tmp_path, **keys)))
+
+
+def test_run_takes_the_place(approach, tmp_path: Path) -> None:
+    out, file = tmp_path / "s.jsonl", written(tmp_path, arms=[LEFT, RIGHT], site="Elm Street")
+    given_array = ["--array", str(approach.array_path)]
+    assert (
+        main(["run", str(approach.audio_path), *given_array, "--context", str(file), "--out", str(out)]) == 0
+    )
+    last = json.loads(out.read_text().splitlines()[-1])["context"]
+    assert last["site"] == "Elm Street"
+    assert last["occluders"][0]["edge_azimuth_rad"] == pytest.approx(math.atan2(3.0, 5.0))
+    assert (
+        main(["run", str(approach.audio_path), *given_array, "--context", str(tmp_path / "none.json")]) == 2
+    )
