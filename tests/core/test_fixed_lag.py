@@ -138,9 +138,8 @@ def test_many_small_predictions_are_one(seed: int) -> None:
     measured = script(rng, hops=12)
     often = WorldFilter()
     for one in measured:
-        for stamp_ns in sorted(
-            rng.integers(often.stamp_ns, max(one.stamp_ns, often.stamp_ns + 1), 3).tolist()
-        ):
+        between_ns = rng.integers(often.stamp_ns, max(one.stamp_ns, often.stamp_ns + 1), 3).tolist()
+        for stamp_ns in sorted([*between_ns, max(one.stamp_ns, often.stamp_ns)]):
             often = often.predict_to(stamp_ns)
         often = often.update(one)
     assert often.state == filtered(measured).state

@@ -202,6 +202,23 @@ def correlated(state, spread, seed):
     return MotionBelief(state, 0.5 * (covariance + covariance.T))
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+def test_many_entities_at_once_are_each_by_itself(seed, n):
+    rng = np.random.default_rng(seed)
+    beliefs = [random_belief(int(one)) for one in rng.integers(0, 2**32, n)]
+    values, stds, weights, kept = rng.normal(0, 1, n), rng.uniform(0.01, 1, n), rng.random(n), rng.random(n)
+
+    def moved(belief, value, std, weight, bearing_kept):
+        after = relax(predict(belief, 0.1, 2.0), beliefs[0], bearing_kept, 0.9)
+        return update_approach(update_azimuth(after, value, std, weight), value, std, weight)
+
+    at_once = moved(MotionBelief.stacked(beliefs), values, stds, weights, kept).each()
+    for *one, together in zip(beliefs, values, stds, weights, kept, at_once, strict=True):
+        alone = moved(*one)
+        assert together.mean == pytest.approx(alone.mean, abs=1e-12)
+        assert together.covariance == pytest.approx(alone.covariance, abs=1e-12)
+
+
 @given(states, spreads, turns, times)
 def test_predict_is_that_of_an_extended_kalman_filter(state, spread, seed, time_s):
     assume(state[2] * time_s > -0.5)  # Nearer than half its range nobody comes within a step

@@ -1,13 +1,16 @@
 """Update the entities with an acoustic bearing and approach rate, by probabilistic data association."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
+
+import numpy as np
 
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
 from .hidden_belief import HiddenBelief
-from .kinematics.motion import log_azimuth_likelihood, update_approach, update_azimuth
+from .kinematics.motion import MotionBelief, log_azimuth_likelihood, update_approach, update_azimuth
 from .settings import FilterSettings
 from .track import Track, merged
 
@@ -29,13 +32,16 @@ def acoustic_update(
     # samples up to ten times.
     if weight <= 0.0:
         return tracks
-    return tuple(
-        _updated(track, measurement, sides, visible, weight, settings)
-        # A measured position tells more than a bearing that may be that of a wall.
-        if track.moving and track.place is None
-        else track
-        for track in tracks
-    )
+    # A measured position tells more than a bearing that may be that of a wall.
+    sounding = [i for i, track in enumerate(tracks) if track.moving and track.place is None]
+    silent = isinstance(measurement.bearing, NotUsable) and isinstance(measurement.approach, NotUsable)
+    if not sounding or silent:
+        return tracks
+    updated = list(tracks)
+    heard = _updated([tracks[i] for i in sounding], measurement, sides, visible, weight, settings)
+    for i, track in zip(sounding, heard, strict=True):
+        updated[i] = track
+    return tuple(updated)
 
 
 def hidden_share(track: Track, sides: HiddenBelief) -> float:
@@ -61,36 +67,38 @@ def association_probability(
 
 
 def _updated(
-    track: Track,
+    tracks: list[Track],
     measurement: Measurement,
     sides: HiddenBelief,
     visible: float,
     weight: float,
     settings: FilterSettings,
-) -> Track:
-    share = hidden_share(track, sides)
-    sounding = _sounding(track, sides, visible)
-    motion, used = track.motion, False
-    if not isinstance(measurement.bearing, NotUsable):
-        std, path = _path(measurement.bearing.std_rad, share, settings)
-        azimuth = measurement.bearing.azimuth_rad
-        own = association_probability(track, azimuth, std, path * sounding)
-        motion = update_azimuth(motion, azimuth, std / math.sqrt(weight), own)
-        used = True
-    approach_heard = track.approach_heard
-    if not isinstance(measurement.approach, NotUsable):
-        std = measurement.approach.std_hz / math.sqrt(weight)
-        motion = update_approach(motion, measurement.approach.inverse_tta_hz, std, sounding)
-        used, approach_heard = True, approach_heard or sounding > 0.5
-    if not used:
-        return track
-    return replace(
-        track,
-        motion=motion,
-        updated_ns=measurement.stamp_ns,
-        sources=merged(track.sources, measurement.source),
-        approach_heard=approach_heard,
+) -> Iterator[Track]:
+    sounding = [_sounding(track, sides, visible) for track in tracks]
+    motion, bearing, approach = (
+        MotionBelief.stacked([track.motion for track in tracks]),
+        measurement.bearing,
+        measurement.approach,
     )
+    if not isinstance(bearing, NotUsable):
+        paths = [_path(bearing.std_rad, hidden_share(track, sides), settings) for track in tracks]
+        own = [
+            association_probability(track, bearing.azimuth_rad, std, path * chance)
+            for track, (std, path), chance in zip(tracks, paths, sounding, strict=True)
+        ]
+        stds = np.array([std for std, _ in paths]) / math.sqrt(weight)
+        motion = update_azimuth(motion, bearing.azimuth_rad, stds, np.array(own))
+    if not isinstance(approach, NotUsable):
+        std = approach.std_hz / math.sqrt(weight)
+        motion = update_approach(motion, approach.inverse_tta_hz, std, np.array(sounding))
+    for track, moved, chance in zip(tracks, motion.each(), sounding, strict=True):
+        yield replace(
+            track,
+            motion=moved,
+            updated_ns=measurement.stamp_ns,
+            sources=merged(track.sources, measurement.source),
+            approach_heard=track.approach_heard or (chance > 0.5 and not isinstance(approach, NotUsable)),
+        )
 
 
 def _path(line_of_sight_std_rad: float, share: float, settings: FilterSettings) -> tuple[float, float]:

@@ -1,9 +1,12 @@
 """The belief of one entity."""
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias
 from uuid import UUID, uuid5
+
+import numpy as np
 
 from worldstate.abduction.road_users import ClassShares
 from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
@@ -12,6 +15,7 @@ from worldstate.ground.values import Answer
 from .existence import after_time
 from .kinematics.cartesian import CartesianBelief, polar_motion, predict_place
 from .kinematics.motion import MotionBelief, predict, relax
+from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 
 # Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
@@ -70,26 +74,55 @@ def entity_id(stream: str, kind: str, number: int) -> str:
     return str(uuid5(_NAMESPACE, f"{stream}/{kind}/{number}"))
 
 
-def predict_track(track: Track, hidden_share: float, step_s: float, site: SiteGeometry) -> Track:
-    """Return the track after a time step without a measurement."""
-    # The azimuth relaxes to the hidden prior by `hidden_share` = P(hidden | exists): a vehicle still hidden
-    # has not passed the corner, whatever its last rates said.
+def predict_tracks(
+    tracks: Sequence[Track], hidden_shares: Sequence[float], step_s: float, site: SiteGeometry
+) -> tuple[Track, ...]:
+    """Return the tracks after a time step without a measurement; shares are P(hidden | exists)."""
+    moved = [_driven_on(track, step_s, site) for track in tracks]
+    polar = [i for i, track in enumerate(moved) if track.place is None]
+    if not polar:
+        return tuple(moved)
+    unplaced, shares = [moved[i] for i in polar], [hidden_shares[i] for i in polar]
+    for i, track in zip(polar, _relaxed(unplaced, shares, step_s, site), strict=True):
+        moved[i] = track
+    return tuple(moved)
+
+
+def _driven_on(track: Track, step_s: float, site: SiteGeometry) -> Track:
+    """Return a track with its place a step later, or without one where that is lost."""
+    if track.place is None:
+        return track
+    place = predict_place(track.place, step_s, _acceleration(track, site.settings), site.ego_speed_mps)
+    if place.position_std_m <= _LOST_PLACE_M:
+        # No life time here: who keeps sending is there, and who does not is lost within seconds.
+        return located(track, place, site)
+    motion = track.motion if track.seen else site.prior(track.side)
+    return replace(track, place=None, behind=1.0, motion=motion)
+
+
+def _acceleration(track: Track, settings: FilterSettings) -> float:
+    return settings.acceleration_psd if track.moving else PARKED_ACCELERATION
+
+
+def _relaxed(
+    tracks: list[Track], hidden_shares: list[float], step_s: float, site: SiteGeometry
+) -> Iterator[Track]:
+    """Yield tracks without a place after a step, drawn to what is expected of vehicles in view or hidden."""
     settings = site.settings
-    acceleration = settings.acceleration_psd if track.moving else PARKED_ACCELERATION
-    if track.place is not None:
-        place = predict_place(track.place, step_s, acceleration, site.ego_speed_mps)
-        if place.position_std_m <= _LOST_PLACE_M:
-            # No life time here: who keeps sending is there, and who does not is lost within seconds.
-            return located(track, place, site)
-        motion = track.motion if track.seen else site.prior(track.side)
-        track = replace(track, place=None, behind=1.0, motion=motion)
-    motion = predict(track.motion, step_s, acceleration)
-    radial_kept = math.exp(-step_s / settings.relaxation_s)
-    if track.seen:
-        existence = after_time(track.existence, step_s, settings.visible_life_s)
-        return replace(track, motion=relax(motion, _IN_VIEW, 1.0, radial_kept), existence=existence)
-    bearing_kept = math.exp(-step_s * hidden_share / settings.relaxation_s)
-    return replace(track, motion=relax(motion, site.prior(track.side), bearing_kept, radial_kept))
+    accelerations = np.array([_acceleration(track, settings) for track in tracks])
+    motion = predict(MotionBelief.stacked([track.motion for track in tracks]), step_s, accelerations)
+    # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
+    # corner, whatever its last rates said.
+    kept = np.exp(
+        -step_s * np.where([track.seen for track in tracks], 0.0, hidden_shares) / settings.relaxation_s
+    )
+    towards = MotionBelief.stacked([_IN_VIEW if one.seen else site.prior(one.side) for one in tracks])
+    relaxed = relax(motion, towards, kept, math.exp(-step_s / settings.relaxation_s))
+    for track, moved in zip(tracks, relaxed.each(), strict=True):
+        existence = track.existence
+        if track.seen:
+            existence = after_time(existence, step_s, settings.visible_life_s)
+        yield replace(track, motion=moved, existence=existence)
 
 
 def located(track: Track, place: CartesianBelief, site: SiteGeometry) -> Track:

@@ -1,8 +1,9 @@
 """Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
@@ -59,14 +60,14 @@ def vision_update(
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings = tuple(sorted(measurement.sightings, key=_BY_ALL))
     found = associated(tracks, sightings, site)
-    after = []
+    turned, after = _turned(tracks, sightings, found, site), []
     for i, track in enumerate(tracks):
         if i not in found:
             after.append(_not_sighted(track, measurement.co_evidence, weight, site))
         elif track.seen:
-            after.append(_sighted(track, sightings[found[i]], measurement, site))
+            after.append(_sighted(turned[i], sightings[found[i]], measurement, site))
         else:
-            after.append(_handed_over(track, sightings[found[i]], measurement, site))
+            after.append(_handed_over(turned[i], sightings[found[i]], measurement, site))
     handed_over = tuple(tracks[i].side for i in found if not tracks[i].seen)
     for side in handed_over:
         explanation = explanation.emerge(side, site.settings.handover_residual)
@@ -110,8 +111,8 @@ def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
     return min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or settings.clutter_rate
 
 
-def _found(track: Track, measurement: Measurement, settings: FilterSettings) -> Track:
-    """Return an associated track with existence, sources and time stamps updated."""
+def _found(track: Track, measurement: Measurement, settings: FilterSettings, **changes: Any) -> Track:
+    """Return an associated track with existence, sources and time stamps updated, and more changes."""
     miss, clutter = _rates(measurement.co_evidence, settings)
     return replace(
         track,
@@ -121,19 +122,19 @@ def _found(track: Track, measurement: Measurement, settings: FilterSettings) -> 
         last_seen_ns=measurement.stamp_ns,
         answer="visible",
         miss_rate=None if isinstance(measurement.co_evidence, Unqueried) else miss,
+        **changes,
     )
 
 
 def _sighted(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
     labels = relabelled(track.labels, ((sighting.label, sighting.score),))
-    changed = replace(_turned(track, sighting, site), labels=labels, moving=sighting.moving)
-    return _found(changed, measurement, site.settings)
+    return _found(track, measurement, site.settings, labels=labels, moving=sighting.moving)
 
 
 def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
     """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
     seen = replace(
-        _turned(track, sighting, site),
+        track,
         seen=True,
         side=site.nearest_side(sighting.azimuth_rad),
         existence=max(track.existence, site.settings.sighting_existence),
@@ -142,14 +143,27 @@ def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, sit
     return _found(seen, measurement, site.settings)
 
 
-def _turned(track: Track, sighting: Sighting, site: SiteGeometry) -> Track:
-    """Return a track with its motion after the bearing of a sighting."""
-    azimuth_rad, std_rad = sighting.azimuth_rad, sighting.std_rad
-    if track.place is not None:
-        return located(track, update_bearing(track.place, azimuth_rad, std_rad), site)
-    if track.seen and sighting.moving == track.moving:
-        return replace(track, motion=update_azimuth(track.motion, azimuth_rad, std_rad, weight=1.0))
-    return replace(track, motion=_motion_at(sighting, track.motion))
+def _turned(
+    tracks: Sequence[Track], sightings: Sequence[Sighting], found: Mapping[int, int], site: SiteGeometry
+) -> dict[int, Track]:
+    """Return the found tracks, by their index, with their motion after the bearings of their sightings."""
+    turned, usual = {}, []
+    for i, j in found.items():
+        track, sighting = tracks[i], sightings[j]
+        if track.place is not None:
+            place = update_bearing(track.place, sighting.azimuth_rad, sighting.std_rad)
+            turned[i] = located(track, place, site)
+        elif track.seen and sighting.moving == track.moving:
+            usual.append(i)
+        else:
+            turned[i] = replace(track, motion=_motion_at(sighting, track.motion))
+    if usual:
+        motion = MotionBelief.stacked([tracks[i].motion for i in usual])
+        azimuth_rad = np.array([sightings[found[i]].azimuth_rad for i in usual])
+        std_rad = np.array([sightings[found[i]].std_rad for i in usual])
+        after = update_azimuth(motion, azimuth_rad, std_rad, weight=1.0)
+        turned |= {i: replace(tracks[i], motion=one) for i, one in zip(usual, after.each(), strict=True)}
+    return turned
 
 
 def _not_sighted(track: Track, answer: CoEvidence, weight: float, site: SiteGeometry) -> Track:

@@ -252,8 +252,10 @@ class WorldFilter:
     def _step(self, memory: Memory, measurement: Measurement | PositionScan) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
         model, before = self._model, memory
+        if memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns:
+            memory = self._memory  # It was predicted there before
         # Within the slack the belief is not moved back.
-        if measurement.stamp_ns > memory.stamp_ns:
+        elif measurement.stamp_ns > memory.stamp_ns:
             memory = advance(memory, measurement.stamp_ns, model)
         carried = memory
         if isinstance(measurement, PositionScan):
@@ -359,7 +361,10 @@ def _checked(measurement: Measurement | PositionScan, context: Context) -> Measu
         # NaN compares false, and what is no number does not compare.
         if not isinstance(value, int | float | np.number) or not low <= value <= high:
             raise InvalidArgumentError(f"{name}: expected a number in [{low}, {high}], got {value!r:.40}")
-    sightings = tuple(replace(sighting, score=float(sighting.score)) for sighting in measurement.sightings)
+    sightings = tuple(
+        one if type(one.score) is float else replace(one, score=float(one.score))
+        for one in measurement.sightings
+    )
     return replace(measurement, stamp_ns=stamp_ns, sightings=sightings)
 
 

@@ -22,7 +22,7 @@ from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.position_update import position_update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.track import Track, predict_track
+from worldstate.belief.track import Track, predict_tracks
 from worldstate.belief.vision_update import VisionUpdate, log_co_evidence, surviving, vision_update
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Look, Measurement
@@ -126,10 +126,8 @@ def _last_look(memory: Memory, sensor: str) -> CountedLook | None:
 def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     """Return the memory predicted to a later time."""
     step_ns, explanation, sides = stamp_ns - memory.stamp_ns, memory.explanation, memory.sides
-    tracks = tuple(
-        predict_track(track, hidden_share(track, sides), seconds(step_ns), model.site)
-        for track in memory.tracks
-    )
+    shares = [hidden_share(track, sides) for track in memory.tracks]
+    tracks = predict_tracks(memory.tracks, shares, seconds(step_ns), model.site)
     predicted = replace(
         memory,
         stamp_ns=stamp_ns,

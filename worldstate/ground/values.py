@@ -1,5 +1,6 @@
 """Small values that every storey of the house speaks of."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, TypeVar
 
@@ -67,6 +68,9 @@ def wrap_angle(angle_rad: AngleT) -> AngleT:
     >>> round(wrap_angle(3 * np.pi / 2), 3), wrap_angle(-np.pi) == np.pi
     (-1.571, True)
     """
+    if isinstance(angle_rad, float):
+        # Ten times as fast as an array of one angle, of which a step of the filter has hundreds.
+        return math.pi - (math.pi - float(angle_rad)) % (2.0 * math.pi)
     wrapped = np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2 * np.pi)
     return float(wrapped) if np.ndim(angle_rad) == 0 else wrapped  # type: ignore[return-value]
 

@@ -18,8 +18,6 @@ References
 Aidala and Hammel, "Utilization of modified polar coordinates for bearings-only tracking", 1983.
 """
 
-import math
-
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
@@ -31,43 +29,54 @@ LEAST_Q = 1e-3
 
 
 def propagate(state: FloatArray, step_s: float) -> FloatArray:
-    """Return the state (theta, theta_dot, rho, log r) after `step_s`, shape (4,); theta is not wrapped.
+    """Return states (theta, theta_dot, rho, log r) after `step_s`, theta not wrapped.
 
-    Shapes: state (4,).
+    Shapes: state (..., 4), as what is returned.
     """
-    theta, omega, rho, log_range = state.tolist()
+    theta, omega, rho, log_range = np.moveaxis(state, -1, 0)
     a, b = 1.0 + rho * step_s, omega * step_s
-    q = max(a * a + b * b, LEAST_Q)
-    return np.array(
-        [theta + math.atan2(b, a), omega / q, (a * rho + b * omega) / q, log_range + 0.5 * math.log(q)]
-    )
+    q = np.maximum(a * a + b * b, LEAST_Q)
+    after = np.empty_like(state)
+    after[..., AZIMUTH] = theta + np.arctan2(b, a)
+    after[..., AZIMUTH_RATE] = omega / q
+    after[..., RADIAL_RATE] = (a * rho + b * omega) / q
+    after[..., LOG_RANGE] = log_range + 0.5 * np.log(q)
+    return after
 
 
 def jacobian(state: FloatArray, step_s: float) -> FloatArray:
-    """Return d propagate / d state, shape (4, 4).
+    """Return d propagate / d state, shape (..., 4, 4).
 
-    Shapes: state (4,).
+    Shapes: state (..., 4).
     """
-    _, omega, rho, _ = state.tolist()
+    _, omega, rho, _ = np.moveaxis(state, -1, 0)
     t = step_s
     a, b = 1.0 + rho * t, omega * t
-    q = max(a * a + b * b, LEAST_Q)
+    q = np.maximum(a * a + b * b, LEAST_Q)
     radial = a * rho + b * omega
     u, v = a / q, b / q
-    return np.array(
-        [
-            [1.0, u * t, -v * t, 0.0],
-            [0.0, (1.0 - 2.0 * b * v) / q, -2.0 * omega * u * t / q, 0.0],
-            [0.0, 2.0 * (omega - radial * v) * t / q, (1.0 + 2.0 * (rho - radial * u) * t) / q, 0.0],
-            [0.0, v * t, u * t, 1.0],
-        ]
-    )
+    slope = np.zeros((*state.shape, 4))
+    slope[..., 0, 0] = slope[..., 3, 3] = 1.0
+    slope[..., 0, 1] = slope[..., 3, 2] = u * t
+    slope[..., 0, 2] = -v * t
+    slope[..., 3, 1] = v * t
+    slope[..., 1, 1] = (1.0 - 2.0 * b * v) / q
+    slope[..., 1, 2] = -2.0 * omega * u * t / q
+    slope[..., 2, 1] = 2.0 * (omega - radial * v) * t / q
+    slope[..., 2, 2] = (1.0 + 2.0 * (rho - radial * u) * t) / q
+    return slope
 
 
-def process_noise(acceleration_psd: float, range_m: float, step_s: float) -> FloatArray:
-    r"""Return Q, shape (4, 4), of a white acceleration: at range r it turns and closes by a/r."""
-    q, t = acceleration_psd / range_m**2, step_s
-    twice, once, rate = q * t**3 / 3.0, q * t**2 / 2.0, q * t
+def process_noise(
+    acceleration_psd: float | FloatArray, range_m: float | FloatArray, step_s: float
+) -> FloatArray:
+    r"""Return Q, shape (..., 4, 4), of a white acceleration: at range r it turns and closes by a/r."""
+    q = np.asarray(acceleration_psd / np.square(range_m))
+    return q[..., None, None] * _unit_noise(step_s)
+
+
+def _unit_noise(t: float) -> FloatArray:
+    twice, once, rate = t**3 / 3.0, t**2 / 2.0, t
     return np.array(
         [[twice, once, 0.0, 0.0], [once, rate, 0.0, 0.0], [0.0, 0.0, rate, once], [0.0, 0.0, once, twice]]
     )
