@@ -80,6 +80,9 @@ def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
     assert np.allclose(np.diff(stamps), 1e8, atol=3e4)
     validator = jsonschema.Draft202012Validator(snapshot_schema())
     assert [error.message for one in snapshots for error in validator.iter_errors(one)] == []
+    onset_s = next(one["stamp_ns"] for one in snapshots if any(cue["advisory"] for cue in one["cues"])) / 1e9
+    assert main(["explain", str(states), "--time", f"{onset_s:.1f}"]) == 0
+    assert f"since {onset_s:.2f} s" in capsys.readouterr().out
     assert (tmp_path / "t.png").read_bytes()[:4] == b"\x89PNG"
 
 

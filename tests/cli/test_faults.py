@@ -21,6 +21,7 @@ from worldstate.adapters.simulation.dataset.dataset import LogRow, write_log
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable, save_tables
+from worldstate.state import WorldState
 
 COMMAND = (sys.executable, "-m", "worldstate.cli.main")
 RECORDING = "set/SA1/left/1_00_0000"
@@ -194,6 +195,8 @@ def whole(tmp_path_factory) -> Path:
     result = {"image_id": 0, "category_id": 3, "bbox": [1, 2, 3, 4], "score": 0.5}
     (folder / "coco.json").write_text(json.dumps([result]))
     write_log(folder, [LogRow("1_00_0002", "SA1", "left", 70)])
+    states = [WorldState(stamp_ns, 0).to_json() for stamp_ns in (0, 10**8, 2 * 10**8)]
+    (folder / "states.jsonl").write_text("\n".join(states) + "\n")
     return folder
 
 
@@ -208,6 +211,7 @@ READERS = {
     "ids.csv": "train {whole}/table.csv --exclude {} --out {new}",
     "boxes.json": "run {whole}/array.xml --detections {}",
     "coco.json": "run {whole}/array.xml --detections {}",
+    "states.jsonl": "explain {} --time 0.2",
     "DataLog.csv": "extract-features {folder} --out {new}",
 }
 

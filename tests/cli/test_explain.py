@@ -1,0 +1,131 @@
+"""`worldstate explain` on the snapshots of a short scripted approach, and where it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.signature.domain_guard import Foreign
+from worldstate.cli.main import main
+from worldstate.measurement import Look
+
+SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
+
+
+def heard(coming: float) -> np.ndarray:
+    """Return a side on which somebody comes in two seconds with this probability, or is perhaps in view."""
+    groups = np.full(len(GROUPS), 0.4 * (1.0 - coming) / (len(GROUPS) - 2))
+    groups[GROUPS.index("coming_2s")], groups[GROUPS.index("seen")] = coming, 0.6 * (1.0 - coming)
+    return groups
+
+
+@pytest.fixture(scope="module")
+def states(tmp_path_factory) -> Path:
+    """Half a second of nothing, half a second of somebody on the left, and speech that takes it away."""
+    path = tmp_path_factory.mktemp("explain") / "states.jsonl"
+    world, lines = WorldFilter(), []
+    for hop in range(1, 16):
+        coming = 0.9 if 6 <= hop <= 10 else 0.01
+        said = SequenceReading(np.stack([heard(coming), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.0, 20.0))
+        look = Look("camera", hop * 10**8, Absent(0.1, 0.01))
+        domain = Foreign("sounds like speech", 1.5) if hop > 10 else None
+        hop_ns = hop * 10**8
+        world = world.update(
+            Measurement(hop_ns, FLAT, look.answer, SILENT, SILENT, (), look, domain, sequence=said)
+        )
+        lines.append(world.state.to_json())
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+RAISED = """\
+time  1.00 s
+left: advisory raised by what is heard and seen now
+  since 0.70 s, valid until 2.00 s, rests on acoustic (working), camera (working)
+  log-odds that somebody comes into view within 3 s, nats:
+    at, s                     0.70          1.00
+    prior                    -0.41         -0.41
+    sequence                 +2.79         +2.79
+    look camera              +0.59         +0.59
+    emerged                  +0.00         +0.00
+    together                 +2.97         +2.97
+    mean of .3 s             +1.63         +2.97
+    threshold                +1.00         +1.00
+  side: 0.50 of what is hidden; risk 0.11
+  comes into view: 0.00 in 0.5 s, 0.01 in 1 s, 0.94 in 2 s, 0.95 in 3 s; 1.8 s from now (1.3 to 2.2)
+  entity: f8eadf57 hidden at +56 deg (std 6), exists with 0.96, by acoustic; the last look did not find it
+sensor acoustic: working
+sensor camera: working
+look of camera at 1.00 s: nobody from -34 to 34 deg, misses 0.10
+"""
+HELD = """\
+time  1.40 s
+left: advisory held: below the threshold now, it ends without news
+  since 0.70 s, valid until 2.10 s, rests on acoustic (impaired), camera (working)
+  log-odds that somebody comes into view within 3 s, nats:
+    at, s                     0.70          1.40
+    prior                    -0.41         -0.41
+    sequence                 +2.79         -1.24
+    look camera              +0.59         +0.59
+    emerged                  +0.00         +0.00
+    together                 +2.97         -1.05
+    mean of .3 s             +1.63         -1.05
+    threshold                +1.00         +1.00
+  side: 0.50 of what is hidden; risk 0.12
+  comes into view: 0.05 in 0.5 s, 0.10 in 1 s, 0.16 in 2 s, 0.26 in 3 s; 2.2 s from now (0.0 to 4.8)
+  entity: f8eadf57 hidden at +59 deg (std 13), exists with 0.40, by acoustic; the last look did not find it
+sound: sounds like speech: the evidence of this hop counts little
+sensor acoustic: impaired (sounds like speech)
+sensor camera: working
+look of camera at 1.40 s: nobody from -34 to 34 deg, misses 0.10
+"""
+
+
+@pytest.mark.parametrize(("time", "said"), [("1.0", RAISED), ("1.4", HELD)], ids=["raised", "held"])
+def test_it_says_what_raised_and_what_holds_an_advisory(time, said, states, capsys):
+    assert main(["explain", str(states), "--time", time, "--side", "left"]) == 0
+    assert capsys.readouterr().out == said
+
+
+def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, capsys):
+    assert main(["explain", str(states), "--time", "0.58", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["time_s"] == 0.6
+    assert {side: one["standing"] for side, one in told["sides"].items()} == {
+        "left": "below",
+        "right": "below",
+    }
+    terms = told["sides"]["left"]["cue"]["evidence"]["terms_nats"]
+    assert terms["prior"] == pytest.approx(np.log(0.4 / 0.6))  # Six of fifteen groups come within 3 s
+    assert terms["sequence"] > 2.0 > 0.0 > told["sides"]["right"]["cue"]["evidence"]["compared_nats"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--time 7.5", "expected a time from 0.1 to 1.5 s, in which it has snapshots, got 7.5 s"),
+        ("--time -1", "expected a time from 0.1 to 1.5 s"),
+        ("--time 1 --side up", "--side: expected one of left, right, got up"),
+        ("--time nan", "--time"),
+    ],
+)
+def test_a_time_outside_and_a_side_that_is_none_are_named(words, said, states, capsys):
+    assert main(["explain", str(states), *words.split()]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, tmp_path, capsys):
+    file = tmp_path / "old.jsonl"
+    file.write_text(states.read_text().replace('"version":"2.0.0"', '"version":"1.5.0"'))
+    assert main(["explain", str(file), "--time", "1"]) == 2
+    assert "old.jsonl: expected schema worldstate.Snapshot 2.x, got" in (said := capsys.readouterr().err)
+    assert "write it anew" in said
+    file.write_text("")
+    assert main(["explain", str(file), "--time", "1"]) == 2
+    assert "worldstate run --out" in capsys.readouterr().err

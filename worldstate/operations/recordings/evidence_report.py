@@ -1,0 +1,148 @@
+"""Which evidence raised or holds the advisories of a snapshot, side by side."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Literal, TypeAlias
+
+from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
+from worldstate.ground.values import seconds
+from worldstate.state import Entity, RiskCue, WorldState
+
+Standing: TypeAlias = Literal["raised", "held", "above", "below"]
+_SAID = {
+    "raised": "raised by what is heard and seen now",
+    "held": "held: below the threshold now, it ends without news",
+    "above": "none yet, though above the threshold: not for long enough, or the other side is likelier",
+    "below": "none: below the threshold",
+}
+_OF = {
+    "coming": "somebody comes into view within 3 s",
+    "hidden": "somebody is hidden on any side, by this window alone",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SideEvidenceReport:
+    """What is known of one side's advisory, at a time and at its onset.
+
+    Examples
+    --------
+    >>> from worldstate.state import EvidenceTerms, Priors
+    >>> terms = EvidenceTerms("coming", {"prior": -3.0, "sequence": 2.0}, -1.0, -0.4)
+    >>> cue = RiskCue("left", 0.9, 0.3, 0.1, 0.5, 0.2, 0.0, Priors(0.1, 0.1, 0.8), evidence=terms)
+    >>> SideEvidenceReport(cue, None, None).standing
+    'below'
+    """
+
+    cue: RiskCue
+    onset: RiskCue | None  # When the advisory began; None without one, or where the file begins later
+    entity: Entity | None
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the advisory is raised now, held, or why there is none."""
+        evidence = self.cue.evidence
+        above = evidence is not None and evidence.compared_nats >= evidence.threshold_nats
+        if self.cue.advisory is None:
+            return "above" if above else "below"
+        return "raised" if above else "held"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON-able values."""
+        onset = self.onset.evidence if self.onset is not None else None
+        return {
+            "standing": self.standing,
+            "cue": asdict(self.cue),
+            "evidence_at_onset": None if onset is None else asdict(onset),
+            "entity": None if self.entity is None else asdict(self.entity),
+        }
+
+    def lines(self, now_s: float) -> Iterator[str]:
+        """Yield it for people."""
+        cue, told = self.cue, self.cue.advisory
+        yield f"{cue.direction}: advisory {_SAID[self.standing]}"
+        if told is not None:
+            since_s, until_s = seconds(told.since_ns), seconds(told.valid_until_ns)
+            rests = ", ".join(f"{one.sensor} ({one.condition})" for one in told.sensors)
+            yield f"  since {since_s:.2f} s, valid until {until_s:.2f} s, rests on {rests or 'no sensor'}"
+        yield from self._terms(now_s)
+        yield f"  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}"
+        if cue.within is not None:
+            chances = ", ".join(f"{chance:.2f} in {after_s} s" for after_s, chance in cue.within.items())
+            yield f"  comes into view: {chances}{_time(cue)}"
+        yield f"  entity: {'none' if self.entity is None else _described(self.entity)}"
+
+    def _terms(self, now_s: float) -> Iterator[str]:
+        evidence = self.cue.evidence
+        if evidence is None:
+            return
+        both, times_s, told = [evidence], [now_s], self.cue.advisory
+        if told is not None and self.onset not in (None, self.cue) and self.onset.evidence is not None:
+            both, times_s = [self.onset.evidence, evidence], [seconds(told.since_ns), now_s]
+        yield f"  log-odds that {_OF[evidence.hypothesis]}, nats:"
+        yield f"    {'at, s':16s}{''.join(f'{time_s:14.2f}' for time_s in times_s)}"
+        names = dict.fromkeys(name for one in both for name in one.terms_nats)
+        for name in names:
+            yield _row(name, *(one.terms_nats.get(name, 0.0) for one in both))
+        yield _row("together", *(sum(one.terms_nats.values()) for one in both))
+        if evidence.hypothesis == "coming":
+            yield _row("mean of .3 s", *(one.compared_nats for one in both))
+        yield _row("threshold", *(one.threshold_nats for one in both))
+
+
+def evidence_report(
+    state: WorldState, onsets: dict[str, WorldState], side: str | None = None
+) -> dict[str, SideEvidenceReport]:
+    """Return the report of every side, or one; `onsets` are the states in which their advisories began."""
+    entities = {entity.id: entity for entity in state.entities}
+    reports = {}
+    for cue in state.cues:
+        if side in (None, cue.direction):
+            began = onsets.get(cue.direction)
+            first = None if began is None else _cue_of(began, cue.direction)
+            reports[cue.direction] = SideEvidenceReport(cue, first, entities.get(cue.entity_id or ""))
+    return reports
+
+
+def common_lines(state: WorldState) -> Iterator[str]:
+    """Yield what all sides share: what was heard, who looked, how the sensors are, what has just happened."""
+    if isinstance(state.domain, Foreign):
+        yield f"sound: {state.domain.reason}: the evidence of this hop counts little"
+    elif isinstance(state.domain, WarningSignal):
+        yield f"sound: a warning signal ({state.domain.signal})"
+    if state.no_sequence is not None:
+        yield f"sequence: not used, {state.no_sequence.reason}"
+    for one in state.sensors:
+        yield f"sensor {one.sensor}: {one.condition}{f' ({one.reason})' if one.reason else ''}"
+    for view in state.searched:
+        right, left = (f"{math.degrees(end_rad):.0f}" for end_rad in view.sector_rad)
+        found = f"{'somebody' if view.found else 'nobody'} from {right} to {left} deg"
+        yield f"look of {view.sensor} at {seconds(view.stamp_ns):.2f} s: {found}, misses {view.miss_rate:.2f}"
+    for event in state.events:
+        yield f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}"
+
+
+def _cue_of(state: WorldState, direction: str) -> RiskCue | None:
+    return next((cue for cue in state.cues if cue.direction == direction), None)
+
+
+def _row(name: str, *nats: float) -> str:
+    # Of what rounds to nothing the sign says nothing.
+    return f"    {name:16s}{''.join(f'{round(value, 2) + 0.0:+14.2f}' for value in nats)}"
+
+
+def _time(cue: RiskCue) -> str:
+    if cue.time_to_visible_s is None:
+        return ""
+    low, best, high = cue.time_to_visible_s
+    return f"; {best:.1f} s from now ({low:.1f} to {high:.1f})"
+
+
+def _described(entity: Entity) -> str:
+    place = f"{math.degrees(entity.azimuth_rad):+.0f} deg (std {math.degrees(entity.azimuth_std_rad):.0f})"
+    found = {"visible": "found it", "absent": "did not find it", "unqueried": "did not search there"}
+    return (
+        f"{entity.id[:8]} {entity.status} at {place}, exists with {entity.existence_probability:.2f}, "
+        f"by {', '.join(entity.sources)}; the last look {found[entity.visibility.answer]}"
+    )
