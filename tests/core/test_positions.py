@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
@@ -199,8 +201,24 @@ def test_a_hidden_vehicle_announced_by_radio_alone_is_an_entity_with_a_place() -
     assert np.mean(inside) > 0.8
     left, right = world.state.cues
     assert left.advisory and not right.advisory and left.risk > 0.9 > 0.1 > right.risk
-    assert left.entity_id == car.id
+    assert left.entity_id == car.id and left.time_to_visible_s == car.time_to_visible_s
     assert WorldState.from_json(world.state.to_json()) == world.state
+
+
+def test_vehicles_announced_on_both_sides_are_advised_of_whatever_the_sound_says() -> None:
+    """With a sequence model that hears nothing, and without one."""
+    quiet = np.full(len(GROUPS), 1.0 / len(GROUPS))
+    reading = SequenceReading(np.stack([quiet, quiet]), quiet, 0.0, SequenceAlarm(50.0, 20.0))
+    for said in (None, reading):
+        world = WorldFilter()
+        for hop in range(1, 8):
+            left = crossing(hop / 10)
+            right = replace(left, position_m=(10.0, -left.position_m[1]), velocity_mps=(0.0, 8.0))
+            sound = replace(heard(hop / 10), sequence=said)
+            world = after(sound, radio(hop / 10 + 0.05, left, right), world=world)
+        assert [bool(cue.advisory) for cue in world.state.cues] == [True, True]
+        assert sorted(one.direction for one in world.state.entities) == ["left", "right"]
+        assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
 
 
 def test_an_announced_vehicle_keeps_its_identity_when_camera_or_radar_find_it() -> None:
@@ -324,3 +342,27 @@ def test_the_latency_of_a_scan_puts_it_where_it_was_taken() -> None:
 def test_what_is_no_position_is_refused_by_name(wrong, words: str) -> None:
     with pytest.raises(InvalidArgumentError, match=words):
         wrong()
+
+
+def test_radar_finds_the_vehicle_that_was_heard_where_it_comes_into_view() -> None:
+    world = after(*[heard(hop / 10, left=4.0) for hop in range(1, 15)])
+    (before,) = world.state.entities
+    edge, elsewhere = (
+        Position((r * math.cos(a), r * math.sin(a)), diagonal(0.3, 0.3)) for r, a in ((12, 0.5), (30, 0.0))
+    )
+    (found,) = after(radar(1.45, edge), world=world).state.entities
+    assert (found.id, found.status) == (before.id, "visible")
+    both = after(radar(1.45, elsewhere), world=world).state.entities
+    assert [one.status for one in both] == ["hidden", "visible"] and both[0].id == before.id
+
+
+def test_radar_and_camera_speak_of_one_car() -> None:
+    world, boxes = WorldFilter(), tuple(Sighting(a, 0.02, "car", 0.9) for a in (0.1, -0.2))
+    cars = [Position((20.0 * math.cos(a), 20.0 * math.sin(a)), diagonal(0.5, 0.5)) for a in (0.1, -0.2)]
+    for hop in range(1, 8):
+        world = after(heard(hop / 10, boxes=boxes), radar(hop / 10 + 0.05, *cars), world=world)
+    entities = world.state.entities
+    assert [one.sources for one in entities] == [("radar", "vision")] * 2
+    # The box is the sharper one across, the radar the only one along.
+    across = [math.sqrt(np.linalg.eigvalsh(np.array(one.covariance)[:2, :2])[0]) for one in entities]
+    assert max(across) < 0.25

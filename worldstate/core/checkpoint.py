@@ -117,6 +117,8 @@ class FilterRecord:
             raise InvalidArgumentError("memory.trail.beliefs: expected at least one")
         if any(one.run > self.policy.sustain_hops for one in memory.rules):
             raise InvalidArgumentError("memory.rules: expected runs within the policy's rule")
+        if any(side >= k for one in memory.rules for side in one.announced):
+            raise InvalidArgumentError("memory.rules: expected known sides")
         if any(track.side >= k for track in memory.tracks):
             raise InvalidArgumentError("memory.tracks: expected known sides")
 

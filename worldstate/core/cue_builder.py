@@ -11,7 +11,7 @@ from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
 
 from .memory import Memory, priors_of
 from .sequence_memory import SequenceMemory
-from .snapshot_builder import hidden_azimuth, sector, time_to_arrival
+from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in
 from .step import FilterModel, advisory_ends_ns
 
 # Certainty has no end; e^-20 is once in fifteen years of hops.
@@ -59,6 +59,8 @@ def _cue(
     share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     within, interval_s = (None, None) if times is None else times
     arrival_s = None if track is None else time_to_arrival(track)
+    # Distance and speed of who has announced itself tell more than the sound.
+    interval_s = (track and visible_in(track, model.site)) or interval_s
     return RiskCue(
         direction=side.label,
         azimuth_rad=azimuth_rad,

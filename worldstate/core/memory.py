@@ -28,6 +28,7 @@ class SourceRule:
     alarm: bool
     stamp_ns: int  # Of its last measurement
     fault: str | None = None  # What was wrong with it then
+    announced: tuple[Count, ...] = ()  # Sides on which its messages announce vehicles; empty of what hears
 
 
 @dataclass(frozen=True, slots=True)

@@ -184,18 +184,23 @@ def _place(track: Track, range_m: float | None, hidden: bool, site: SiteGeometry
         return {}
     x, y, vx, vy = place.mean.tolist()
     moves = place.velocity_std_mps < _KNOWN_VELOCITY_STD_MPS
-    times_s = None
-    if hidden and moves:
-        times_s = time_to_visible(place, site.sides[track.side], site.ego_speed_mps)
     return {
         "position_m": (x, y, 0.0),
         "velocity_mps": (vx, vy, 0.0) if moves else None,
         "covariance": tuple(tuple(row) for row in place.covariance.tolist()),
-        "time_to_visible_s": None if times_s is None else _interval(*times_s),
+        "time_to_visible_s": visible_in(track, site) if hidden else None,
     }
 
 
-def _interval(mean_s: float, std_s: float) -> tuple[float, float, float]:
+def visible_in(track: Track, site: SiteGeometry) -> tuple[float, float, float] | None:
+    """Return low, best and high time to visible of a hidden entity by its place, None where it tells none."""
+    place = track.place
+    if place is None or place.velocity_std_mps >= _KNOWN_VELOCITY_STD_MPS:
+        return None
+    expected = time_to_visible(place, site.sides[track.side], site.ego_speed_mps)
+    if expected is None:
+        return None
+    mean_s, std_s = expected
     return max(mean_s - _NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + _NINE_OF_TEN * std_s
 
 

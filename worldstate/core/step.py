@@ -240,13 +240,16 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     looks = _with_look(memory, _scan_look(scan))
     memory = replace(memory, births=found.births, looks=looks, seq=memory.seq + 1)
     chances = announced(memory.tracks, model.site)
-    raised = partial(ExplanationBelief.at_least, hidden=chances)
-    memory = replace(memory, explanation=raised(memory.explanation), lag=memory.lag.map(raised))
-    if not any(chances) or scan.searched is not None:
+    if not any(chances):
         # Whoever has come into view, or is gone, ends the rule of the source that announced it.
         return replace(memory, rules=tuple(one for one in memory.rules if one.source != scan.source))
+    raised = partial(ExplanationBelief.at_least, hidden=chances)
+    memory = replace(memory, explanation=raised(memory.explanation), lag=memory.lag.map(raised))
+    if scan.searched is not None:
+        return memory
     said = SignatureEvidence(model.context.directions, tuple(map(_log_odds, chances)), 0.0, 0.0)
-    return _ruled(memory, scan.source, scan.stamp_ns, said, Unqueried("messages search nothing"), model)
+    sides = tuple(k for k, chance in enumerate(chances) if chance > 0.5)
+    return _ruled(memory, scan.source, scan.stamp_ns, said, _NO_LOOK, model, announced=sides)
 
 
 def _scan_look(scan: PositionScan) -> CountedLook:
@@ -283,6 +286,7 @@ def _ruled(
     answer: CoEvidence,
     model: FilterModel,
     fault: str | None = None,
+    announced: tuple[int, ...] = (),
 ) -> Memory:
     """Return the memory after one source's sustained rule has seen what it says."""
     # At the policy's own prior, without memory: the statistic that the threshold was calibrated on.
@@ -292,7 +296,7 @@ def _ruled(
     run = next((one.run for one in memory.rules if one.source == source), 0)
     rule = replace(model.policy.rule(), run=run).advance(held)
     others = (one for one in memory.rules if one.source != source)
-    rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns, fault))
+    rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns, fault, announced))
     return replace(
         memory,
         instant=instant,
@@ -332,14 +336,20 @@ def _adapted(memory: Memory, stamp_ns: int, policy: CueingPolicy) -> AdaptiveThr
 def advisory_ends_ns(memory: Memory) -> tuple[int | None, ...]:
     """Return for each side when its advisory ends without news, None where there is none.
 
-    The rule names the likeliest side, or all in a tie; the alarm of a sequence model each side by itself.
+    The rule names the likeliest side, or all in a tie; the alarm of a sequence model and messages name each
+    side by itself.
     """
-    sequence = memory.sequence
+    sequence, hidden = memory.sequence, memory.explanation.hidden
     if sequence is not None and sequence.alarm is not None:
-        return sequence.alarm_ends_ns(memory.stamp_ns)
-    hidden, end_ns = memory.explanation.hidden, _rule_ends_ns(memory)
-    least = max(hidden) * (1.0 - _TIE)
-    return tuple(end_ns if p >= least else None for p in hidden)
+        heard_ns = sequence.alarm_ends_ns(memory.stamp_ns)
+    else:
+        end_ns, least = _rule_ends_ns(memory), max(hidden) * (1.0 - _TIE)
+        heard_ns = tuple(end_ns if p >= least else None for p in hidden)
+    told_ns = (_rule_ends_ns(memory, k) for k in range(len(hidden)))
+    return tuple(
+        max((end_ns for end_ns in ends_ns if end_ns is not None), default=None)
+        for ends_ns in zip(heard_ns, told_ns, strict=True)
+    )
 
 
 def alarmed(memory: Memory) -> tuple[bool, ...]:
@@ -347,9 +357,17 @@ def alarmed(memory: Memory) -> tuple[bool, ...]:
     return tuple(end_ns is not None for end_ns in advisory_ends_ns(memory))
 
 
-def _rule_ends_ns(memory: Memory) -> int | None:
-    """Return when the last rule in alarm ends; that of a source that is silent for a second has ended."""
-    ends_ns = (one.stamp_ns + NEWS_HOLDS_NS for one in memory.rules if one.alarm)
+def _rule_ends_ns(memory: Memory, announced: int | None = None) -> int | None:
+    """Return when the last rule in alarm ends, of those that hear or of those that announce for a side.
+
+    That of a source that is silent for a second has ended.
+    """
+    rules = (one for one in memory.rules if one.alarm)
+    if announced is None:
+        rules = (one for one in rules if not one.announced)
+    else:
+        rules = (one for one in rules if announced in one.announced)
+    ends_ns = (one.stamp_ns + NEWS_HOLDS_NS for one in rules)
     return max((end_ns for end_ns in ends_ns if end_ns >= memory.stamp_ns), default=None)
 
 
