@@ -14,6 +14,7 @@ from worldstate.adapters.acoustic import AcousticAdapter, AcousticSettings
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds
@@ -164,6 +165,16 @@ def test_growing_sound_approaches() -> None:
         rates = [m.approach.inverse_tta_hz for m in measured if isinstance(m.approach, Approach)]
         assert len(rates) > 5
         assert all(np.sign(rate) == np.sign(gain_per_s) for rate in rates)
+
+
+def test_faults_of_microphones_are_told_and_stand_in_the_snapshot() -> None:
+    sound = plane_wave(0.2, 1.3)
+    whole = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)[-1]
+    sound[:, [2, 5]] = 0.0
+    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)[-1]
+    assert (whole.fault, measured.fault) == (None, "microphones: 2 dead")
+    (told,) = WorldFilter().update(measured).state.sensors
+    assert (told.condition, told.reason) == ("impaired", measured.fault)
 
 
 def test_keeps_the_last_frame_for_plots() -> None:

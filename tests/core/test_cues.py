@@ -48,7 +48,7 @@ def run(measured: list[Measurement], world: WorldFilter | None = None) -> list[W
 
 
 @given(SEEDS, st.booleans())
-@settings(max_examples=3)
+@settings(max_examples=2)
 def test_an_advisory_says_since_when_and_ends_when_it_says(seed: int, sequence: bool) -> None:
     worlds = run(script(np.random.default_rng(seed), 20, sequence))
     since: dict[str, int] = {}
@@ -162,7 +162,7 @@ def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
 
 
 @given(SEEDS, st.booleans())
-@settings(max_examples=4)
+@settings(max_examples=3)
 def test_events_account_for_every_entity(seed: int, sequence: bool) -> None:
     alive: dict[str, str] = {}
     kinds = set()
@@ -183,6 +183,12 @@ def test_events_account_for_every_entity(seed: int, sequence: bool) -> None:
             assert not seen_now or status == "visible"
             alive[name] = status
     assert {"born", "handed_over", "coasting", "died"} <= kinds
+
+
+def test_a_snapshot_holds_no_more_than_64_events() -> None:
+    many = tuple(Position((5.0 + one, 0.0), ((0.01, 0.0), (0.0, 0.01))) for one in range(100))
+    state = WorldFilter().update(PositionScan("lidar", 10**9, many)).state
+    assert (len(state.entities), len(state.events)) == (100, 64)
 
 
 def test_a_pass_is_born_handed_over_coasts_and_dies() -> None:
@@ -225,7 +231,7 @@ def test_the_forecast_is_that_of_straight_lines(seed: int) -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=3)
+@settings(max_examples=2)
 def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
     for world in run(script(np.random.default_rng(seed), 30, sequence=True)):
         for one in world.state.entities:
