@@ -46,7 +46,7 @@ def states(tmp_path_factory) -> Path:
 
 RAISED = """\
 time  1.00 s
-left: advisory raised by what is heard and seen now
+left: advisory raised: not below the threshold now
   since 0.70 s, valid until 2.00 s, rests on acoustic (working), camera (working)
   log-odds that somebody comes into view within 3 s, nats:
     at, s                     0.70          1.00

@@ -115,6 +115,28 @@ def test_what_evidence_adds_to_the_rule_adds_up_to_the_statistic(seed: int) -> N
             assert (cue.evidence.terms_nats["look"] == 0.0) == isinstance(_last(world), Unqueried)
 
 
+@pytest.mark.parametrize("sequence", [False, True])
+def test_an_advisory_that_messages_raise_says_so(sequence: bool) -> None:
+    """Nothing is heard on either side, and on the left a vehicle says where it is."""
+    flat = SignatureEvidence(("left", "right"), (-3.0, -3.0), -1.0, 1.0)
+    said = SequenceReading(np.stack([SHARE, SHARE]), SHARE, 0.0, SequenceAlarm(5.0, 20.0))
+    world = WorldFilter()
+    for hop in range(1, 9):
+        car = Position((10.0, 30.0 - 0.8 * hop), tuple(map(tuple, np.diag([0.5] * 4))), (0.0, -8.0), 0.95)
+        sound = Measurement(hop * 10**8, flat, UNASKED, SILENT, SILENT, sequence=said if sequence else None)
+        world = world.update(PositionScan("v2x", hop * 10**8 - 10**7, (car,))).update(sound)
+    left, right = world.state.cues
+    assert left.advisory is not None and right.advisory is None
+    assert left.evidence is not None and right.evidence is not None
+    assert (left.evidence.hypothesis, right.evidence.hypothesis) == (
+        "announced",
+        "coming" if sequence else "hidden",
+    )
+    assert left.evidence.compared_nats == pytest.approx(sum(left.evidence.terms_nats.values()))
+    assert left.evidence.compared_nats >= left.evidence.threshold_nats > right.evidence.compared_nats
+    assert {one.sensor for one in left.advisory.sensors} == {"acoustic", "v2x"}
+
+
 def _last(world: WorldFilter) -> CoEvidence:
     assert world.lag is not None
     return world.lag.arrivals[-1].measurement.co_evidence

@@ -6,13 +6,14 @@ from functools import partial
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.belief.announced import announced
 from worldstate.belief.birth_death import hidden_on
 from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
 
 from .memory import Memory, priors_of
 from .sequence_memory import SequenceMemory
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in
-from .step import FilterModel, advisory_ends_ns
+from .step import FilterModel, advisory_ends_ns, announced_ends_ns, claimed_nats, heard_ends_ns
 
 # Certainty has no end; e^-20 is once in fifteen years of hops.
 _MOST_NATS = 20.0
@@ -71,7 +72,7 @@ def _cue(
         log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
         hypotheses=priors_of(explanation),
         advisory=advisory,
-        alpha=None if evidence.hypothesis == "coming" else model.policy.alpha or None,
+        alpha=model.policy.alpha or None if evidence.hypothesis == "hidden" else None,
         entity_id=None if track is None else track.id,
         horizon_s=arrival_s if interval_s is None else interval_s[1],
         within=within,
@@ -100,7 +101,16 @@ def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> li
 
 
 def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
-    """Return for each side what its alarm goes by: that of a sequence, or the rule of all sides together."""
+    """Return what raises the advisory of each side: the sound, or messages where they alone do."""
+    heard, told_ns = _heard(memory, model), announced_ends_ns(memory)
+    if all(end_ns is None for end_ns in told_ns):
+        return heard
+    told, sides = _announced(memory, model), zip(heard, heard_ends_ns(memory), told_ns, strict=True)
+    return [own if heard_ns is not None or end_ns is None else told for own, heard_ns, end_ns in sides]
+
+
+def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
+    """Return for each side what the alarm of a sequence goes by, or the rule of all sides together."""
     kept, instant = memory.sequence, memory.instant
     assert instant is not None
     if kept is not None and kept.alarm is not None:
@@ -110,12 +120,27 @@ def _evidence(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
             EvidenceTerms("coming", {name: both[k] for name, both in terms.items()}, means[k], threshold)
             for k in range(len(means))
         ]
-    prior = _log_odds(sum(model.policy.reference_prior[:-2]))
+    prior, threshold = _rule_log_odds(memory, model)
     heard, looked = _bounded(memory.heard_nats), _bounded(instant.log_lambda)
     terms_nats = {"prior": prior, "window": heard, "look": looked - heard}
-    threshold = _log_odds(model.policy.gamma_at(memory.threshold.shift_nats))
     told = EvidenceTerms("hidden", terms_nats, prior + looked, threshold)
     return [told] * len(model.site.sides)
+
+
+def _announced(memory: Memory, model: FilterModel) -> EvidenceTerms:
+    """Return what the rule of messages goes by, all sides together."""
+    weights = model.policy.reference_prior[:-2]
+    chances = announced(memory.tracks, model.site)
+    odds = sum(w * math.exp(claimed_nats(p)) for w, p in zip(weights, chances, strict=True)) / sum(weights)
+    prior, threshold = _rule_log_odds(memory, model)
+    nats = math.log(odds)
+    return EvidenceTerms("announced", {"prior": prior, "messages": nats}, prior + nats, threshold)
+
+
+def _rule_log_odds(memory: Memory, model: FilterModel) -> tuple[float, float]:
+    """Return the log-odds of the rule's prior and of its threshold."""
+    gamma = model.policy.gamma_at(memory.threshold.shift_nats)
+    return _log_odds(sum(model.policy.reference_prior[:-2])), _log_odds(gamma)
 
 
 def _log_odds(probability: float) -> float:

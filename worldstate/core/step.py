@@ -247,7 +247,7 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     memory = replace(memory, explanation=raised(memory.explanation), lag=memory.lag.map(raised))
     if scan.searched is not None:
         return memory
-    said = SignatureEvidence(model.context.directions, tuple(map(_log_odds, chances)), 0.0, 0.0)
+    said = SignatureEvidence(model.context.directions, tuple(map(claimed_nats, chances)), 0.0, 0.0)
     sides = tuple(k for k, chance in enumerate(chances) if chance > 0.5)
     return _ruled(memory, scan.source, scan.stamp_ns, said, _NO_LOOK, model, announced=sides)
 
@@ -263,7 +263,8 @@ def _scan_look(scan: PositionScan) -> CountedLook:
     return CountedLook(source, stamp_ns, source, answer, ends_rad)
 
 
-def _log_odds(probability: float) -> float:
+def claimed_nats(probability: float) -> float:
+    """Return the log-odds that a message claims for a hidden entity of such existence."""
     # At even odds and below a message claims nothing, as the prior of the rule.
     known = min(max(probability, 0.5), _MOST_CERTAIN)
     return math.log(known / (1.0 - known))
@@ -339,17 +340,24 @@ def advisory_ends_ns(memory: Memory) -> tuple[int | None, ...]:
     The rule names the likeliest side, or all in a tie; the alarm of a sequence model and messages name each
     side by itself.
     """
-    sequence, hidden = memory.sequence, memory.explanation.hidden
-    if sequence is not None and sequence.alarm is not None:
-        heard_ns = sequence.alarm_ends_ns(memory.stamp_ns)
-    else:
-        end_ns, least = _rule_ends_ns(memory), max(hidden) * (1.0 - _TIE)
-        heard_ns = tuple(end_ns if p >= least else None for p in hidden)
-    told_ns = (_rule_ends_ns(memory, k) for k in range(len(hidden)))
     return tuple(
         max((end_ns for end_ns in ends_ns if end_ns is not None), default=None)
-        for ends_ns in zip(heard_ns, told_ns, strict=True)
+        for ends_ns in zip(heard_ends_ns(memory), announced_ends_ns(memory), strict=True)
     )
+
+
+def heard_ends_ns(memory: Memory) -> tuple[int | None, ...]:
+    """Return for each side when its advisory by what is heard and seen ends."""
+    sequence, hidden = memory.sequence, memory.explanation.hidden
+    if sequence is not None and sequence.alarm is not None:
+        return sequence.alarm_ends_ns(memory.stamp_ns)
+    end_ns, least = _rule_ends_ns(memory), max(hidden) * (1.0 - _TIE)
+    return tuple(end_ns if p >= least else None for p in hidden)
+
+
+def announced_ends_ns(memory: Memory) -> tuple[int | None, ...]:
+    """Return for each side when its advisory by messages ends."""
+    return tuple(_rule_ends_ns(memory, k) for k in range(len(memory.births)))
 
 
 def alarmed(memory: Memory) -> tuple[bool, ...]:

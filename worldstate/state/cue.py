@@ -43,12 +43,12 @@ class EvidenceTerms:
 
     Parameters
     ----------
-    hypothesis : {"coming", "hidden"}
-        Somebody comes into view from this side within three seconds, by the alarm of a sequence model; or
-        somebody is hidden on any side, by the sustained rule.
+    hypothesis : {"coming", "hidden", "announced"}
+        Somebody comes into view from this side within three seconds, by the alarm of a sequence model;
+        somebody is hidden on any side, by the sustained rule; or by the rule of messages alone.
     terms_nats : mapping of str to float
-        By what was said: the prior, the sequence or the window, each sensor's look, and what has just
-        come into view; each given those before it, so that they add up.
+        By what was said: the prior, the sequence or the window, each sensor's look, what has just come into
+        view, messages; each given those before it, so that they add up.
     compared_nats : float
         What is held against the threshold: for a sequence the mean of the log-odds over .3 s.
     threshold_nats : float
@@ -60,7 +60,7 @@ class EvidenceTerms:
     4.5
     """
 
-    hypothesis: Literal["coming", "hidden"]
+    hypothesis: Literal["coming", "hidden", "announced"]
     terms_nats: Mapping[str, float]
     compared_nats: float
     threshold_nats: float

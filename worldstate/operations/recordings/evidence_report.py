@@ -11,7 +11,7 @@ from worldstate.state import Entity, RiskCue, WorldState
 
 Standing: TypeAlias = Literal["raised", "held", "above", "below"]
 _SAID = {
-    "raised": "raised by what is heard and seen now",
+    "raised": "raised: not below the threshold now",
     "held": "held: below the threshold now, it ends without news",
     "above": "none yet, though above the threshold: not for long enough, or the other side is likelier",
     "below": "none: below the threshold",
@@ -19,6 +19,7 @@ _SAID = {
 _OF = {
     "coming": "somebody comes into view within 3 s",
     "hidden": "somebody is hidden on any side, by this window alone",
+    "announced": "somebody is hidden, by messages alone",
 }
 
 
