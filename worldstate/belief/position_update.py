@@ -23,7 +23,7 @@ from .kinematics.cartesian import (
 )
 from .kinematics.polar import AZIMUTH, LOG_RANGE
 from .site_geometry import SiteGeometry, normal_share
-from .track import Track, entity_id, located, merged, relabelled
+from .track import Track, entity_id, follow_places, merged, relabelled
 from .vision_update import VisionUpdate, emerged_sides
 
 # m/s, of a velocity that was not measured: wide, so that it decides nothing.
@@ -84,8 +84,9 @@ def position_update(
         counts[track.side] += track.was_hidden
         born += not track.was_hidden
         fresh.append(track)
-    emerged = emerged_sides(handed_over, fresh, site)
-    seen = VisionUpdate((*after, *fresh), explanation, handed_over, emerged, born)
+    known = follow_places([*after, *fresh], site)
+    emerged = emerged_sides(handed_over, known[len(after) :], site)
+    seen = VisionUpdate(known, explanation, handed_over, emerged, born)
     return PositionUpdate(seen, tuple(counts))
 
 
@@ -185,26 +186,31 @@ def _found(track: Track, position: Position, scan: PositionScan, site: SiteGeome
         sources=merged(track.sources, scan.source),
         updated_ns=scan.stamp_ns,
         approach_heard=True,
+        place=_placed(track, position),
     )
     if scan.searched is not None:
-        changed = _sighted(changed, scan.stamp_ns, scan.searched)
+        return _sighted(changed, scan.stamp_ns, scan.searched)
+    return _at_side(changed, site)
+
+
+def _placed(track: Track, position: Position) -> CartesianBelief:
     if track.place is not None:
-        place = update_position(track.place, position)
-    else:
-        place = at_position(position)
-        if track.seen:
-            place = update_bearing(place, track.motion.azimuth_rad, track.motion.azimuth_std_rad)
-    return _at_side(changed, place, site)
+        return update_position(track.place, position)
+    place = at_position(position)
+    if not track.seen:
+        return place
+    return update_bearing(place, track.motion.azimuth_rad, track.motion.azimuth_std_rad)
 
 
-def _at_side(track: Track, place: CartesianBelief, site: SiteGeometry) -> Track:
-    """Return the track at a place, on the side whose occluder hides it there, if one does."""
-    side, behind = site.hiding_side(math.atan2(place.mean[1], place.mean[0]), _SHARP_RAD)
+def _at_side(track: Track, site: SiteGeometry) -> Track:
+    """Return a track that a message has placed on the side whose occluder hides it there, if one does."""
+    assert track.place is not None
+    x, y = track.place.mean[:2].tolist()
+    side, behind = site.hiding_side(math.atan2(y, x), _SHARP_RAD)
     unseen_ns = track.updated_ns - (track.last_seen_ns or 0)
     unseen = not track.seen or unseen_ns > site.settings.reocclusion_after_s * NANOSECONDS_PER_SECOND
-    if behind >= 0.5 and unseen:
-        track = replace(track, side=side, seen=False, was_hidden=True)
-    return located(track, place, site)
+    hidden = behind >= 0.5 and unseen
+    return replace(track, side=side, seen=False, was_hidden=True) if hidden else track
 
 
 def _sighted(track: Track, stamp_ns: int, searched: SearchedSector) -> Track:
@@ -274,8 +280,9 @@ def _born(
         updated_ns=scan.stamp_ns,
         approach_heard=True,
         was_hidden=hidden,
+        place=at_position(position),
     )
     if scan.searched is not None:
         existence = _detected(track.existence, scan.searched)
         track = _sighted(replace(track, existence=existence), scan.stamp_ns, scan.searched)
-    return located(track, at_position(position), site)
+    return track

@@ -78,7 +78,7 @@ def predict_tracks(
     tracks: Sequence[Track], hidden_shares: Sequence[float], step_s: float, site: SiteGeometry
 ) -> tuple[Track, ...]:
     """Return the tracks after a time step without a measurement; shares are P(hidden | exists)."""
-    moved = [_driven_on(track, step_s, site) for track in tracks]
+    moved = list(_driven_on(tracks, step_s, site))
     polar = [i for i, track in enumerate(moved) if track.place is None]
     if not polar:
         return tuple(moved)
@@ -88,16 +88,23 @@ def predict_tracks(
     return tuple(moved)
 
 
-def _driven_on(track: Track, step_s: float, site: SiteGeometry) -> Track:
-    """Return a track with its place a step later, or without one where that is lost."""
-    if track.place is None:
-        return track
-    place = predict_place(track.place, step_s, _acceleration(track, site.settings), site.ego_speed_mps)
-    if place.position_std_m <= _LOST_PLACE_M:
-        # No life time here: who keeps sending is there, and who does not is lost within seconds.
-        return located(track, place, site)
-    motion = track.motion if track.seen else site.prior(track.side)
-    return replace(track, place=None, behind=1.0, motion=motion)
+def _driven_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> tuple[Track, ...]:
+    """Return the tracks with their places a step later, or without those that are lost."""
+    placed = [(i, one.place, _acceleration(one, site.settings)) for i, one in enumerate(tracks) if one.place]
+    if not placed:
+        return tuple(tracks)
+    stacked = CartesianBelief.stacked([place for _, place, _ in placed])
+    after = predict_place(stacked, step_s, np.array([one for _, _, one in placed]), site.ego_speed_mps)
+    moved = list(tracks)
+    for (i, _, _), place in zip(placed, after.each(), strict=True):
+        track = tracks[i]
+        if place.position_std_m <= _LOST_PLACE_M:
+            # No life time here: who keeps sending is there, and who does not is lost within seconds.
+            moved[i] = replace(track, place=place)
+        else:
+            motion = track.motion if track.seen else site.prior(track.side)
+            moved[i] = replace(track, place=None, behind=1.0, motion=motion)
+    return follow_places(moved, site)
 
 
 def _acceleration(track: Track, settings: FilterSettings) -> float:
@@ -125,11 +132,18 @@ def _relaxed(
         yield replace(track, motion=moved, existence=existence)
 
 
-def located(track: Track, place: CartesianBelief, site: SiteGeometry) -> Track:
-    """Return the track at a place, from which its polar motion and its chance to be hidden follow."""
-    motion = polar_motion(place, site.ego_speed_mps)
+def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> tuple[Track, ...]:
+    """Return the tracks with the polar motion, and the chance to be hidden, that follow from their places."""
+    places = [track.place for track in tracks if track.place is not None]
+    if not places:
+        return tuple(tracks)
+    motions = iter(polar_motion(CartesianBelief.stacked(places), site.ego_speed_mps).each())
+    return tuple(track if track.place is None else _followed(track, next(motions), site) for track in tracks)
+
+
+def _followed(track: Track, motion: MotionBelief, site: SiteGeometry) -> Track:
     behind = site.sides[track.side].behind(motion.azimuth_rad, motion.azimuth_std_rad)
-    return replace(track, place=place, motion=motion, behind=behind)
+    return replace(track, motion=motion, behind=behind)
 
 
 def relabelled(labels: tuple[Label, ...], seen_as: ClassShares) -> tuple[Label, ...]:

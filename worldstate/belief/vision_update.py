@@ -19,7 +19,7 @@ from .kinematics.motion import MotionBelief, update_azimuth
 from .kinematics.polar import LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
-from .track import Track, entity_id, located, merged, relabelled
+from .track import Track, entity_id, follow_places, merged, relabelled
 
 # Of (theta_dot rad/s, rho 1/s) at the first sighting: a car at 50 km/h passing at 15 m has .9 rad/s, two
 # deviations. A parked one has none, but zero would make the covariance singular.
@@ -147,16 +147,17 @@ def _turned(
     tracks: Sequence[Track], sightings: Sequence[Sighting], found: Mapping[int, int], site: SiteGeometry
 ) -> dict[int, Track]:
     """Return the found tracks, by their index, with their motion after the bearings of their sightings."""
-    turned, usual = {}, []
+    turned, usual, placed = {}, [], {}
     for i, j in found.items():
         track, sighting = tracks[i], sightings[j]
         if track.place is not None:
             place = update_bearing(track.place, sighting.azimuth_rad, sighting.std_rad)
-            turned[i] = located(track, place, site)
+            placed[i] = replace(track, place=place)
         elif track.seen and sighting.moving == track.moving:
             usual.append(i)
         else:
             turned[i] = replace(track, motion=_motion_at(sighting, track.motion))
+    turned |= zip(placed, follow_places(list(placed.values()), site), strict=True)
     if usual:
         motion = MotionBelief.stacked([tracks[i].motion for i in usual])
         azimuth_rad = np.array([sightings[found[i]].azimuth_rad for i in usual])

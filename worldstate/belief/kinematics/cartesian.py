@@ -8,6 +8,7 @@ filterpy's `Q_continuous_white_noise`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from worldstate.ground.values import wrap_angle
 from worldstate.measurement.position import Position
 
 from .motion import MotionBelief, checked_covariance
+from .polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 
 # m/s: without a measured velocity a road user in town may drive at up to twice this, in any direction.
 _UNKNOWN_SPEED_STD = 10.0
@@ -27,16 +29,29 @@ _NEAREST_M = 1.0
 # rad: no sensor knows a bearing better. Its square is added to polar variances, too: a sharp position far
 # away would leave a covariance that is singular to rounding, and its checkpoint would be refused.
 _LEAST_STD = 1e-4
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CartesianBelief:
-    """Gaussian over (x, y, vx, vy), m and m/s."""
+    """Gaussian over (x, y, vx, vy), m and m/s.
+
+    Shapes: mean (4,), covariance (4, 4), or with a leading axis of many entities to predict them at once.
+    """
 
     # shape (4,)
     mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]
     # shape (4, 4): Symmetric positive definite
     covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, checked_covariance)]
+
+    @classmethod
+    def stacked(cls, beliefs: Sequence["CartesianBelief"]) -> "CartesianBelief":
+        """Return many beliefs as one with a leading axis."""
+        return cls(np.array([one.mean for one in beliefs]), np.array([one.covariance for one in beliefs]))
+
+    def each(self) -> "list[CartesianBelief]":
+        """Return the beliefs that were stacked."""
+        return list(map(CartesianBelief, self.mean, self.covariance))
 
     @property
     def position_std_m(self) -> float:
@@ -64,26 +79,25 @@ def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArr
 
 
 def predict_place(
-    belief: CartesianBelief, step_s: float, acceleration_psd: float, ego_speed_mps: float
+    belief: CartesianBelief, step_s: float, acceleration_psd: float | FloatArray, ego_speed_mps: float
 ) -> CartesianBelief:
     r"""Return the belief after `step_s` of constant velocity and white acceleration (m^2/s^3).
 
     .. math:: m \leftarrow F m - (u\,dt, 0, 0, 0), \quad P \leftarrow F P F^T + Q
     """
-    flow = np.eye(4)
-    flow[0, 2] = flow[1, 3] = step_s
-    q, t = acceleration_psd, step_s
-    block = np.array([[q * t**3 / 3.0, q * t**2 / 2.0], [q * t**2 / 2.0, q * t]])
-    mean = flow @ belief.mean
-    mean[0] -= ego_speed_mps * step_s
-    return _belief(mean, flow @ belief.covariance @ flow.T + np.kron(block, np.eye(2)))
+    t, flow = step_s, np.eye(4) + step_s * np.eye(4, k=2)
+    noise = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
+    mean = belief.mean @ flow.T
+    mean[..., 0] -= ego_speed_mps * step_s
+    strength = np.asarray(acceleration_psd)[..., None, None]
+    return _belief(mean, flow @ belief.covariance @ flow.T + strength * noise)
 
 
 def update_position(belief: CartesianBelief, position: Position) -> CartesianBelief:
     """Return the belief after a position, and a velocity where that was measured."""
     known = len(position.covariance)
     measured = np.array([*position.position_m, *(position.velocity_mps or ())])
-    return _update(belief, measured - belief.mean[:known], np.eye(4)[:known], np.array(position.covariance))
+    return _update(belief, measured - belief.mean[:known], _IDENTITY[:known], np.array(position.covariance))
 
 
 def update_bearing(belief: CartesianBelief, azimuth_rad: float, std_rad: float) -> CartesianBelief:
@@ -100,31 +114,27 @@ def update_bearing(belief: CartesianBelief, azimuth_rad: float, std_rad: float) 
 
 def polar_motion(belief: CartesianBelief, ego_speed_mps: float) -> MotionBelief:
     """Return the belief in modified polar coordinates, to first order."""
-    x, y, vx, vy = belief.mean.tolist()
-    vx -= ego_speed_mps
-    r = math.hypot(x, y)
-    if r < _NEAREST_M:
-        x, y = (_NEAREST_M * x / r, _NEAREST_M * y / r) if r > 0.0 else (_NEAREST_M, 0.0)
+    x, y, vx, vy = np.moveaxis(belief.mean, -1, 0)
+    vx, r = vx - ego_speed_mps, np.hypot(x, y)
+    # Moved out to the nearest distance; who is at the array itself is taken to be ahead of it.
+    farther = _NEAREST_M / np.clip(r, 1e-9, _NEAREST_M)
+    x, y = np.where(r > 1e-9, x * farther, _NEAREST_M), y * farther
     square = x * x + y * y
     cosine, sine = x / square, y / square
     turning, closing = vy * cosine - vx * sine, vx * cosine + vy * sine
     # In complex numbers d log z = dz / z, so that log r and theta, rho and theta_dot share their derivatives.
-    slope = np.array(
-        [
-            [-sine, cosine, 0.0, 0.0],
-            [
-                vy / square - 2.0 * cosine * turning,
-                -vx / square - 2.0 * sine * turning,
-                -sine,
-                cosine,
-            ],
-            [vx / square - 2.0 * cosine * closing, vy / square - 2.0 * sine * closing, cosine, sine],
-            [cosine, sine, 0.0, 0.0],
-        ]
-    )
-    covariance = slope @ belief.covariance @ slope.T + _LEAST_STD**2 * np.eye(4)
-    mean = np.array([math.atan2(y, x), turning, closing, 0.5 * math.log(square)])
-    return MotionBelief(mean, 0.5 * (covariance + covariance.T))
+    slope = np.zeros((*belief.mean.shape, 4))
+    slope[..., AZIMUTH, 0] = slope[..., AZIMUTH_RATE, 2] = -sine
+    slope[..., AZIMUTH, 1] = slope[..., AZIMUTH_RATE, 3] = cosine
+    slope[..., AZIMUTH_RATE, 0] = vy / square - 2.0 * cosine * turning
+    slope[..., AZIMUTH_RATE, 1] = -vx / square - 2.0 * sine * turning
+    slope[..., RADIAL_RATE, 0] = vx / square - 2.0 * cosine * closing
+    slope[..., RADIAL_RATE, 1] = vy / square - 2.0 * sine * closing
+    slope[..., RADIAL_RATE, 2] = slope[..., LOG_RANGE, 0] = cosine
+    slope[..., RADIAL_RATE, 3] = slope[..., LOG_RANGE, 1] = sine
+    covariance = slope @ belief.covariance @ slope.mT + _LEAST_STD**2 * _IDENTITY
+    mean = np.stack([np.arctan2(y, x), turning, closing, 0.5 * np.log(square)], axis=-1)
+    return MotionBelief(mean, 0.5 * (covariance + covariance.mT))
 
 
 def _update(
@@ -133,13 +143,13 @@ def _update(
     """Return the belief after a measurement, in Joseph's form, which rounding leaves positive definite."""
     spread = slope @ belief.covariance
     gain = np.linalg.solve(spread @ slope.T + noise, spread).T
-    keep = np.eye(4) - gain @ slope
+    keep = _IDENTITY - gain @ slope
     covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
     return _belief(belief.mean + gain @ residual, covariance)
 
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> CartesianBelief:
-    return CartesianBelief(mean, 0.5 * (covariance + covariance.T))
+    return CartesianBelief(mean, 0.5 * (covariance + covariance.mT))
 
 
 def _longest(covariance: FloatArray) -> float:
