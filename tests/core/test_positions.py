@@ -205,6 +205,19 @@ def test_a_hidden_vehicle_announced_by_radio_alone_is_an_entity_with_a_place() -
     assert WorldState.from_json(world.state.to_json()) == world.state
 
 
+@pytest.mark.parametrize("speed_mps", [0.0, 8.0])
+def test_who_stands_or_drives_away_behind_a_corner_is_an_entity_without_an_advisory(speed_mps: float) -> None:
+    world = WorldFilter()
+    for hop in range(1, 15):
+        car = Position(
+            (10.0, 15.0 + speed_mps * hop / 10), diagonal(0.5, 0.5, 0.3, 0.3), (0.0, speed_mps), 0.95
+        )
+        world = world.update(radio(hop / 10, car))
+    (entity,) = world.state.entities
+    assert (entity.status, entity.time_to_visible_s) == ("hidden", None)
+    assert not any(cue.advisory or cue.risk > 0.3 for cue in world.state.cues)
+
+
 def test_vehicles_announced_on_both_sides_are_advised_of_whatever_the_sound_says() -> None:
     """With a sequence model that hears nothing, and without one."""
     quiet = np.full(len(GROUPS), 1.0 / len(GROUPS))
