@@ -1,6 +1,7 @@
 """Build the cues of a snapshot: risk, times, advisories, and what these are raised by."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -24,7 +25,8 @@ def cues_of(
     memory: Memory, model: FilterModel, hazard_risk: float, sensors: tuple[SensorHealth, ...]
 ) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
-    if memory.instant is None:
+    instant, explanation = memory.instant, memory.explanation
+    if instant is None:
         return ()
     ends_ns = advisory_ends_ns(memory)
     rested_on = tuple(one for one in sensors if one.condition != "silent")
@@ -36,41 +38,46 @@ def cues_of(
     ]
     times = _times(memory.sequence, advisories)
     evidence = _evidence(memory, model)
-    build = partial(_cue, memory, model, hazard_risk)
-    return tuple(map(build, range(len(ends_ns)), advisories, times, evidence))
+    # All sides together: what is taken out of arrays once.
+    shared = partial(
+        RiskCue,
+        statistic=min(instant.hidden_total, 1.0),
+        log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
+        hypotheses=priors_of(explanation),
+    )
+    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
+    shares = np.array(explanation.hidden) / max(explanation.hidden_total, 1e-300)
+    build = partial(_cue, memory, model, shared, hazard_risk)
+    return tuple(map(build, range(len(ends_ns)), shares.tolist(), advisories, times, evidence))
 
 
 def _cue(
     memory: Memory,
     model: FilterModel,
+    shared: Callable[..., RiskCue],
     hazard_risk: float,
     k: int,
+    share: float,
     advisory: Advisory | None,
     times: _Times | None,
     evidence: EvidenceTerms,
 ) -> RiskCue:
-    explanation, side, instant = memory.explanation, model.site.sides[k], memory.instant
-    assert instant is not None
     track = hidden_on(memory.tracks, k)
     motion = model.site.prior(k) if track is None else track.motion
     azimuth_rad, std_rad = motion.azimuth_rad, motion.azimuth_std_rad
     if track is None or track.place is None:
         azimuth_rad, std_rad = hidden_azimuth(k, motion, memory.sequence, model.site)
-    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
-    share = explanation.hidden[k] / max(explanation.hidden_total, 1e-300)
     within, interval_s = (None, None) if times is None else times
-    arrival_s = None if track is None else time_to_arrival(track)
+    closing_hz = motion.inverse_tta_hz if track is not None and track.approach_heard else None
+    arrival_s = time_to_arrival(closing_hz, motion.inverse_tta_std_hz)
     # Distance and speed of who has announced itself tell more than the sound.
     interval_s = (track and visible_in(track, model.site)) or interval_s
-    return RiskCue(
-        direction=side.label,
+    return shared(
+        direction=model.site.sides[k].label,
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
         risk=hazard_risk * share,
         confidence=share,
-        statistic=min(instant.hidden_total, 1.0),
-        log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
-        hypotheses=priors_of(explanation),
         advisory=advisory,
         alpha=model.policy.alpha or None if evidence.hypothesis == "hidden" else None,
         entity_id=None if track is None else track.id,

@@ -183,7 +183,7 @@ class WorldFilter:
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
-            entities=entities_of(tracks, memory, context, self._model.site),
+            entities=entities_of(tracks, memory, self._model.site),
             relations=tuple(
                 edge for track in tracks for edge in relations_of(track, sides, context, memory.stamp_ns)
             ),

@@ -43,6 +43,7 @@ def forecasts(
     range_m = np.exp(np.minimum(np.maximum(log_range, math.log(NEAREST_M)), math.log(FARTHEST_M)))
     variance = known + density[:, None] * _CUBES / (range_m**2 * q)
     azimuth_rad = theta + np.arctan2(b, a)
+    azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
     # Full precision would take twice as long to write.
-    rows = np.stack([np.arctan2(np.sin(azimuth_rad), np.cos(azimuth_rad)), np.sqrt(variance)], axis=-1)
+    rows = np.stack([azimuth_rad, np.sqrt(variance)], axis=-1)
     return [dict(zip(_NAMES, map(tuple, row), strict=True)) for row in rows.round(6).tolist()]

@@ -56,9 +56,7 @@ class _Moments(NamedTuple):
     forecast: Forecast
 
 
-def entities_of(
-    tracks: tuple[Track, ...], memory: Memory, context: Context, site: SiteGeometry
-) -> tuple[Entity, ...]:
+def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -> tuple[Entity, ...]:
     """Return some tracks as published entities."""
     if not tracks:
         return ()
@@ -68,14 +66,13 @@ def entities_of(
     stds = np.sqrt(covariances.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (means, stds, covariances[:, *_UPPER]))
     moments = map(_Moments, *lists, forecasts(tracks, means, covariances, site.settings))
-    build = partial(_entity, memory, memory.sides, context, site)
+    build = partial(_entity, memory, memory.sides, site)
     return tuple(map(build, tracks, moments))
 
 
 def _entity(
     memory: Memory,
     sides: HiddenBelief,
-    context: Context,
     site: SiteGeometry,
     track: Track,
     moments: _Moments,
@@ -85,6 +82,7 @@ def _entity(
     hidden = share >= 0.5
     heard_only = hidden and track.place is None
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
+    closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
     azimuth_rad, std_rad = mean[AZIMUTH], std[AZIMUTH]
     if heard_only:
         azimuth_rad, std_rad = hidden_azimuth(track.side, track.motion, memory.sequence, site)
@@ -95,15 +93,15 @@ def _entity(
         hidden_probability=share * existence,
         classification=_classes(track),
         moving=track.moving,
-        direction=context.directions[track.side],
+        direction=site.sides[track.side].label,
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
         azimuth_rate_rad_s=None if hidden else mean[AZIMUTH_RATE],
         range_m=range_m,
         **_place(track, range_m, hidden, site),
-        inverse_tta_hz=-mean[RADIAL_RATE] if track.approach_heard else None,
-        inverse_tta_std_hz=std[RADIAL_RATE] if track.approach_heard else None,
-        tta_s=time_to_arrival(track),
+        inverse_tta_hz=closing_hz,
+        inverse_tta_std_hz=None if closing_hz is None else std[RADIAL_RATE],
+        tta_s=time_to_arrival(closing_hz, std[RADIAL_RATE]),
         visibility=Visibility(track.answer, track.miss_rate),
         sources=track.sources,
         created_ns=track.created_ns,
@@ -142,10 +140,9 @@ def existence_of(track: Track, sides: HiddenBelief) -> float:
     return max(track.existence, sides.hidden[track.side])
 
 
-def time_to_arrival(track: Track) -> float | None:
+def time_to_arrival(closing_hz: float | None, std_hz: float) -> float | None:
     """Return TTA in seconds where a measured approach rate exceeds its standard deviation, else None."""
-    rate = track.motion.inverse_tta_hz
-    return 1.0 / rate if track.approach_heard and rate > track.motion.inverse_tta_std_hz else None
+    return 1.0 / closing_hz if closing_hz is not None and closing_hz > std_hz else None
 
 
 def hidden_azimuth(
