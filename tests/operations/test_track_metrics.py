@@ -49,6 +49,26 @@ def test_gospa_is_the_cheapest_of_all_assignments(estimates, truths, cutoff, ord
     assert mirrored.total_rad == pytest.approx(one.total_rad)
 
 
+@given(st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 4), st.sampled_from([1.0, 2.0]))
+@few
+def test_gospa_is_stone_soups(seed, said, there, order):
+    why = "Stone Soup is the oracle: pip install 'worldstate[oracles]'"
+    metrics = pytest.importorskip("stonesoup.metricgenerator.ospametric", reason=why)
+    from stonesoup.types.state import State
+
+    rng, cutoff = np.random.default_rng(seed), np.radians(60.0)
+    estimates, truths = (rng.uniform(-3.5, 3.5, n) for n in (said, there))
+
+    def apart(one, other):
+        return abs(float(wrap_angle(float(one.state_vector[0] - other.state_vector[0]))))
+
+    peer = metrics.GOSPAMetric(p=order, c=cutoff, measure=apart)
+    found, _ = peer.compute_gospa_metric([State([a]) for a in estimates], [State([a]) for a in truths])
+    one = gospa_bearing(estimates, truths, cutoff, order)
+    parts = (found.value[name] for name in ("distance", "localisation", "missed", "false"))
+    assert (one.total_rad, one.localisation, one.missed, one.false) == pytest.approx(tuple(parts), abs=1e-9)
+
+
 @given(bearings, bearings, bearings)
 @few
 def test_gospa_is_a_metric(a, b, c):
