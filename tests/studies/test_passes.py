@@ -124,3 +124,21 @@ def test_a_hidden_bearing_lies_behind_the_edge_and_is_mirrored(seed: int, edge_r
     nearer = coming.copy()
     nearer[0], nearer[1:] = 0.9, 0.1 * coming[1:] / coming[1:].sum()
     assert coming[0] > 0.9 or hidden_bearing(nearer, sides[0])[0] <= left + 1e-9
+
+
+def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_boxes() -> None:
+    pytest.importorskip("stonesoup", reason="the benchmark's trackers: pip install 'worldstate[oracles]'")
+    import bench_gospa as bench
+
+    made_up = stream([("left", "left", 8.0)], duration_s=12.0)
+    costs, hops = bench.costs(made_up, heard(made_up), WorldFilter(Context()))
+    assert hops.tolist() == pytest.approx([50, 24], abs=1)
+    per_hop = {method: cost / hops[:, None] for method, cost in costs.items()}
+    # One vehicle, of which nothing is said: 30 degrees a hop for a miss, and no others.
+    np.testing.assert_allclose(per_hop[bench.SILENCE], [[0.0, 30.0, 0.0]] * 2, atol=1e-9)
+    hidden, visible = per_hop[bench.WORLD].sum(axis=1)
+    assert hidden < 15.0 and visible < 15.0
+    for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.JPDA):
+        hidden, visible = per_hop[tracker].sum(axis=1)
+        # Without the sound nobody knows of whom no box has shown; a box, each of them follows.
+        assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0

@@ -1,5 +1,6 @@
 """Let the whole world-state follow streams that were listened to, with a camera or without."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +12,7 @@ from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.simulation.scene.junction import site
 from worldstate.core.filter import WorldFilter
+from worldstate.measurement.measurement import Measurement
 from worldstate.operations.commissioning.commission import parts_of, stream_evidence
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_labels import stream_truth
@@ -44,16 +46,23 @@ def passed_stream(
     InvalidArgumentError
         If the model has no sequence, as `commission` makes one.
     """
+    heard, measured = stream_measurements(path, model, camera, seed)
+    context = place_of(str(heard.hops.about["site"])) if known_place else Context()
+    world = WorldFilter(context, model.policies.for_alpha(alpha))
+    return PassedStream(heard, stream_truth(heard), followed(world, measured))
+
+
+def stream_measurements(
+    path: Path, model: Model, camera: CameraKind, seed: int
+) -> tuple[HeardStream, Iterator[Measurement]]:
+    """Return a stream with what microphones and camera measure of it, hop by hop."""
     windows, sequence = parts_of(model)
     heard, vision = HeardStream.load(path), None
     if camera != "none":
         boxes = EVERYBODY if camera == "all" else DetectionFilter()
         detections = stream_detections(heard, np.random.default_rng(seed))
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
-    measured = measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
-    context = place_of(str(heard.hops.about["site"])) if known_place else Context()
-    world = WorldFilter(context, model.policies.for_alpha(alpha))
-    return PassedStream(heard, stream_truth(heard), followed(world, measured))
+    return heard, measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
 
 
 def place_of(name: str) -> Context:
