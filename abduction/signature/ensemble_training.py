@@ -1,7 +1,7 @@
 """Training of the ensemble: every window and its mirror image, one softmax regression for each view."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -63,6 +63,14 @@ class SimulatedWindows:
         """Return those of some sites, and those of no street."""
         chosen = np.isin(self.sites, [*np.unique(sites).tolist(), OPEN_FIELD])
         return SimulatedWindows(*(getattr(self, column.name)[chosen] for column in fields(self)))
+
+    def beside(self, sites: AnyArray) -> "SimulatedWindows":
+        """Return all of them for a table of these sites; those of other streets stay whatever is held out.
+
+        Left with the names of drawn junctions, none would be learned beside a table of real ones.
+        """
+        own = np.isin(self.sites, np.unique(sites))
+        return replace(self, sites=np.where(own, self.sites, OPEN_FIELD))
 
     @classmethod
     def joined(cls, parts: Sequence["SimulatedWindows"]) -> "SimulatedWindows":

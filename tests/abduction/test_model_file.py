@@ -61,6 +61,8 @@ def test_the_default_model_ships_and_says_where_it_comes_from():
     assert model.signature.n_features == 60
     assert {p.alpha for p in model.policies.policies} == {0.01, 0.02, 0.05}
     assert {p.miss_rate for p in model.policies.policies} == {0.0, 1.0}
+    assert {"both", "direct"} <= set(model.signature.classes)
+    assert model.sequence is not None and model.guard is not None and model.road_users is not None
     assert "Schulz" in model.provenance.dataset
     assert len(model.provenance.excluded_lists) == 2
     signature, policies = load_model()

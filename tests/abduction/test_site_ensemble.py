@@ -122,6 +122,18 @@ def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too(
     assert with_all.prior_s == without.prior_s
 
 
+def test_streets_that_a_table_does_not_have_are_learned_whatever_is_held_out():
+    """Drawn junctions have names of their own: learned beside real ones, windows of them were dropped."""
+    rng = np.random.default_rng(9)
+    X, y = windows(rng)
+    groups = np.tile(["SA1", "SA2"], 100)
+    drawn = simulated(rng, ["SA1", "SA101", "SB101"], ("both", "direct")).beside(["SA1", "SA2", "SB1"])
+    known = SiteEnsembleClassifier(simulated=drawn).fit(X, y, groups).model_
+    assert {"both", "direct"} <= set(known.classes)
+    kept = drawn.at(["SA2"])
+    assert len(kept.y) == np.sum(drawn.sites != "SA1") > 0
+
+
 def test_a_quarter_of_a_simulated_hazard_says_the_other_side():
     # Three windows of one pattern, of which real ones say nothing: the posterior is the share, by weight.
     rng, n = np.random.default_rng(9), 300

@@ -23,6 +23,7 @@ from worldstate import (
     uncalibrated_policy,
 )
 from worldstate.abduction import log_lambda
+from worldstate.measurement import Look
 
 NOTHING, UNASKED = NotUsable("-"), Unqueried("-")
 EVEN = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
@@ -59,6 +60,16 @@ def test_an_empty_look_says_nothing_of_what_it_cannot_see(azimuth, answer):
     alive = before * math.exp(-0.3 / world.settings.visible_life_s)
     assert (entity.existence_probability == pytest.approx(alive)) == (answer == "unqueried")
     assert entity.existence_probability <= alive * (1.0 + 1e-9)
+
+
+def test_a_look_ends_whom_it_would_have_seen_whatever_the_sound_asked_about():
+    """Asked about a sector that it hardly sees, a camera has still looked at all that it sees."""
+    world = after(WorldFilter(), measured(1.0, FRONT, car(0.2)))
+    asked = measured(1.3, FRONT, answer=Absent(0.9))
+    looked = replace(asked, look=Look("camera", asked.stamp_ns, Absent(0.05)))
+    said = [after(world, one).state.entities for one in (asked, looked)]
+    assert said[0][0].existence_probability > 0.9
+    assert said[1][0].existence_probability < 0.6
 
 
 @pytest.mark.parametrize(("gate_rad", "vehicles"), [(0.35, 2), (0.6, 1)])

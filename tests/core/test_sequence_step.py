@@ -221,9 +221,9 @@ def test_whoever_comes_on_one_side_takes_nothing_from_the_other(seed: int) -> No
     left = {one.direction: one for one in alone[-1].state.entities}
     sides = {one.direction: one for one in both[-1].state.entities}
     assert (set(left), set(sides)) == ({"left"}, {"left", "right"})
-    assert sides["left"].existence_probability == pytest.approx(left["left"].existence_probability, abs=1e-6)
+    assert sides["left"].hidden_probability == pytest.approx(left["left"].hidden_probability, abs=1e-6)
     assert sides["left"].azimuth_rad == pytest.approx(-sides["right"].azimuth_rad)
-    assert sides["left"].existence_probability == pytest.approx(0.9, abs=1e-6)
+    assert sides["left"].hidden_probability == pytest.approx(0.9, abs=1e-6)
 
 
 def test_without_a_sequence_nothing_is_said_of_times_and_the_rule_alarms() -> None:
@@ -265,3 +265,34 @@ def test_readings_that_do_not_fit_are_refused() -> None:
     damaged["memory"]["sequence"]["share"] = [2.0] * len(GROUPS)
     with pytest.raises(InvalidArgumentError, match=r"sequence\.share"):
         WorldFilter.from_dict(damaged)
+
+
+def approach() -> list[SequenceReading]:
+    """Return what is said of a vehicle from the left that counts down into view and stays there for 2 s."""
+    groups = np.full((50, 2, len(GROUPS)), 0.02 / (len(GROUPS) - 1))
+    for hop in range(50):
+        left = min(max(int(np.searchsorted(COMING_S, 3.0 - 0.1 * hop)), 0), COMING) if hop < 30 else COMING
+        groups[hop, 0, left] = 0.98
+        groups[hop, 1, COMING + 1 if hop < 30 else COMING] = 0.98
+    return [SequenceReading(one / one.sum(axis=1, keepdims=True), SHARE) for one in groups]
+
+
+def test_who_came_into_view_unseen_is_there_as_long_as_it_sounds() -> None:
+    """A camera that is dead ends no entity; one that looks and sees nobody does."""
+    said = approach()
+    dead = run(WorldFilter(), [heard(hop + 1, one) for hop, one in enumerate(said)])
+    looking = [UNASKED if hop < 30 else Absent(0.04, 0.01) for hop in range(50)]
+    empty = run(
+        WorldFilter(), [heard(h + 1, one, a) for h, (one, a) in enumerate(zip(said, looking, strict=True))]
+    )
+    (before,) = dead[28].state.entities
+    assert before.status == "hidden" and before.existence_probability > 0.9
+    for world in dead[30:]:
+        (now,) = world.state.entities
+        assert now.id == before.id and now.existence_probability >= 0.5
+    assert now.status == "emerged" and now.hidden_probability < 0.1
+    assert not [one for one in empty[35].state.entities if one.existence_probability > 0.2]
+    # Nothing in the belief of who comes is touched by it.
+    np.testing.assert_allclose(belief(dead[-1]), said[-1].groups, rtol=1e-6, atol=1e-9)
+    again = WorldFilter.from_dict(dead[40].to_dict())
+    assert again.update(heard(42, said[41])).state == dead[41].state

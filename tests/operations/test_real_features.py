@@ -83,7 +83,7 @@ def test_the_model_that_ships_holds_on_the_official_test_recordings():
     )
     # The authors' own classifier has .928 there, retrained from this table .920: two more classes and the
     # share of hazards in streams cost accuracy, not order.
-    assert figures["accuracy"] == pytest.approx(0.88, abs=0.02)
+    assert figures["accuracy"] == pytest.approx(0.9, abs=0.02)
     assert figures["auroc_pooled"] > 0.98
     assert figures["auroc_pooled_absent"] > 0.98
     assert figures["tpr_absent"] > 0.7

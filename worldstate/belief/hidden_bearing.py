@@ -16,6 +16,8 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.ground.typing import FloatArray
 
+from .kinematics.motion import MotionBelief
+from .kinematics.polar import AZIMUTH, AZIMUTH_RATE
 from .site_geometry import SideGeometry
 
 # What is not known of v / d: within a factor of 1.2 (three points of a lognormal distribution with the
@@ -27,6 +29,10 @@ _PACE_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
 _PASSED = (0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1]))))[:, None] * _PACES
 # Beyond, the street ahead ends or bends.
 _FARTHEST_RAD = math.radians(80.0)
+_SMALLEST = 1e-12
+# Of the azimuth rate, relative: drivers brake and turn.
+_RATE_SPREAD = 0.5
+_IN_VIEW_STD = math.radians(20.0)
 
 
 def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float]:
@@ -45,8 +51,32 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     sign, edge_rad = math.copysign(1.0, side.edge_azimuth_rad), abs(side.edge_azimuth_rad)
     slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * _PASSED
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
-    weight = coming[:, None] * _PACE_WEIGHTS
+    weight = coming[:, None] * _PACE_WEIGHTS + _SMALLEST
     weight = weight / weight.sum()
     mean = float((weight * azimuth).sum())
     variance = float((weight * (azimuth - mean) ** 2).sum()) + side.edge_std_rad**2
     return sign * mean, math.sqrt(variance)
+
+
+def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: MotionBelief) -> MotionBelief:
+    r"""Return the motion of who comes with these probabilities, or, with the rest of `share`, is in view.
+
+    Whoever is past the edge goes on as it came,
+
+    .. math:: \dot\theta = -\frac{v}{d} \cos^2\theta
+
+    and stands half-way between edge and axis, give or take; what was heard of its approach rate is kept.
+    """
+    (hidden_rad, hidden_std), in_view_rad = hidden_bearing(coming, side), 0.5 * side.edge_azimuth_rad
+    azimuth_rad = share * hidden_rad + (1.0 - share) * in_view_rad
+    # Mean and variance of the two together.
+    apart = share * (1.0 - share) * (hidden_rad - in_view_rad) ** 2
+    variance = share * hidden_std**2 + (1.0 - share) * _IN_VIEW_STD**2 + apart
+    rate = -math.copysign(side.pace_hz * math.cos(azimuth_rad) ** 2, side.edge_azimuth_rad)
+    mean, covariance = before.mean.copy(), before.covariance.copy()
+    mean[[AZIMUTH, AZIMUTH_RATE]] = azimuth_rad, rate
+    # Both are read anew from the sequence, whatever else was believed of them.
+    for axis, spread in ((AZIMUTH, variance), (AZIMUTH_RATE, (_RATE_SPREAD * rate) ** 2)):
+        covariance[axis], covariance[:, axis] = 0.0, 0.0
+        covariance[axis, axis] = spread
+    return MotionBelief(mean, covariance)

@@ -63,7 +63,7 @@ def vision_update(
     turned, after = _turned(tracks, sightings, found, site), []
     for i, track in enumerate(tracks):
         if i not in found:
-            after.append(_not_sighted(track, measurement.co_evidence, weight, site))
+            after.append(_not_sighted(track, _searched(track, measurement), weight, site))
         elif track.seen:
             after.append(_sighted(turned[i], sightings[found[i]], measurement, site))
         else:
@@ -165,6 +165,17 @@ def _turned(
         after = update_azimuth(motion, azimuth_rad, std_rad, weight=1.0)
         turned |= {i: replace(tracks[i], motion=one) for i, one in zip(usual, after.each(), strict=True)}
     return turned
+
+
+def _searched(track: Track, measurement: Measurement) -> CoEvidence:
+    """Return the answer that speaks of a track: of the sector of a sound, or of all that the sensor sees.
+
+    Of whoever is in view the look itself: by the miss rate of a sector half outside the image, vehicles that
+    have gone stay for up to two seconds.
+    """
+    if measurement.look is None or (not track.seen and track.place is None):
+        return measurement.co_evidence
+    return measurement.look.answer
 
 
 def _not_sighted(track: Track, answer: CoEvidence, weight: float, site: SiteGeometry) -> Track:

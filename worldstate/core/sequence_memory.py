@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
 
 import numpy as np
 
+from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
     COMING_S,
@@ -30,7 +31,9 @@ from worldstate.belief.sequence_chain import (
 )
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import ADDED, Probability
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 
@@ -42,6 +45,9 @@ _LOOK_NS = 500_000_000
 # A window and the smoothing of the alarm; then a follower is told like anybody. In dense traffic one in six
 # has another one right behind.
 _EXPLAINED_NS, _FOLLOWED = 1_300_000_000, 0.2
+_IN_VIEW_S = 6.0  # Two passages: before, it is the sound that tells whether it is still there
+_OTHERS = 0.1  # Who came into view from nowhere that is listened to
+_SEEN, _PAST = GROUPS.index("seen"), GROUPS.index("past")
 # States of those who come into view within three seconds.
 _SOON = np.array([COMES[i] and COMING_S[i % len(COMING_S)] <= 3.0 for i in range(len(STATES))])
 _LEAST_WEIGHT = 1e-12  # Keeps logarithms finite
@@ -61,6 +67,8 @@ class SequenceMemory:
     over_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When each side was last above the threshold
     looks: tuple[Look, ...] = ()  # The last one of each sensor, for as long as it holds
     emerged_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When somebody last came into view from a side
+    # P(somebody has come into view from a side and no look has told), where no camera looks or none sees.
+    unseen: tuple[Probability, ...] = field(default=(0.0,) * len(SIDES), metadata=ADDED)
     stamp_ns: int = 0
 
     def check(self) -> None:
@@ -74,9 +82,10 @@ class SequenceMemory:
             finite_array(f"memory.sequence.{name}", array, shape)
             if (array < 0.0).any() or not np.allclose(array.sum(axis=-1), 1.0, atol=1e-3):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected probabilities")
-        for name, stamps_ns in (("over_ns", self.over_ns), ("emerged_ns", self.emerged_ns)):
-            if len(stamps_ns) != len(SIDES):
-                got = len(stamps_ns)
+        by_side = (("over_ns", self.over_ns), ("emerged_ns", self.emerged_ns), ("unseen", self.unseen))
+        for name, values in by_side:
+            if len(values) != len(SIDES):
+                got = len(values)
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected {len(SIDES)}, got {got}")
 
     @cached_property
@@ -96,7 +105,8 @@ class SequenceMemory:
     def emerged(self, sides: Collection[int], stamp_ns: int) -> "SequenceMemory":
         """Return the memory after somebody came into view past the edge of some sides."""
         known = (stamp_ns if side in sides else ns for side, ns in enumerate(self.emerged_ns))
-        return replace(self, emerged_ns=tuple(known))
+        unseen = (0.0 if side in sides else chance for side, chance in enumerate(self.unseen))
+        return replace(self, emerged_ns=tuple(known), unseen=tuple(unseen))
 
     def _explained(self) -> FloatArray:
         """Return log p(sound | one comes) of each side, given who has just come into view there, shape (2,).
@@ -109,9 +119,16 @@ class SequenceMemory:
 
     @cached_property
     def hidden(self) -> HiddenBelief:
-        """Whoever comes into view within eight seconds is hidden now."""
-        coming = self.posterior.groups[0, :, : len(COMING_S)].sum(axis=1)
-        return HiddenBelief(tuple(np.minimum(coming, 1.0).tolist()), (0.0,) * len(SIDES))
+        """Whoever comes into view within eight seconds is hidden; who came unseen is there as it sounds.
+
+        What sounds in view, or as if it had left the view into the other side, is shared among those who may
+        have come into view unseen and somebody of whom nothing is known.
+        """
+        groups, unseen = self.posterior.groups[0], np.array(self.unseen)
+        coming = np.minimum(groups[:, : len(COMING_S)].sum(axis=1), 1.0)
+        there = groups[:, _SEEN] + groups[::-1, _PAST]
+        emerged = np.minimum(there * unseen / (unseen.sum() + _OTHERS), 1.0 - coming)
+        return HiddenBelief(tuple(coming.tolist()), tuple(emerged.tolist()))
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:
         """Return for each side when its alarm ends: a second after it was last above the threshold."""
@@ -145,7 +162,18 @@ def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context)
     """Return the belief at a later time, with nothing heard."""
     chain = state_transition(_prior(kept.share, context), step_ns)
     looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
-    return replace(kept, sides=next_belief(kept.sides, None, chain), looks=looks, stamp_ns=stamp_ns)
+    sides, unseen = next_belief(kept.sides, None, chain), _unseen(kept, step_ns)
+    return replace(kept, sides=sides, looks=looks, unseen=unseen, stamp_ns=stamp_ns)
+
+
+def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
+    r"""Return the chances that somebody has come into view unseen, after a step.
+
+    .. math:: u \leftarrow \max(u\, e^{-dt / \tau},\ P(T \le .5))
+    """
+    soon = kept.posterior.within()[0, :, 0]
+    left = np.array(kept.unseen) * math.exp(-seconds(step_ns) / _IN_VIEW_S)
+    return tuple(np.maximum(left, soon).tolist())
 
 
 def informed(
@@ -170,6 +198,9 @@ def informed(
     looks = kept.looks
     if look is not None:
         looks = (*(one for one in looks if one.sensor != look.sensor), look)
+        if not isinstance(look.answer, Unqueried):
+            # Whoever has come into view is seen there but for a miss; who is seen was handed over.
+            kept = replace(kept, unseen=tuple(chance * look.answer.miss_rate for chance in kept.unseen))
     looks = tuple(sorted(looks, key=attrgetter("sensor")))
     return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=measurement.stamp_ns))
 

@@ -13,12 +13,14 @@ from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
+from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
+from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.position_update import position_update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
@@ -38,6 +40,7 @@ _TIE = 1e-9
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
 _MOST_CERTAIN = 0.999  # Of a message
+_HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 _NO_LOOK = Unqueried("sound alone")
 
 
@@ -398,7 +401,7 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
     last_ns = dict(memory.last_ns) | {measurement.source: measurement.stamp_ns}
     return replace(
         memory,
-        tracks=hidden.tracks,
+        tracks=_on_their_way(hidden.tracks, memory, model.site),
         explanation=hidden.explanation,
         lag=lag,
         births=hidden.births,
@@ -407,6 +410,22 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
         domain=measurement.domain,
         last_ns=tuple(sorted(last_ns.items())),
     )
+
+
+def _on_their_way(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -> tuple[Track, ...]:
+    """Return the tracks, those that are only heard and hidden where the sequence has them."""
+    kept, sides = memory.sequence, memory.sides
+    if kept is None:
+        return tracks
+    coming = kept.posterior.groups[0, :, : len(COMING_S)]
+    after = []
+    for one in tracks:
+        share = hidden_share(one, sides)
+        if not one.seen and one.place is None and share >= _HIDDEN:
+            motion = hidden_motion(coming[one.side], share, site.sides[one.side], one.motion)
+            one = replace(one, motion=motion)
+        after.append(one)
+    return tuple(after)
 
 
 def chronicled(before: Memory, carried: Memory, after: Memory, model: FilterModel) -> Memory:

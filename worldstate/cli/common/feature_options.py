@@ -44,7 +44,7 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
     # A table that does not say, as the released one, is OVAD's.
     array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
     in_the_open = open_field_windows(open_field_features(array, N_OPEN, np.random.default_rng(0)))
-    return learned_beside(streams, in_the_open, tables)
+    return learned_beside(streams, in_the_open, tables).beside(table.environments)
 
 
 def add_which_windows(parser: argparse.ArgumentParser, of: str) -> None:

@@ -47,7 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
     quiet = "recordings in which nobody came: the alarm is set on them"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
-    add("--onsets", type=float, default=20.0, metavar="N", help="alarms an hour allowed (default: 20)")
+    add("--onsets", type=float, default=30.0, metavar="N", help="alarms an hour allowed (default: 30)")
     add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
     add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
     add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")

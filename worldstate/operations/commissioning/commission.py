@@ -251,7 +251,7 @@ def _table_and_beside(
     """Return the windows that a model is trained on, and what it learns beside them."""
     learned = learned_beside(streams, open_field)
     if real is not None:
-        return real, learned
+        return real, learned.beside(real.environments)
     # Without real windows the streams' own take their place; classes that these do not know stay beside.
     own = np.isin(learned.y, CLASSES)
     n_features = learned.X.shape[1] // (1 + len(KINDS))

@@ -50,7 +50,7 @@ class CommissionSettings:
     approach_minutes: float = 7.2
     hazard_free_minutes: float = 6.0
     exam_minutes: float = 24.0
-    onsets_per_hour: float = 20.0
+    onsets_per_hour: float = 30.0
     bandwidth_hz: float = 2000.0
     seed: int = 1
     leave_out: tuple[str, ...] = ()

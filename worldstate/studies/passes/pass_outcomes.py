@@ -36,6 +36,7 @@ from worldstate.state import Entity
 from .followed_stream import FollowedStream
 
 EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
+KEPT_S, KEPT_RAD = 3.0, np.radians(20.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +133,7 @@ def pass_figures(streams: Sequence[PassedStream]) -> dict[str, float | int | Non
         "onset_after_pass": mean_of([one.alarm.onsets_after > 0 for one in singles]),
     }
     quiet = quiet_figures([one.followed.advisory for one in streams if one.heard.hazard_free])
-    return found | quiet | _ahead(streams) | _forecast(streams) | _bearing(streams)
+    return found | quiet | _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
 
 
 def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
@@ -154,6 +155,29 @@ def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
             if entity is not None:
                 taken.append(entity.id in before)
     return {"seen_ahead": len(taken), "took_hidden_identity": mean_of(taken)}
+
+
+def _kept(streams: Sequence[PassedStream]) -> dict[str, float | None]:
+    """Return how often an entity stands near a vehicle in the three seconds after T0, and how many do."""
+    near = []
+    for stream in streams:
+        for one in approaches(stream.heard):
+            if one.quiet or one.flow != "single":
+                continue
+            vehicle, lead = (
+                _vehicle(stream.heard, one.entries_s[0]),
+                stream.followed.time_s - one.entries_s[0],
+            )
+            for hop in np.flatnonzero((lead >= 0.0) & (lead < KEPT_S)).tolist():
+                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+                if azimuth is not None:
+                    there = [e for e in stream.followed.entities[hop] if e.existence_probability >= EXISTS]
+                    near.append(sum(abs(wrap_angle(e.azimuth_rad - azimuth)) <= KEPT_RAD for e in there))
+    counts = np.array(near)
+    return {
+        "kept_after_t0": mean_of(counts > 0),
+        "entities_after_t0": float(counts[counts > 0].mean()) if (counts > 0).any() else None,
+    }
 
 
 def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:

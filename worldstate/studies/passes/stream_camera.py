@@ -1,5 +1,7 @@
 """What a camera would have reported of a stream of which only the truth was kept: boxes frame by frame."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
@@ -10,6 +12,7 @@ from worldstate.adapters.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.plan import junction_named
+from worldstate.operations.commissioning.stream_exam import AFTER_S
 
 FRAME_S = 0.1
 _STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
@@ -39,6 +42,15 @@ def stream_detections(
     last = round(float(heard.hops.time_s[-1]) / FRAME_S)
     every = [_frame(frames.get(at, [])) for at in range(last + 1)]
     return DetectionLog.at_rate(every, 1.0 / FRAME_S, source=heard.hops.name)
+
+
+def without_passes(detections: DetectionLog, heard: HeardStream) -> DetectionLog:
+    """Return a log whose camera is dead from every T0 on for as long as an approach is followed."""
+    entries_s = heard.vehicles.entry_s[heard.vehicles.hazard]
+    since_s = detections.stamps_ns[:, None] * 1e-9 - entries_s[np.isfinite(entries_s)]
+    alive = ~((since_s >= 0.0) & (since_s < AFTER_S)).any(axis=1)
+    frames = tuple(detections.frames[at] for at in np.flatnonzero(alive).tolist())
+    return replace(detections, stamps_ns=detections.stamps_ns[alive], frames=frames)
 
 
 def _crossing(x: FloatArray, y: FloatArray) -> FloatArray:

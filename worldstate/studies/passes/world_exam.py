@@ -21,9 +21,9 @@ from worldstate.state.context import Context, corner_at
 from .followed_stream import followed
 from .measured_stream import measurements
 from .pass_outcomes import PassedStream
-from .stream_camera import stream_detections
+from .stream_camera import stream_detections, without_passes
 
-CameraKind = Literal["all", "cars", "none"]
+CameraKind = Literal["all", "cars", "none", "dies"]
 # Everything that drives, however small its box; of OVAD's boxes its authors keep cars above 100 px.
 EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcycle", "bicycle"}), 0.5, 20.0)
 
@@ -47,7 +47,7 @@ def passed_stream(
         If the model has no sequence, as `commission` makes one.
     """
     heard, measured = stream_measurements(path, model, camera, seed)
-    context = place_of(str(heard.hops.about["site"])) if known_place else Context()
+    context = known_context(str(heard.hops.about["site"])) if known_place else Context()
     world = WorldFilter(context, model.policies.for_alpha(alpha))
     return PassedStream(heard, stream_truth(heard), followed(world, measured))
 
@@ -59,18 +59,20 @@ def stream_measurements(
     windows, sequence = parts_of(model)
     heard, vision = HeardStream.load(path), None
     if camera != "none":
-        boxes = EVERYBODY if camera == "all" else DetectionFilter()
+        boxes = DetectionFilter() if camera == "cars" else EVERYBODY
         detections = stream_detections(heard, np.random.default_rng(seed))
+        if camera == "dies":
+            detections = without_passes(detections, heard)
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
     return heard, measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
 
 
-def place_of(name: str) -> Context:
+def known_context(name: str) -> Context:
     """Return corners and lanes of a simulated site; who comes from the left drives in the nearer lane.
 
     Examples
     --------
-    >>> [round(one.edge_azimuth_rad, 2) for one in place_of("SB1").occluders]
+    >>> [round(one.edge_azimuth_rad, 2) for one in known_context("SB1").occluders]
     [0.42, -0.52]
     """
     plan = site(name)
