@@ -18,6 +18,7 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
+    from worldstate.adapters.datasets.feature_table import FeatureTable
     from worldstate.adapters.files.model_file import Model
     from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.operations.commissioning.exam_report import Figures
@@ -62,7 +63,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.datasets.feature_table import read_features, read_ids
     from worldstate.adapters.files.model_file import save_model
     from worldstate.cli.common.output import write_report
     from worldstate.frontend.array.ovad_array import ovad_array
@@ -80,10 +80,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     settings = _settings(arguments)
     folder = arguments.streams or arguments.out.with_suffix(".streams")
     array = given_array(arguments) or ovad_array()
-    table, source = None, arguments.source
-    if arguments.labelled is not None:
-        table, source = read_features(arguments.labelled).group("static"), source or arguments.labelled.name
-        table = table.without([name for path in arguments.exclude for name in read_ids(path)])
     # Streams take nearly all of the time; what is learned from them counts as a few more.
     steps = len(learned_streams(settings)) + LEARNING_STEPS
     with progress_bar("commissioning", steps) as bar:
@@ -91,8 +87,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             array,
             settings,
             folder,
-            table=table,
-            source=source or "",
+            table=_labelled(arguments),
+            source=arguments.source or getattr(arguments.labelled, "name", ""),
             excluded_lists=[path.name for path in arguments.exclude],
             quiet=arguments.quiet,
             jobs=arguments.jobs,
@@ -116,6 +112,16 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         write_report(arguments.report, report)
     lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
     return CommandResult(report, told, lines)
+
+
+def _labelled(arguments: argparse.Namespace) -> "FeatureTable | None":
+    """Return the labelled windows that are learned, too; None without any."""
+    from worldstate.adapters.datasets.feature_table import read_features, read_ids
+
+    if arguments.labelled is None:
+        return None
+    table = read_features(arguments.labelled).group("static")
+    return table.without([name for path in arguments.exclude for name in read_ids(path)])
 
 
 def _mounted(
