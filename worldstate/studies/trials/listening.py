@@ -1,6 +1,7 @@
 """Passes over the sound of one recording: what the front-end reads, and what the whole chain says."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +50,12 @@ from .trial import (
 )
 
 # Changes whenever a pass over the same recording would give other numbers.
-VERSION = 2
+VERSION = 3
 # How the library listens: at its first guess of the site, learning the site, and hearing past the own engine.
 CHAINS = {
-    "plain": ListenSettings(site_adaptation=False, uncalibrated=True),
-    "adapted": ListenSettings(uncalibrated=True),
-    "ego_noise": ListenSettings(uncalibrated=True, ego_noise=True),
+    "plain": ListenSettings(site_adaptation=False),
+    "adapted": ListenSettings(),
+    "ego_noise": ListenSettings(ego_noise=True),
 }
 # The grounded likelihood without its approach rate, for the ablation that drops it.
 RATELESS = Grounding(settings=GroundedSettings(without=frozenset({"radial_speed_m_s", "inverse_tta_hz"})))
@@ -118,8 +119,8 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
 
 def model_refusal(take: Take, model: Model) -> str | None:
     """Say why a model was not made for the sound of a recording; None where it was, or names no array."""
-    # The chains listen uncalibrated, as their budgets are not what is scored: nothing else would refuse it.
-    source = open_source(take.path, model=model, settings=CHAINS["plain"])
+    # Listened to uncalibrated it has no sequence, but nothing is refused before it can be said here.
+    source = open_source(take.path, model=model, settings=replace(CHAINS["plain"], uncalibrated=True))
     domain = model.domain
     if domain is None:
         return None
