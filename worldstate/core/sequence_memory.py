@@ -171,7 +171,8 @@ def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
 
     .. math:: u \leftarrow \max(u\, e^{-dt / \tau},\ P(T \le .5))
     """
-    soon = kept.posterior.within()[0, :, 0]
+    # Rounding may take a sum of probabilities above one, which readers of a checkpoint refuse.
+    soon = np.minimum(kept.posterior.within()[0, :, 0], 1.0)
     left = np.array(kept.unseen) * math.exp(-seconds(step_ns) / _IN_VIEW_S)
     return tuple(np.maximum(left, soon).tolist())
 
