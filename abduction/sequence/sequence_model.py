@@ -43,7 +43,9 @@ class SequencePosterior:
 
     def within(self) -> FloatArray:
         """Return the probability of coming into view within each of `HORIZONS_S`, shape (n, 2, 4)."""
-        return np.asarray(np.cumsum(self.groups[..., : len(COMING_S)], axis=-1)[..., _HORIZONS])
+        sums = np.cumsum(self.groups[..., : len(COMING_S)], axis=-1)[..., _HORIZONS]
+        # Rounding may take a sum of probabilities above one, which readers of files refuse.
+        return np.asarray(np.minimum(sums, 1.0))
 
     def time_to_visible_s(self) -> FloatArray:
         """Return the time to visible of what comes within five seconds: low, mean, high, shape (n, 2, 3).

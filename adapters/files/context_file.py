@@ -5,9 +5,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode
 from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at
 
-from .json_file import read_json, read_record, refused_as_file
+from .json_file import read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,4 +99,4 @@ def read_context(path: str | Path) -> Context:
         known = {one.name for one in fields(_ContextFile)}
         if isinstance(given, dict) and (unknown := sorted(set(given) - known)):
             raise InvalidArgumentError(f"context: expected keys among {sorted(known)}, got {unknown}")
-        return read_record(_ContextFile, path, "context").context()
+        return decode(_ContextFile, given, "context").context()

@@ -94,8 +94,7 @@ def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> li
     if kept is None:
         return [None] * len(advisories)
     posterior = kept.posterior
-    # A sum of probabilities may exceed one by rounding, which readers of a snapshot refuse.
-    within = np.minimum(posterior.within()[0], 1.0).tolist()
+    within = posterior.within()[0].tolist()
     soon = posterior.groups[0, :, : COMING_S.index(LONGEST_S) + 1].sum(axis=1) > 0.5
     # The times are those of whoever comes: of a street where nobody does they would say nothing.
     stated = [told is not None or likely for told, likely in zip(advisories, soon.tolist(), strict=True)]

@@ -102,6 +102,11 @@ class SequenceMemory:
         told = {name: np.stack([nats] * len(SIDES)) for name, nats in looks}
         return told | {"emerged": self._explained()[:, None] * COMES}
 
+    @property
+    def coming(self) -> FloatArray:
+        """Probabilities of the groups of `COMING_S`, shape (2, 9)."""
+        return self.posterior.groups[0, :, : len(COMING_S)]
+
     def emerged(self, sides: Collection[int], stamp_ns: int) -> "SequenceMemory":
         """Return the memory after somebody came into view past the edge of some sides."""
         known = (stamp_ns if side in sides else ns for side, ns in enumerate(self.emerged_ns))
@@ -125,7 +130,7 @@ class SequenceMemory:
         have come into view unseen and somebody of whom nothing is known.
         """
         groups, unseen = self.posterior.groups[0], np.array(self.unseen)
-        coming = np.minimum(groups[:, : len(COMING_S)].sum(axis=1), 1.0)
+        coming = np.minimum(self.coming.sum(axis=1), 1.0)
         there = groups[:, _SEEN] + groups[::-1, _PAST]
         emerged = np.minimum(there * unseen / (unseen.sum() + _OTHERS), 1.0 - coming)
         return HiddenBelief(tuple(coming.tolist()), tuple(emerged.tolist()))
@@ -171,8 +176,7 @@ def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
 
     .. math:: u \leftarrow \max(u\, e^{-dt / \tau},\ P(T \le .5))
     """
-    # Rounding may take a sum of probabilities above one, which readers of a checkpoint refuse.
-    soon = np.minimum(kept.posterior.within()[0, :, 0], 1.0)
+    soon = kept.posterior.within()[0, :, 0]
     left = np.array(kept.unseen) * math.exp(-seconds(step_ns) / _IN_VIEW_S)
     return tuple(np.maximum(left, soon).tolist())
 

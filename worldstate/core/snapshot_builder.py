@@ -8,14 +8,13 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.announced import time_to_visible
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
-from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import Track
 from worldstate.ground.values import seconds
 from worldstate.state import (
@@ -150,7 +149,7 @@ def hidden_azimuth(
 ) -> tuple[float, float]:
     """Return where a hidden vehicle is and how far that may be off: by its time to visible, or as heard."""
     if kept is not None:
-        return hidden_bearing(kept.posterior.groups[0, side, : len(COMING_S)], site.sides[side])
+        return hidden_bearing(kept.coming[side], site.sides[side])
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
     return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, site.settings.hidden_bias_std_rad)
@@ -166,8 +165,7 @@ def relations_of(track: Track, sides: HiddenBelief, context: Context, stamp_ns: 
         edges.append(Relation(track.id, occluder, "emerged_from", 1.0, stamp_ns))
     if track.approach_heard:
         deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
-        closing = 0.5 * math.erfc(-deviations / math.sqrt(2.0))
-        edges.append(Relation(track.id, EGO, "approaching", closing, stamp_ns))
+        edges.append(Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns))
     return edges
 
 

@@ -13,7 +13,6 @@ from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
-from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
@@ -417,15 +416,13 @@ def _on_their_way(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry)
     kept, sides = memory.sequence, memory.sides
     if kept is None:
         return tracks
-    coming = kept.posterior.groups[0, :, : len(COMING_S)]
-    after = []
-    for one in tracks:
-        share = hidden_share(one, sides)
-        if not one.seen and one.place is None and share >= _HIDDEN:
-            motion = hidden_motion(coming[one.side], share, site.sides[one.side], one.motion)
-            one = replace(one, motion=motion)
-        after.append(one)
-    return tuple(after)
+    coming, shares = kept.coming, [hidden_share(one, sides) for one in tracks]
+    return tuple(
+        replace(one, motion=hidden_motion(coming[one.side], share, site.sides[one.side], one.motion))
+        if not one.seen and one.place is None and share >= _HIDDEN
+        else one
+        for one, share in zip(tracks, shares, strict=True)
+    )
 
 
 def chronicled(before: Memory, carried: Memory, after: Memory, model: FilterModel) -> Memory:
