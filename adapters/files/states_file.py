@@ -1,6 +1,7 @@
 """JSON-lines files of snapshots, as `worldstate run --out` writes them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from worldstate.ground.serialisation import MOST_CHARACTERS, decode_json
 from worldstate.ground.values import nanoseconds, seconds
 from worldstate.state import WorldState
 
+from .atomic import atomic_path
 from .json_file import refused_as_file
 
 # A hop: the last decision of a recording ends up to so long before it does.
@@ -37,14 +39,30 @@ def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
         return WorldState.from_dict(nearest[1])
 
 
-def _records(path: str | Path) -> Iterator[tuple[int, object]]:
-    """Yield stamp and content of every line."""
+@contextmanager
+def states_writer(path: Path | None) -> Iterator[Callable[[str], None]]:
+    """Lend a function that writes a snapshot's line; without a path one that writes nothing."""
+    if path is None:
+        yield lambda line: None
+        return
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        yield lambda line: print(line, file=file)
+
+
+def state_lines(path: str | Path) -> Iterator[str]:
+    """Yield every line of the file, without its end."""
     with Path(path).open("rb") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
             try:
-                value = decode_json(line.decode(), f"line {number}")
+                yield line.decode().rstrip("\n")
             except UnicodeDecodeError as error:
                 raise InvalidArgumentError(f"line {number}: expected UTF-8") from error
-            stamp_ns = value.get("stamp_ns") if isinstance(value, dict) else None
-            # What has no stamp is refused by the reader of snapshots, which says what is missing.
-            yield stamp_ns if isinstance(stamp_ns, int) else WorldState.from_dict(value).stamp_ns, value
+
+
+def _records(path: str | Path) -> Iterator[tuple[int, object]]:
+    """Yield stamp and content of every line."""
+    for number, line in enumerate(state_lines(path), start=1):
+        value = decode_json(line, f"line {number}")
+        stamp_ns = value.get("stamp_ns") if isinstance(value, dict) else None
+        # What has no stamp is refused by the reader of snapshots, which says what is missing.
+        yield stamp_ns if isinstance(stamp_ns, int) else WorldState.from_dict(value).stamp_ns, value

@@ -19,6 +19,7 @@ COMMANDS = (
     "users.demo",
     "users.run",
     "users.explain",
+    "users.replay",
     "users.bearings",
     "users.doctor",
     "users.bounds",

@@ -29,6 +29,7 @@ from worldstate.cli.common.array_options import (
     stance,
 )
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
+from worldstate.cli.common.log_options import add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options, sound_of
@@ -44,7 +45,8 @@ examples:
   worldstate run ovad_dataset/SA1/left/1_00_0002 --figure timeline.png
   worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
   worldstate run second.wav --resume state.json --start 60 --save-state state2.json
-  worldstate run drive.wav --ego-noise --engine-rpm rpm.csv"""
+  worldstate run drive.wav --ego-noise --engine-rpm rpm.csv
+  worldstate run ovad_dataset/SA1/left/1_00_0002 --mcap out.mcap"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     _add_model_options(parser)
     add_camera_options(parser)
     _add_output_options(parser)
+    add_log_options(parser)
 
 
 def _add_model_options(parser: argparse.ArgumentParser) -> None:
@@ -105,10 +108,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.operations.recordings.bearing_gating import bearing_figures, write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
-    check_outputs(arguments, "out", "save_state", figures=("figure", "gating"))
+    check_outputs(arguments, "out", "save_state", "mcap", figures=("figure", "gating"))
     source = _source(arguments)
     try:
-        report = listen_with_progress(source, title=str(source.audio_path), states_path=arguments.out)
+        with log_hops(arguments, source) as log:
+            report = listen_with_progress(
+                source, title=str(source.audio_path), states_path=arguments.out, on_hop=log
+            )
     except SilentChannelsError as error:
         if arguments.mask_dead:
             raise

@@ -1,20 +1,18 @@
 """Run one recording through the whole chain and keep what the figures need, hop by hop."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.files.checkpoint_file import Checkpoint
+from worldstate.adapters.files.states_file import states_writer
 from worldstate.adapters.listen import Source, Step, listen_steps
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.values import seconds
-from worldstate.state import WorldState
 
 from .bearing_gating import check_bearings
 from .channel_report import HealthLog, RecordingHealth
@@ -136,9 +134,9 @@ def run_recording(
     """
     log = _HopLog(WarningMeter(source.t0_s, source.hazard_free))
     started, end = time.perf_counter(), None
-    with _states_writer(states_path) as write_state:
+    with states_writer(states_path) as write:
         for step in listen_steps(source):
-            write_state(step.state)
+            write(step.state.to_json())
             log.add(step)
             on_hop(step)
             end = Checkpoint(step.world, step.site, step.history)
@@ -154,15 +152,6 @@ def run_recording(
         bearings=check_bearings(hops, log.moving_rad),
         end=end,
     )
-
-
-@contextmanager
-def _states_writer(path: Path | None) -> Iterator[Callable[[WorldState], None]]:
-    if path is None:
-        yield lambda state: None
-        return
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        yield lambda state: print(state.to_json(), file=file)
 
 
 @dataclass(slots=True)

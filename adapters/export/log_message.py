@@ -1,0 +1,80 @@
+"""What a viewer or a log is given of a hop: messages on topics, each in JSON with its schema."""
+
+import base64
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import TypeAlias
+
+from worldstate.ground.json_schema import json_schema
+from worldstate.ground.serialisation import encode
+from worldstate.ground.typing import FloatArray
+from worldstate.state import WorldState
+
+from .scene import scene_update, srp_scene
+from .scene_messages import CompressedImage, Instant, SceneUpdate
+
+SNAPSHOT_TOPIC, SCENE_TOPIC = "/worldstate/snapshot", "/worldstate/scene"
+SRP_TOPIC, IMAGE_TOPIC = "/worldstate/srp", "/camera/image"
+# By the name that a viewer knows them by.
+_SCHEMAS: dict[str, type] = {
+    "worldstate.Snapshot": WorldState,
+    "foxglove.SceneUpdate": SceneUpdate,
+    "foxglove.CompressedImage": CompressedImage,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LogMessage:
+    """One message of JSON text."""
+
+    topic: str
+    schema_name: str
+    stamp_ns: int
+    data: bytes
+
+    @property
+    def schema(self) -> bytes:
+        """JSON Schema of the message."""
+        return _schema(self.schema_name)
+
+
+LogSink: TypeAlias = Callable[[LogMessage], None]
+
+
+def state_messages(state: WorldState) -> Iterator[LogMessage]:
+    """Yield a snapshot as `WorldState.to_json` writes it, and the scene that it describes.
+
+    Examples
+    --------
+    >>> [(message.topic, message.schema_name) for message in state_messages(WorldState(0, 0))]
+    [('/worldstate/snapshot', 'worldstate.Snapshot'), ('/worldstate/scene', 'foxglove.SceneUpdate')]
+    """
+    yield LogMessage(SNAPSHOT_TOPIC, "worldstate.Snapshot", state.stamp_ns, state.to_json().encode())
+    yield _scene(SCENE_TOPIC, state.stamp_ns, scene_update(state))
+
+
+def srp_message(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> LogMessage:
+    """Return the power of the sound over azimuth as a line about the array."""
+    return _scene(SRP_TOPIC, state.stamp_ns, srp_scene(state, azimuths_rad, srp))
+
+
+def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
+    """Return an image of the camera."""
+    text = base64.b64encode(jpeg).decode("ascii")
+    image = CompressedImage(Instant.of_ns(stamp_ns), "camera", text)
+    return LogMessage(IMAGE_TOPIC, "foxglove.CompressedImage", stamp_ns, _json(encode(image)))
+
+
+def _scene(topic: str, stamp_ns: int, scene: SceneUpdate) -> LogMessage:
+    return LogMessage(topic, "foxglove.SceneUpdate", stamp_ns, _json(encode(scene)))
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value, allow_nan=False, check_circular=False, separators=(",", ":")).encode()
+
+
+@cache
+def _schema(name: str) -> bytes:
+    return json.dumps(json_schema(_SCHEMAS[name])).encode()

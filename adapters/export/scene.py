@@ -1,0 +1,219 @@
+"""The world-state as a scene that Foxglove draws: sectors, lines and labels in the frame of the state."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from worldstate.ground.typing import FloatArray
+from worldstate.state import Entity, Occluder, RiskCue, SearchedView, WorldState
+
+from .scene_messages import (
+    Instant,
+    Placed,
+    Rgba,
+    SceneArrow,
+    SceneItem,
+    SceneLine,
+    ScenePair,
+    SceneRemoval,
+    SceneSolid,
+    SceneText,
+    SceneTriangles,
+    SceneUpdate,
+    Xyz,
+)
+
+# How far a sector is drawn. Sound gives no distance: the radius only tells the layers apart.
+SECTOR_M, SEARCHED_M, CUE_M, SRP_M = 30.0, 15.0, 24.0, 12.0
+# Half of an interval that holds nine of ten of a normal deviate, in standard deviations.
+NINE_OF_TEN = 1.645
+# Of the sectors that are drawn in one plane the later lie higher, or a viewer lets them flicker.
+_HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
+# Triangles of a sector span at most this.
+_STEP_RAD = math.radians(5.0)
+_CAR = Xyz(4.5, 1.8, 1.5)
+# The palette of the figures (Okabe and Ito).
+_GREY, _RED, _BLUE, _GREEN, _PURPLE, _ORANGE, _SKY = (
+    (0.5, 0.5, 0.5),
+    (0.835, 0.369, 0.0),
+    (0.0, 0.447, 0.698),
+    (0.0, 0.62, 0.451),
+    (0.8, 0.475, 0.655),
+    (0.902, 0.624, 0.0),
+    (0.337, 0.706, 0.914),
+)
+
+
+def scene_update(state: WorldState) -> SceneUpdate:
+    """Return everything a snapshot says of places; what an earlier one drew is removed.
+
+    Examples
+    --------
+    >>> [item.id for item in scene_update(WorldState(0, 0)).entities]
+    ['ego', 'occluder corner_left', 'occluder corner_right']
+    """
+    items = [
+        _item(state, "ego", arrows=(_ego(),)),
+        *(_occluder(state, one) for one in state.context.occluders),
+        *(_searched(state, one) for one in state.searched),
+        *(_cue(state, one) for one in state.cues),
+        *(_entity(state, one) for one in state.entities if one.moving),
+    ]
+    return SceneUpdate((SceneRemoval(Instant.of_ns(state.stamp_ns)),), tuple(items))
+
+
+def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> SceneUpdate:
+    """Return the power of the sound over azimuth as a line about the array.
+
+    The radius is that of a circle, times the power over its median over azimuth.
+    """
+    level = srp / max(float(np.median(srp)), np.finfo(np.float64).tiny)
+    radii = SRP_M * np.clip(level, 0.0, 2.0)
+    points = tuple(map(_at, azimuths_rad.tolist(), radii.tolist()))
+    line = SceneLine(0, points, Rgba(*_SKY, 1.0))
+    return SceneUpdate((SceneRemoval(Instant.of_ns(state.stamp_ns)),), (_item(state, "srp", lines=(line,)),))
+
+
+def sector_of(
+    azimuth_rad: float, std_rad: float, sector_rad: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Return where something is in nine of ten cases: as stated, else by its standard deviation.
+
+    Examples
+    --------
+    >>> sector_of(1.0, 0.1, None)
+    (0.8355, 1.1645)
+    """
+    half_rad = NINE_OF_TEN * std_rad
+    return sector_rad or (azimuth_rad - half_rad, azimuth_rad + half_rad)
+
+
+def label_of(entity: Entity) -> str:
+    """Return the likeliest class of an entity and its existence probability.
+
+    Examples
+    --------
+    >>> label_of(Entity("id", "hidden", 0.9, 0.8, 0.8, azimuth_std_rad=0.3, created_ns=0, updated_ns=0))
+    'hidden .90'
+    """
+    likeliest = max(entity.classification, key=lambda one: one.probability, default=None)
+    kind = f" {likeliest.label}" if likeliest is not None and likeliest.label != "unknown" else ""
+    return f"{entity.status}{kind} {_short(entity.existence_probability)}"
+
+
+def _ego() -> SceneArrow:
+    return SceneArrow(Placed(), 2.0, 0.6, 0.9, 1.2, Rgba(0.2, 0.2, 0.2, 1.0))
+
+
+def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
+    """Draw the edge as a line and what lies behind it as a sector."""
+    far_rad = occluder.hidden_azimuth_rad
+    far_rad += math.copysign(NINE_OF_TEN * occluder.hidden_std_rad, far_rad - occluder.edge_azimuth_rad)
+    sides = sorted((occluder.edge_azimuth_rad, far_rad))
+    edge = SceneLine(
+        0, (_at(occluder.edge_azimuth_rad, 4.0), _at(occluder.edge_azimuth_rad, SECTOR_M)), _ink(_GREY)
+    )
+    behind = _sector((sides[0], sides[1]), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
+    pairs = _pairs(direction=occluder.direction, assumed=occluder.assumed)
+    return _item(state, f"occluder {occluder.id}", metadata=pairs, lines=(edge,), triangles=(behind,))
+
+
+def _searched(state: WorldState, view: SearchedView) -> SceneItem:
+    color = Rgba(*(_PURPLE if view.found else _GREEN), 0.25)
+    pairs = _pairs(found=view.found, miss_rate=view.miss_rate, clutter_rate=view.clutter_rate)
+    shape = _sector(view.sector_rad, SEARCHED_M, color, "searched")
+    return _item(state, f"searched {view.sensor}", metadata=pairs, triangles=(shape,))
+
+
+def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
+    """Draw the risk of a side, the denser the higher, and in words what comes within three seconds."""
+    sector_rad = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
+    raised = cue.advisory is not None
+    shape = _sector(sector_rad, CUE_M, Rgba(*(_RED if raised else _ORANGE), 0.05 + 0.5 * cue.risk), "cue")
+    said = f"{cue.direction}: risk {_short(cue.risk)}"
+    if cue.within is not None and "3" in cue.within:
+        said += f", in 3 s {_short(cue.within['3'])}"
+    text = _text(
+        cue.azimuth_rad, CUE_M + 2.0, said + (" ADVISORY" if raised else ""), _RED if raised else _GREY
+    )
+    pairs = _pairs(risk=cue.risk, confidence=cue.confidence, advisory=raised, within=cue.within)
+    return _item(state, f"cue {cue.direction}", metadata=pairs, triangles=(shape,), texts=(text,))
+
+
+def _entity(state: WorldState, entity: Entity) -> SceneItem:
+    """Draw where it is in nine of ten cases, and where it will be; a box only where a position is known."""
+    hidden = entity.status == "hidden"
+    color = _RED if hidden else _BLUE
+    density = entity.existence_probability
+    sector_rad = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
+    shapes = (_sector(sector_rad, SECTOR_M, Rgba(*color, 0.05 + 0.3 * density), "entity"),)
+    middle = SceneLine(0, (Xyz(), _at(entity.azimuth_rad, SECTOR_M)), Rgba(*color, 0.2 + 0.8 * density))
+    coming = tuple(_forecast(*ahead, color) for ahead in (entity.forecast or {}).values())
+    cubes: tuple[SceneSolid, ...] = ()
+    if entity.position_m is not None:
+        cubes = (SceneSolid(Placed(Xyz(*entity.position_m)), _CAR, Rgba(*color, 0.2 + 0.8 * density)),)
+    pairs = _pairs(
+        status=entity.status,
+        existence_probability=entity.existence_probability,
+        hidden_probability=entity.hidden_probability,
+        time_to_visible_s=entity.time_to_visible_s,
+        **{f"P({one.label})": one.probability for one in entity.classification},
+    )
+    text = _text(entity.azimuth_rad, SECTOR_M + 2.0, label_of(entity), color)
+    return _item(
+        state, f"entity {entity.id}", metadata=pairs, cubes=cubes, lines=(middle, *coming), triangles=shapes,
+        texts=(text,),
+    )  # fmt: skip
+
+
+def _forecast(azimuth_rad: float, std_rad: float, color: tuple[float, float, float]) -> SceneLine:
+    """Draw an azimuth to come as an arc at the rim, as wide as nine of ten cases."""
+    arc = _azimuths(sector_of(azimuth_rad, std_rad, None))
+    return SceneLine(0, tuple(_at(each, SECTOR_M) for each in arc), Rgba(*color, 0.6), thickness=0.4)
+
+
+def _item(state: WorldState, name: str, **shapes: tuple[object, ...]) -> SceneItem:
+    # After that nothing in the snapshot holds, and a viewer must not show it either.
+    lifetime_ns = 0 if state.valid_until_ns is None else max(state.valid_until_ns - state.stamp_ns, 1)
+    stamp, lifetime = Instant.of_ns(state.stamp_ns), Instant.of_ns(lifetime_ns)
+    return SceneItem(stamp, state.frame_id, name, lifetime, **shapes)  # type: ignore[arg-type]
+
+
+def _sector(sector_rad: tuple[float, float], radius_m: float, color: Rgba, layer: str) -> SceneTriangles:
+    height_m = _HEIGHT_M[layer]
+    rim = [_at(azimuth_rad, radius_m, height_m) for azimuth_rad in _azimuths(sector_rad)]
+    corners = ((Xyz(0.0, 0.0, height_m), *pair) for pair in pairwise(rim))
+    return SceneTriangles(tuple(point for triangle in corners for point in triangle), color)
+
+
+def _azimuths(sector_rad: tuple[float, float]) -> list[float]:
+    """Divide a sector, from the first azimuth to the left until the second."""
+    first_rad, last_rad = sector_rad
+    width_rad = (last_rad - first_rad) % (2.0 * math.pi) if last_rad < first_rad else last_rad - first_rad
+    count = max(math.ceil(width_rad / _STEP_RAD), 1)
+    return [first_rad + width_rad * step / count for step in range(count + 1)]
+
+
+def _at(azimuth_rad: float, radius_m: float, height_m: float = 0.0) -> Xyz:
+    return Xyz(radius_m * math.cos(azimuth_rad), radius_m * math.sin(azimuth_rad), height_m)
+
+
+def _text(azimuth_rad: float, radius_m: float, text: str, color: tuple[float, float, float]) -> SceneText:
+    return SceneText(Placed(_at(azimuth_rad, radius_m, 1.0)), text, _ink(color))
+
+
+def _ink(color: tuple[float, float, float]) -> Rgba:
+    return Rgba(*color, 1.0)
+
+
+def _pairs(**values: object) -> tuple[ScenePair, ...]:
+    return tuple(ScenePair(key, _words(value)) for key, value in values.items() if value is not None)
+
+
+def _words(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _short(probability: float) -> str:
+    return f"{probability:.2f}".removeprefix("0")

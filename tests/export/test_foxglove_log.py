@@ -1,0 +1,185 @@
+"""MCAP logs for Foxglove: schemas, the same states back, what a scene shows, and where it refuses."""
+
+import json
+import math
+from importlib.resources import files
+
+import cv2
+import jsonschema
+import numpy as np
+import pytest
+import soundfile
+from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from scripted_states import scripted_states
+
+from worldstate.adapters.export.log_message import image_message, srp_message, state_messages
+from worldstate.adapters.export.scene import scene_update
+from worldstate.cli.main import main
+from worldstate.state import SearchedView, WorldState
+
+STATES = scripted_states()
+AZIMUTHS = np.radians(np.arange(-90.0, 91.0))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A second and a half of noise with a video of two colours beside it."""
+    folder = tmp_path_factory.mktemp("log")
+    noise = np.random.default_rng(0).uniform(-0.01, 0.01, (72_000, 56))
+    soundfile.write(folder / "out_multi.wav", noise, 48_000)
+    video = cv2.VideoWriter(
+        str(folder / "ueye_stereo_vid.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (64, 48)
+    )
+    for number in range(15):
+        video.write(np.full((48, 64, 3), 40 + 10 * number, np.uint8))
+    video.release()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def logged(recording):
+    log, states = recording / "out.mcap", recording / "states.jsonl"
+    sound = str(recording / "out_multi.wav")
+    assert main(["run", sound, "--mcap", str(log), "--out", str(states)]) == 0
+    return log, states
+
+
+def messages(path):
+    with path.open("rb") as file:
+        return [
+            (channel.topic, schema, message) for schema, channel, message in make_reader(file).iter_messages()
+        ]
+
+
+def test_replay_gives_the_same_bytes_back(logged, tmp_path, capsys):
+    log, states = logged
+    assert main(["replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
+    assert (tmp_path / "again.jsonl").read_bytes() == states.read_bytes()
+    assert main(["replay", str(states), "--mcap", str(tmp_path / "again.mcap")]) == 0
+    assert main(["replay", str(tmp_path / "again.mcap"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["states"] == 6
+
+
+def test_every_message_holds_to_the_schema_of_its_channel(logged):
+    found = messages(logged[0])
+    assert {topic for topic, _, _ in found} == {
+        "/worldstate/snapshot",
+        "/worldstate/scene",
+        "/worldstate/srp",
+        "/camera/image",
+    }
+    # One of each topic: all are made by the same types.
+    for schema, message in {topic: one for topic, *one in found}.values():
+        described = json.loads(schema.data)
+        jsonschema.Draft202012Validator.check_schema(described)
+        jsonschema.Draft202012Validator(described).validate(json.loads(message.data))
+    shipped = json.loads(files("worldstate").joinpath("data/snapshot.schema.json").read_text("utf-8"))
+    assert shipped in [json.loads(schema.data) for _, schema, _ in found[:4]]
+
+
+def test_an_image_is_the_frame_of_its_time(logged):
+    images = [message for topic, _, message in messages(logged[0]) if topic == "/camera/image"]
+    assert len(images) == 5, "the video ends after 1.4 s, where the sixth hop has no new frame"
+    for message in images:
+        jpeg = json_format.base64.b64decode(json.loads(message.data)["data"])
+        grey = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).mean()
+        assert grey == pytest.approx(40 + message.log_time / 1e7, abs=4.0)
+
+
+def of_foxglove(name):
+    """Return the message class that Foxglove itself publishes."""
+    import foxglove.messages
+
+    described = descriptor_pb2.FileDescriptorSet.FromString(
+        getattr(foxglove.messages, name).get_schema().data
+    )
+    pool = descriptor_pool.DescriptorPool()
+    for file in described.file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+
+
+def as_protobuf_json(value, key=""):
+    """Write time stamps and durations as protobuf's JSON does; all else is the same."""
+    if isinstance(value, list):
+        return [as_protobuf_json(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"sec", "nsec"}:
+        if key == "lifetime":
+            return f"{value['sec']}.{value['nsec']:09d}s"
+        return f"1970-01-01T00:{value['sec'] // 60:02d}:{value['sec'] % 60:02d}.{value['nsec']:09d}Z"
+    return {name: as_protobuf_json(one, name) for name, one in value.items()}
+
+
+def test_foxglove_parses_every_field_by_its_own_definitions():
+    pytest.importorskip("foxglove")
+    scene_class, image_class = of_foxglove("SceneUpdate"), of_foxglove("CompressedImage")
+    srp = np.linspace(1.0, 2.0, AZIMUTHS.size)
+    for state in STATES:
+        for message in (*list(state_messages(state))[1:], srp_message(state, AZIMUTHS, srp)):
+            text = json.dumps(as_protobuf_json(json.loads(message.data)))
+            json_format.Parse(text, scene_class())
+    image = json.loads(image_message(1_500_000_000, b"\xff\xd8\xff").data)
+    assert json_format.Parse(json.dumps(as_protobuf_json(image)), image_class()).data == b"\xff\xd8\xff"
+
+
+def test_a_scene_shows_who_is_there_where_was_looked_and_the_risk():
+    drawn = [{item.id: item for item in scene_update(state).entities} for state in STATES]
+    hidden = STATES[0]
+    assert {"ego", "cue left", "cue right", "searched camera", "occluder corner_left"} <= set(drawn[0])
+    assert f"entity {hidden.entities[0].id}" in drawn[0]
+    assert "ADVISORY" in drawn[0]["cue left"].texts[0].text
+    assert "ADVISORY" not in drawn[0]["cue right"].texts[0].text
+    placed = STATES[-1].entities[0]
+    box = drawn[-1][f"entity {placed.id}"].cubes[0].pose.position
+    assert (box.x, box.y, box.z) == placed.position_m
+    assert len(drawn[-1][f"entity {placed.id}"].lines) == 1 + len(placed.forecast)
+
+
+angles = st.floats(-math.pi, math.pi)
+
+
+@settings(max_examples=15)
+@given(angles, st.floats(0.01, 6.0))
+def test_a_drawn_sector_goes_from_the_first_azimuth_to_the_left_until_the_second(first, width):
+    last = math.remainder(first + width, math.tau)
+    view = SearchedView("lidar", 0, False, 0.1, 0.1, (first, last))
+    (item,) = [i for i in scene_update(WorldState(0, 0, searched=(view,))).entities if "lidar" in i.id]
+    points = item.triangles[0].points
+    turned = [(math.atan2(p.y, p.x) - first) % math.tau for p in points if math.hypot(p.x, p.y) > 1.0]
+    turned = [0.0 if angle > math.tau - 1e-6 else angle for angle in turned]
+    assert min(turned) == pytest.approx(0.0, abs=1e-6)
+    assert max(turned) == pytest.approx(width, abs=1e-6)
+    area = sum(
+        0.5 * ((b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x))
+        for a, b, c in zip(points[::3], points[1::3], points[2::3], strict=True)
+    )
+    assert area == pytest.approx(0.5 * width * 15.0**2, rel=0.01)
+
+
+def test_the_layout_shows_topics_that_are_written(logged):
+    layout = files("worldstate").joinpath("data/foxglove_layout.json").read_text("utf-8")
+    panels = json.loads(layout)["configById"]
+    written = {topic for topic, _, _ in messages(logged[0])}
+    shown = {*panels["3D!worldstate"]["topics"], panels["Image!camera"]["imageMode"]["imageTopic"]}
+    plots = [path["value"] for name in panels for path in panels[name].get("paths", ())]
+    assert shown | {plot.split(".")[0] for plot in plots} == written
+
+
+def test_a_damaged_log_is_refused_in_one_line(logged, tmp_path, capsys):
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(logged[0].read_bytes()[:5000])
+    assert main(["replay", str(broken)]) == 2
+    assert "broken.mcap: expected an MCAP file" in capsys.readouterr().err
+    (tmp_path / "empty.jsonl").write_text("")
+    assert main(["replay", str(tmp_path / "empty.jsonl")]) == 2
+
+
+def test_without_the_package_the_extra_is_named(logged, monkeypatch, capsys):
+    monkeypatch.setitem(__import__("sys").modules, "mcap", None)
+    assert main(["replay", str(logged[0])]) == 2
+    assert "worldstate[mcap]" in capsys.readouterr().err
