@@ -206,7 +206,7 @@ def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
     assert list(simulate.TRAFFICS) == list(TRAFFICS)
     assert simulate.STREAM_SITES == SITES
     refused = {
-        "--minutes 1 --site DA1": "no moving ego",
+        "--minutes 1 --site DA1": "drives are heard",
         "--minutes 1 --static 2": "--static",
         "--static 2 --bandwidth 3": "bandwidth_hz",
         "--minutes 1 --bandwidth 3": "--bandwidth",

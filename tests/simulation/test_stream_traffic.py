@@ -199,8 +199,8 @@ def test_other_sounds_come_at_their_rate_and_rain_takes_boxes() -> None:
 
 
 def test_streams_refuse_what_they_cannot_be() -> None:
-    with pytest.raises(InvalidArgumentError, match="no moving ego"):
-        StreamSettings(site("DA1"), 1.0)
+    with pytest.raises(InvalidArgumentError, match="minutes"):
+        StreamSettings(site("DA1"), 1.1)
     with pytest.raises(InvalidArgumentError, match="junction"):
         StreamSettings(place("merge").site, 1.0)
     with pytest.raises(InvalidArgumentError, match="per_hour"):

@@ -1,6 +1,6 @@
 """Where the ego is: it stands, or it drives up to the corner and stops there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,17 @@ class EgoMotion:
     def stands(self) -> bool:
         """Whether it never moves."""
         return self.speed_mps == 0.0
+
+    def later(self, start_s: float) -> "EgoMotion":
+        """Return the same motion on a clock that begins so much later; it stands if it has stopped by then.
+
+        Examples
+        --------
+        >>> EgoMotion(5.0, 8.0).later(-2.0).stop_s, EgoMotion(5.0, 8.0).later(9.0).stands
+        (10.0, True)
+        """
+        left_s = self.stop_s - start_s
+        return replace(self, stop_s=left_s) if left_s > 0.0 else EgoMotion()
 
     def at_mps(self, time_s: FloatArray) -> FloatArray:
         """Speed at any time, same shape as `time_s`."""

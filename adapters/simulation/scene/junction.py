@@ -5,6 +5,7 @@ crossing street (along y) between two corners. Type A has a wall across the cros
 """
 
 import hashlib
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from .occluders import OccludingBody
 SITES = ("SA1", "SA2", "SB1", "SB2", "SB3")  # OVAD's location numbers 00..04, in this order
 MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # the same places, the ego drives up to the corner
 MAX_OCCLUDERS = 4
+_MOVING = re.compile(r"D([AB]\d+)")  # Named or drawn: where the ego moves at the place S..
 # The fits want smooth side walls, and a rough one opposite: shop fronts, doors, parked bicycles.
 ROUGHNESS_A, ROUGHNESS_B = (1.0, 4.0), (0.3, 1.0)
 WALL_END_M = 99.0  # openings before a wall begins and after it ends go on to here
@@ -235,6 +237,17 @@ PLANS = {
 }
 
 
+def ego_moves(name: str) -> bool:
+    """Tell whether the ego moves at a site of this name.
+
+    Examples
+    --------
+    >>> [ego_moves(name) for name in ("SA1", "DA1", "DB101")]
+    [False, True, True]
+    """
+    return _MOVING.fullmatch(name) is not None
+
+
 def drawn_site(name: str) -> Site:
     """Draw a site from the family of those in `PLANS`, by a generator seeded with its name.
 
@@ -242,9 +255,11 @@ def drawn_site(name: str) -> Site:
     --------
     >>> drawn_site("SA101").opposite_wall_m is None, drawn_site("SB101").opposite_wall_m is None
     (False, True)
+    >>> drawn_site("DA101") == replace(drawn_site("SA101"), name="DA101")  # there the ego moves
+    True
     """
     rng = site_generator(name)
-    with_wall = name.startswith("SA")
+    with_wall = name[:2] in ("SA", "DA")
     ahead, corners = rng.uniform(4.5, 5.2), rng.uniform(2.3, 3.1, 2)
     walls = corners - rng.uniform(0.1, 0.7, 2)
     begins = rng.uniform(-1.5, 1.2, 2)
@@ -277,6 +292,6 @@ def site_generator(name: str, purpose: str = "plan") -> np.random.Generator:
     >>> site_generator("SA1").random() == site_generator("SA1").random()
     True
     """
-    place = "S" + name[1:] if name in MOVING_SITES else name
+    place = _MOVING.sub(r"S\1", name) if ego_moves(name) else name
     digest = hashlib.sha256(f"worldstate {place} {purpose}".encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:8], "little"))

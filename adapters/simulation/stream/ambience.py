@@ -47,5 +47,5 @@ def ambience_piece(
 
 
 def overlap_samples(settings: StreamSettings) -> int:
-    """Length of a cross-fade."""
-    return round(OVERLAP_S * settings.sample_rate_hz)
+    """Length of a cross-fade; a drive is one piece."""
+    return round(OVERLAP_S * settings.sample_rate_hz) if settings.ego.stands else 0

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
+from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.adapters.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.adapters.simulation.scene.presets import Preset
-from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.settings import EGO_STOPS_AFTER_S, SimulationSettings
 from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
 from worldstate.ground.typing import FloatArray
 
@@ -20,6 +21,8 @@ from .traffic import HAZARDS, Traffic
 HEADWAY_S = (1.5, 4.0)
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
 LONGEST_QUEUE = 8
+AROUND_DRIVE_S = 20.0  # who arrives so long before or after a drive is still heard in it
+STANDING = EgoMotion()
 SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # the fades of an event lie beside the sound
 
 
@@ -55,26 +58,43 @@ Event = VehicleEvent | SoundEvent
 
 
 def draw_events(
-    site: Site, traffic: Traffic, preset: Preset, duration_s: float, rng: np.random.Generator
+    site: Site,
+    traffic: Traffic,
+    preset: Preset,
+    duration_s: float,
+    rng: np.random.Generator,
+    ego: EgoMotion = STANDING,
 ) -> list[VehicleEvent]:
     """Draw all vehicles of a stream, in the order in which they come into earshot."""
     # A generator a flow: another rate of one of them leaves the others as they are.
     flows = dict(zip(MANOEUVRES, rng.spawn(len(MANOEUVRES)), strict=True))
-    turns = _turns(traffic, duration_s, rng) if traffic.evenly else {}
+    turns = _turns(traffic, duration_s, rng, ego) if traffic.evenly else {}
+    around_s = 0.0 if ego.stands else AROUND_DRIVE_S
     events: list[VehicleEvent] = []
     for flow, own in flows.items():
         times_s = turns.get(flow)
         if times_s is None:
-            number = own.poisson(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0)
-            times_s = np.sort(own.uniform(0.0, duration_s, number))
+            drawn_s = duration_s + 2.0 * around_s
+            number = own.poisson(traffic.per_hour.get(flow, 0.0) * drawn_s / 3600.0)
+            times_s = np.sort(own.uniform(0.0, drawn_s, number)) - around_s
         for arrival_s, one in zip(times_s, own.spawn(len(times_s)), strict=True):
             events += _arrival(flow, float(arrival_s), site, traffic, preset, one)
     inside = [event for event in events if event.start_s < duration_s and event.end_s > 0.0]
     return sorted(inside, key=lambda event: event.start_s)
 
 
-def _turns(traffic: Traffic, duration_s: float, rng: np.random.Generator) -> dict[str, FloatArray]:
-    """Deal equal stretches of time to the hazards, and draw the middle half of each to arrive in."""
+def _turns(
+    traffic: Traffic, duration_s: float, rng: np.random.Generator, ego: EgoMotion
+) -> dict[str, FloatArray]:
+    """Deal equal stretches of time to the hazards, and draw the middle half of each to arrive in.
+
+    A drive has one of them, shortly before the ego stops, as recordings have.
+    """
+    if not ego.stands:
+        rates = np.array([traffic.per_hour.get(flow, 0.0) for flow in HAZARDS])
+        chosen = rng.choice(HAZARDS, p=rates / rates.sum())
+        arrives_s = np.array([ego.stop_s - rng.uniform(*EGO_STOPS_AFTER_S)])
+        return {flow: arrives_s[: int(flow == chosen)] for flow in HAZARDS}
     counts = {flow: round(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0) for flow in HAZARDS}
     order = rng.permutation(np.repeat(list(counts), list(counts.values())))
     middle = np.arange(len(order)) + rng.uniform(0.25, 0.75, len(order))

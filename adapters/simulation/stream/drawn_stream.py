@@ -42,7 +42,7 @@ class DrawnStream:
 def draw_stream(settings: StreamSettings, array: MicrophoneArray) -> DrawnStream:
     """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator."""
     arrivals, drawn = settings.generator(ARRIVALS), settings
-    events = draw_events(drawn.site, drawn.traffic, drawn.preset, drawn.duration_s, arrivals)
+    events = draw_events(drawn.site, drawn.traffic, drawn.preset, drawn.duration_s, arrivals, drawn.ego)
     return DrawnStream(
         StreamScene(
             settings,

@@ -10,18 +10,20 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from worldstate.adapters.simulation.scene.ambience import Ambience
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.ego_sound import add_ego_echo, ego_noise
+from worldstate.adapters.simulation.sound.receiver import Receiver
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .ambience import ambience_piece, overlap_samples
 from .arrivals import Event
-from .event_sound import ROW_S, event_blocks, event_sound, loudness_db
+from .event_sound import ALWAYS_S, ROW_S, event_blocks, event_sound, loudness_db
 from .microphones import Microphones
 from .settings import StreamSettings
 
 # What one process renders at a time: 40 MB of sound for 56 channels at 6 kHz, 80 MB at the full rate.
 PIECE_S, PIECE_SAMPLES = 30.0, 360_000
-AMBIENCE, EVENT = 3, 4  # purposes of generators
+AMBIENCE, EVENT, EGO_NOISE = 3, 4, 8  # purposes of generators
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,9 +36,16 @@ class StreamScene:
 
     @property
     def piece(self) -> int:
-        """Samples in a piece; not shorter than two overlaps, so that only neighbours meet."""
+        """Samples in a piece; not shorter than two overlaps, so that only neighbours meet; a drive is one."""
+        if not self.settings.ego.stands:
+            return self.settings.samples
         rate = self.settings.sample_rate_hz
         return max(min(round(PIECE_S * rate), PIECE_SAMPLES), 2 * overlap_samples(self.settings))
+
+    @property
+    def within_s(self) -> tuple[float, float]:
+        """What is rendered of the events: all, of a drive what is heard in it, often a third."""
+        return ALWAYS_S if self.settings.ego.stands else (0.0, self.settings.duration_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,18 +97,21 @@ def pieces(scene: StreamScene, events: Sequence[Event]) -> list[Piece]:
 def render_piece(scene: StreamScene, piece: Piece) -> Block:
     """Render the background of one piece and all that begins in it, to the end."""
     settings, begin = scene.settings, piece.number * scene.piece
-    rate = settings.sample_rate_hz
+    rate, within, ego = settings.sample_rate_hz, scene.within_s, settings.ego
     ends = [
-        round(one.start_s * rate) + event_blocks(one, rate) * KNOT_SAMPLES for one in piece.events.values()
+        round(max(one.start_s, within[0]) * rate) + event_blocks(one, rate, within) * KNOT_SAMPLES
+        for one in piece.events.values()
     ]
     samples = max([end - begin for end in ends] + [scene.piece + overlap_samples(settings)])
     sound = np.zeros((len(scene.microphones.positions_m), samples), np.float32)
     loudness = {}
     with threadpool_limits(1):  # the number of BLAS threads would change the last bits
         _add_ambience(sound, scene, piece.number)
+        if not ego.stands:
+            _add_ego(sound, scene)
         for number, event in piece.events.items():
             rng = settings.generator(EVENT, number)
-            alone = event_sound(event, settings.site, settings.preset, scene.microphones, rng)
+            alone = event_sound(event, settings.site, settings.preset, scene.microphones, rng, ego, within)
             loudness[number] = loudness_db(alone, row_times(event, settings), rate)
             heard = alone.pressure_pa[:, max(-alone.first, 0) :]
             at = max(alone.first, 0) - begin
@@ -113,3 +125,19 @@ def _add_ambience(sound: Float32Array, scene: StreamScene, number: int) -> None:
         scene.settings, scene.ambience, scene.microphones, scene.piece, rng, begins=number == 0
     )
     sound[:, : piece.shape[1]] += piece
+
+
+def _add_ego(sound: Float32Array, scene: StreamScene) -> None:
+    """Add what the ego itself sounds like over a drive."""
+    settings, heard = scene.settings, scene.microphones
+    to_ego, to_echo = settings.generator(EGO_NOISE).spawn(2)
+    rate, engine_db, tyre_db = (
+        settings.sample_rate_hz,
+        settings.preset.ego_engine_db,
+        settings.site.surface_db,
+    )
+    speed = settings.ego.at_mps(np.arange(sound.shape[1]) / rate)
+    sound += ego_noise(heard.positions_m, speed, rate, to_ego, engine_db, tyre_db).T
+    knots = np.arange(2) * KNOT_SAMPLES / rate
+    receiver = Receiver(heard.positions_m, heard.skew_s, knots, settings.ego)
+    add_ego_echo(sound, receiver, settings.site, engine_db, to_echo)

@@ -14,10 +14,11 @@ from worldstate.adapters.simulation.camera.simulated_detector import (
     lost,
     park,
 )
+from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.ground.typing import FloatArray
 
-from .arrivals import SoundEvent, VehicleEvent
+from .arrivals import STANDING, SoundEvent, VehicleEvent
 from .settings import StreamSettings
 
 CLOCK_S = 0.01  # resolution of the first line of sight
@@ -30,10 +31,11 @@ CLUTTER_PER_HOUR, CLUTTER_IMAGES, CLUTTER_SCORE = 60.0, (1, 3), (0.3, 0.9)
 CLUTTER_WIDTH_PX, CLUTTER_SHAPE = (60.0, 400.0), (0.4, 1.0)
 
 
-def visible_s(event: VehicleEvent, site: Site) -> float | None:
+def visible_s(event: VehicleEvent, site: Site, ego: EgoMotion = STANDING) -> float | None:
     """Time of the stream at which a vehicle first comes into view; None where it never does."""
     clock = np.arange(0.0, event.manoeuvre.motion.duration_s, CLOCK_S)
-    seen = line_of_sight(event.manoeuvre.motion.trajectory(clock), site, PinholeCamera())
+    path, ego_x = event.manoeuvre.motion.trajectory(clock), ego.x_m(event.start_s + clock)
+    seen = line_of_sight(path, site, PinholeCamera(), ego_x)
     return round(event.start_s + float(clock[seen.argmax()]), 6) if seen.any() else None
 
 

@@ -38,7 +38,7 @@ class VehicleTruth:
     event: VehicleEvent
     t0_s: float | None  # First line of sight; None where it never comes into view
     time_s: FloatArray  # shape (R,): Tenths of a second of the stream
-    x_m: FloatArray  # shape (R,): Front bumper, ahead
+    x_m: FloatArray  # shape (R,): Front bumper, ahead of the array
     y_m: FloatArray  # shape (R,): Front bumper, left
     axle_rad: FloatArray  # shape (R,): Azimuth of the front axle
     axle_m: FloatArray  # shape (R,): Its distance
@@ -63,17 +63,18 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
     path = event.manoeuvre.motion.trajectory(rows - event.start_s)
     x, y = path.behind(0.0)
     axle_x, axle_y = path.behind(path.kind.axles_m[0])
+    ego_x = settings.ego.x_m(rows)
     return VehicleTruth(
         number=number,
         event=event,
-        t0_s=visible_s(event, settings.site),
+        t0_s=visible_s(event, settings.site, settings.ego),
         time_s=rows.round(1),
-        x_m=x,
+        x_m=x - ego_x,
         y_m=y,
-        axle_rad=np.arctan2(axle_y, axle_x),
-        axle_m=np.hypot(axle_x, axle_y),
+        axle_rad=np.arctan2(axle_y, axle_x - ego_x),
+        axle_m=np.hypot(axle_x - ego_x, axle_y),
         speed_mps=path.speed_mps,
-        in_view=line_of_sight(path, settings.site, PinholeCamera()),
+        in_view=line_of_sight(path, settings.site, PinholeCamera(), ego_x),
     )
 
 

@@ -18,6 +18,7 @@ from worldstate.adapters.simulation.dataset.recording_folder import (
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 from .arrivals import SoundEvent
@@ -85,7 +86,7 @@ def write_stream(
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range.
+        If a number is out of range or the ego of the site moves.
     InputFileError
         If something that was not simulated stands there, or the disk is full.
 
@@ -101,6 +102,9 @@ def write_stream(
     ('SB1-calm-1', 36007)
     """
     in_range("jobs", jobs, 1, 256)
+    if not settings.ego.stands:
+        got = f"{settings.site.name}: drives are heard, not written"
+        raise InvalidArgumentError(f"site: expected one where the ego stands, got {got}")
     folder = Path(root)
     target = folder / settings.name
     refuse_foreign(target)
