@@ -96,10 +96,18 @@ def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path, 
 def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path) -> None:
     moving = next(steps(folder, context=Context(ego_speed_mps=5.0))).state
     assert moving.no_sequence == NotUsable("the model was made for a standing ego, this one is moving")
+    model = read_model(folder / "model.json")
+    domain = replace(model.signature.domain, ego_motion="moving")
+    driven = replace(model, signature=replace(model.signature, domain=domain))
+    stands, moves = (
+        next(listen_steps(open_source(folder / "sound.wav", model=driven, context=context))).state
+        for context in (Context(), Context(ego_speed_mps=5.0))
+    )
+    assert stands.no_sequence == NotUsable("the model was made for a moving ego, this one is standing")
+    assert moves.no_sequence is not None and "made for" not in moves.no_sequence.reason  # too short as yet
     other = replace(ARRAY, positions_m=1.1 * ARRAY.positions_m)
     free = next(steps(folder, array=other, settings=ListenSettings(uncalibrated=True))).state
     assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")
-    model = read_model(folder / "model.json")
     unfit = replace(model, provenance=replace(model.provenance, fit_for_use=False))
     quick = next(listen_steps(open_source(folder / "sound.wav", model=unfit))).state
     assert quick.no_sequence == NotUsable("the model says that it is unfit for use")

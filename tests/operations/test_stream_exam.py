@@ -153,15 +153,18 @@ def test_an_alarm_set_at_other_junctions_keeps_the_onsets_it_was_set_for(
     seed: int, junctions: int, rate: float
 ) -> None:
     # Whatever the streams, over all ways to leave one out, which is what exchangeable junctions are.
-    streams = _made_up(np.random.default_rng(seed), junctions)
-    left_out = [(alarm_elsewhere(streams[:i] + streams[i + 1 :], rate), streams[i]) for i in range(junctions)]
-    onsets = [min(_onsets_per_hour(alarm, stream), LOUDEST * rate) for alarm, stream in left_out]
+    # Two drives each, or a stream in two parts.
+    parts = _made_up(np.random.default_rng(seed), 2 * junctions)
+    there = list(zip(parts[::2], parts[1::2], strict=True))
+    left_out = [(alarm_elsewhere(there[:i] + there[i + 1 :], rate), there[i]) for i in range(junctions)]
+    rates = [np.mean([_onsets_per_hour(alarm, one) for one in two]) for alarm, two in left_out]
+    onsets = np.minimum(rates, LOUDEST * rate)
     assert np.mean(onsets) <= rate * (1.0 + 1e-9)
 
 
 def test_one_junction_sets_no_alarm_for_others() -> None:
     with pytest.raises(InvalidArgumentError, match="2 junctions at least, got 1"):
-        alarm_elsewhere(_made_up(np.random.default_rng(0), 1), 20.0)
+        alarm_elsewhere([_made_up(np.random.default_rng(0), 3)], 20.0)
 
 
 def test_who_is_missed_throughout_the_last_second_ranks_with_nobody() -> None:
@@ -189,3 +192,18 @@ def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_w
     # Approaches and the hazard-free stream of a junction are different traffic under one seed.
     assert len(set(learned.values())) == 2 * 40 and len(set(exams.values())) == 2 * 5
     assert not set(learned.values()) & set(exams.values())
+
+
+def test_a_moving_ego_drives_again_and_again_and_no_drive_is_another() -> None:
+    chosen = CommissionSettings(moving_ego=True, junctions=3, approach_minutes=1.5, hazard_free_minutes=1.0)
+    learned, exam = learned_streams(chosen), exam_streams(chosen)
+    assert {one.site.name for one in exam} == {"DA1", "DA2", "DB1", "DB2", "DB3"}
+    assert not any(one.ego.stands for one in learned)
+    minutes = {
+        traffic: sum(one.minutes for one in learned if one.traffic.name == traffic)
+        for traffic in ("approaches", "no-hazard")
+    }
+    assert minutes == {"approaches": pytest.approx(4.5), "no-hazard": pytest.approx(3.0)}
+    # A seed is shared by an approach and a hazard-free drive, which are different traffic.
+    assert len({one.seed for one in learned}) == 3 * 5
+    assert not {one.seed for one in learned} & {one.seed for one in exam}

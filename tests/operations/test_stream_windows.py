@@ -52,6 +52,12 @@ def test_a_window_says_who_comes_out_of_which_arm_and_how_soon():
     assert label_at(labels, 23.5) == "" and label_at(labels, 24.2) == "none"
 
 
+def test_windows_of_a_moving_ego_lie_half_a_second_later():
+    labels = hop_labels(stream(("light", "left", 20.0), site="DA1"))
+    times = {18.5: "", 19.5: "left", 20.5: "left", 20.7: "", 21.5: "front", 24.2: "none"}
+    assert {time: label_at(labels, time) for time in times} == times
+
+
 def test_two_that_come_within_a_second_and_a_half_are_both_and_two_far_apart_are_not():
     near = hop_labels(stream(("light", "left", 30.0), ("light", "right", 31.2)))
     assert {label_at(near, time) for time in (29.2, 29.9)} == {"both"}

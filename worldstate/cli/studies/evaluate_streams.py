@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     streams: dict[str, list[PassedStream]] = {}
     with progress_bar("following", len(arguments.streams)) as bar:
         for one in in_processes(follow, arguments.streams, arguments.jobs):
-            streams.setdefault(str(one.heard.hops.about["site"]), []).append(one)
+            streams.setdefault(one.heard.site, []).append(one)
             bar.advance()
     figures = {site: pass_figures(streams[site]) for site in sorted(streams)}
     figures["all"] = pass_figures([one for every in streams.values() for one in every])

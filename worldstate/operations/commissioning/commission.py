@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
-from worldstate.abduction.sequence.sequence_model import SequenceModel
+from worldstate.abduction.sequence.sequence_model import SequenceModel, SequencePosterior
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.model_domain import ModelDomain
@@ -114,15 +114,16 @@ def learn_sequence(
                 evidence = stream_evidence(windows, one)
                 labelled[number] = LabelledStream(evidence, stream_truth(one), weights[number])
         on_step()
-    margins, quiet = [], []
+    margins, quiet = [], dict[str, list[SequencePosterior]]()
     for fold in sorted(set(folds)):
         model = train_sequence([labelled[i] for i, at in enumerate(folds) if at != fold], rng)
         outside = [i for i, at in enumerate(folds) if at == fold]
         margins.append(calibrated_margin_s(model, [labelled[i] for i in outside]))
-        free = [i for i in outside if streams[i].hops.about["traffic"] == HAZARD_FREE]
-        quiet += [model.posterior(labelled[i].evidence) for i in free]
+        for i in outside:
+            if streams[i].hops.about["traffic"] == HAZARD_FREE:
+                quiet.setdefault(streams[i].site, []).append(model.posterior(labelled[i].evidence))
         on_step()
-    alarm, margin_s = alarm_elsewhere(quiet, onsets_per_hour), float(np.mean(margins))
+    alarm, margin_s = alarm_elsewhere(list(quiet.values()), onsets_per_hour), float(np.mean(margins))
     final = train_sequence(list(labelled.values()), rng)
     on_step()
     return replace(final, margin_s=margin_s, alarm=alarm)
@@ -130,13 +131,9 @@ def learn_sequence(
 
 def _folds(streams: Sequence[HeardStream]) -> list[int]:
     """Deal junctions to folds in turn, pairs of both types where there are enough."""
-    names = sorted({_site(one) for one in streams}, key=lambda name: (name[2:], name))
+    names = sorted({one.site for one in streams}, key=lambda name: (name[2:], name))
     together = 2 if len(names) >= 2 * FOLDS else 1
-    return [names.index(_site(one)) // together % FOLDS for one in streams]
-
-
-def _site(heard: HeardStream) -> str:
-    return str(heard.hops.about["site"])
+    return [names.index(one.site) // together % FOLDS for one in streams]
 
 
 def _weights(streams: Sequence[HeardStream]) -> list[float]:
@@ -172,10 +169,10 @@ def commission(
         streams.append(one)
         on_step()
     open_field = open_field_windows(
-        open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs)
+        open_field_features(array, N_OPEN // 10 if settings.quick else N_OPEN, rng, jobs, settings.moving_ego)
     )
     rate_hz = streams[0].hops.about["sample_rate_hz"]
-    domain = domain_of(array, [rate_hz], [_site(one) for one in streams])
+    domain = domain_of(array, [rate_hz], [one.site for one in streams])
     real = None if table is None else windows_of_array(table, settings, domain)
     fit = partial(_windows_learned, real, open_field, domain)
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, on_step)
@@ -184,7 +181,7 @@ def commission(
         windows,
         TrainingSettings(seed=settings.seed, repeats=1, method="worldstate"),
         dataset=SIMULATED if real is None else f"{source}; {SIMULATED}",
-        group="static",
+        group="dynamic" if settings.moving_ego else "static",
         excluded_lists=(*excluded_lists, *settings.leave_out),
         simulated=beside,
     )
@@ -193,7 +190,7 @@ def commission(
     guard = road_users = None
     if not settings.quick:
         guard = train_guard(array, streams, rng, jobs)
-        sites = list(dict.fromkeys(_site(one) for one in streams))
+        sites = list(dict.fromkeys(one.site for one in streams))
         road_users = train_road_users(array, sites, rate_hz, rng, jobs)
     provenance = replace(model.provenance, fit_for_use=not settings.quick)
     made = replace(model, provenance=provenance, sequence=sequence, guard=guard, road_users=road_users)

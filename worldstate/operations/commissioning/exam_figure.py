@@ -14,11 +14,11 @@ BEFORE_S = np.linspace(0.0, 5.0, 26)
 
 def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
     """Draw the share of approaches in alarm and the AUROC against the time before T0, site by site."""
-    sites = sorted({str(one.heard.hops.about["site"]) for one in streams})
+    sites = sorted({one.heard.site for one in streams})
     with figure_file(path, 9.0, 3.6) as figure:
         warned, ranked = figure.subplots(1, 2)
         for site in sites:
-            here = [one for one in streams if one.heard.hops.about["site"] == site]
+            here = [one for one in streams if one.heard.site == site]
             onsets = examine(here)["onsets_per_hour"]
             told = site if onsets is None else f"{site}, {onsets:.0f} an hour"
             warned.plot(-BEFORE_S, warned_before(here, BEFORE_S), linewidth=1.0, label=told)

@@ -8,7 +8,8 @@ import scipy.signal
 
 from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
-from worldstate.adapters.simulation.scene.settings import SimulationSettings
+from worldstate.adapters.simulation.scene.settings import EGO_SPEEDS_MPS, SimulationSettings
+from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.adapters.simulation.sound.receiver import standing_m
 from worldstate.adapters.simulation.stream.ambience import ambience_piece, stream_ambience
 from worldstate.adapters.simulation.stream.arrivals import SOUND_MARGIN_S, Event, SoundEvent
@@ -85,7 +86,7 @@ def _rows_of_street(stream: HeardStream) -> GuardRows:
     measures, usable = characters(middle.ravel(), float(middle.shape[1] * HOPS_A_SECOND))
     labels = hop_labels(stream)
     kinds = np.where(np.isin(labels, ("left", "right", "both")), "hidden", labels)[usable]
-    return GuardRows(measures[:, : len(MEASURES)], kinds, np.full(len(kinds), str(stream.hops.about["site"])))
+    return GuardRows(measures[:, : len(MEASURES)], kinds, np.full(len(kinds), stream.site))
 
 
 def _rows_of_sound(
@@ -125,6 +126,11 @@ def event_and_ambience(
         sound = event_sound(event, settings.site, settings.preset, alone, rng).pressure_pa
         here, samples = stream_ambience(settings, rng), sound.shape[1] + round(lead_s * alone.sample_rate_hz)
         ambience = ambience_piece(settings, here, alone, samples, rng, begins=True)[0, :samples]
+        if not settings.ego.stands:
+            # Driving all the time: what stands is learned from the end of the drives.
+            speed = np.full(samples, rng.uniform(*EGO_SPEEDS_MPS))
+            levels = settings.preset.ego_engine_db, settings.site.surface_db
+            ambience += ego_noise(position_m[None], speed, alone.sample_rate_hz, rng, *levels)[:, 0]
     sound = np.pad(sound[0], (samples - sound.shape[1], 0))
     return sound / np.float32(FULL_SCALE_PA), ambience / np.float32(FULL_SCALE_PA)
 

@@ -41,7 +41,7 @@ def guard_rows(
 ) -> GuardRows:
     """Return the rows of streets, and those of so many sounds of each kind at some of their sites."""
     rate_hz = float(streets[0].hops.middle.shape[1] * HOPS_A_SECOND)
-    sites = sorted({str(stream.hops.about["site"]) for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
+    sites = sorted({stream.site for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
     draws = list(zip(sites, rng.spawn(len(sites)), strict=True))
     heard = in_processes(partial(_sounds_at, array, rate_hz), draws, jobs)
     return GuardRows.joined([street_rows(streets), *heard])

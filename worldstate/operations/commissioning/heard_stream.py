@@ -12,6 +12,7 @@ import numpy as np
 
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.simulation.scene.junction import ego_moves
 from worldstate.adapters.simulation.stream.drawn_stream import DrawnStream, draw_stream
 from worldstate.adapters.simulation.stream.rendering import Block
 from worldstate.adapters.simulation.stream.settings import StreamSettings
@@ -43,6 +44,16 @@ class HeardStream:
     def hazard_free(self) -> bool:
         """Whether nobody comes out of a hidden arm."""
         return not self.vehicles.hazard.any()
+
+    @property
+    def site(self) -> str:
+        """Name of the junction."""
+        return str(self.hops.about["site"])
+
+    @property
+    def ego_moves(self) -> bool:
+        """Whether the ego drives up to the corner."""
+        return ego_moves(self.site)
 
     def save(self, path: Path) -> None:
         """Write it, whole or not at all."""

@@ -15,8 +15,10 @@ from worldstate.abduction.signature.window_classes import DIRECT
 from worldstate.adapters.datasets.feature_table import N_FEATURES
 from worldstate.adapters.simulation.scene.places import open_road
 from worldstate.adapters.simulation.scene.presets import preset
+from worldstate.adapters.simulation.scene.settings import EGO_SPEEDS_MPS
 from worldstate.adapters.simulation.sound.background import add_background
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
 from worldstate.adapters.simulation.sound.propagation import add_sources
 from worldstate.adapters.simulation.sound.receiver import Receiver, standing_m
@@ -71,14 +73,15 @@ def drawn_source(rng: np.random.Generator) -> OpenSource:
 
 
 def open_field_features(
-    array: MicrophoneArray, n: int, rng: np.random.Generator, jobs: int = 1
+    array: MicrophoneArray, n: int, rng: np.random.Generator, jobs: int = 1, moving_ego: bool = False
 ) -> FloatArray:
     """Return the features of n windows of drawn sources in the open, shape (n, 60)."""
-    return np.array(list(in_processes(partial(_drawn_feature, array), rng.spawn(n), jobs)))
+    return np.array(list(in_processes(partial(_drawn_feature, array, moving_ego), rng.spawn(n), jobs)))
 
 
-def _drawn_feature(array: MicrophoneArray, rng: np.random.Generator) -> FloatArray:
-    return open_feature(array, drawn_source(rng), rng)
+def _drawn_feature(array: MicrophoneArray, moving_ego: bool, rng: np.random.Generator) -> FloatArray:
+    source = drawn_source(rng)
+    return open_feature(array, source, rng, rng.uniform(*EGO_SPEEDS_MPS) if moving_ego else 0.0)
 
 
 def open_field_windows(features: FloatArray, weight: float = OPEN_WEIGHT) -> SimulatedWindows:
@@ -92,7 +95,9 @@ def open_field_windows(features: FloatArray, weight: float = OPEN_WEIGHT) -> Sim
     return SimulatedWindows(np.hstack([features, nowhere]), *names, np.full(n, weight))
 
 
-def open_feature(array: MicrophoneArray, source: OpenSource, rng: np.random.Generator) -> FloatArray:
+def open_feature(
+    array: MicrophoneArray, source: OpenSource, rng: np.random.Generator, ego_mps: float = 0.0
+) -> FloatArray:
     """Render a second of one source in the open and return its feature, shape (60,)."""
     blocks = -(-round(_WINDOW_S * RATE_HZ) // KNOT_SAMPLES)
     knots = np.arange(blocks + 1) * KNOT_SAMPLES / RATE_HZ
@@ -102,6 +107,10 @@ def open_feature(array: MicrophoneArray, source: OpenSource, rng: np.random.Gene
     with one_blas_thread():
         _add_source(sound, source, receiver, rng)
         add_background(ambience, receiver, open_road().site, preset(), rng)
+    if ego_mps:
+        # Its own noise is part of what a source stands out from; that the array moves on is left out.
+        speed = np.full(receiver.samples, ego_mps)
+        ambience += ego_noise(receiver.positions_m, speed, RATE_HZ, rng, preset().ego_engine_db).T
     gain = 10.0 ** (source.snr_db / 20.0) * _level(ambience) / _level(sound)
     heard = (ambience + np.float32(gain) * sound)[:, : round(_WINDOW_S * RATE_HZ)]
     front_end = FrontEnd(array, RATE_HZ, FrontEndSettings(nfft=feature_nfft(RATE_HZ), watch_channels=False))

@@ -1,8 +1,9 @@
 """Which streams a model for an array is learned from, and which ones examine it."""
 
 from dataclasses import dataclass, replace
+from math import ceil
 
-from worldstate.adapters.simulation.scene.junction import SITES, Site, drawn_site, site
+from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, site
 from worldstate.adapters.simulation.scene.settings import rate_for
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.adapters.simulation.stream.traffic import traffic_named
@@ -12,7 +13,10 @@ APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
 # junction has its own: of one seed the same drivers come at the same times everywhere.
 LEARNED_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 2_000_000, 1000
-MOUNTING_SITE = SITES[2]
+# Of a moving ego a stream is many drives, each with a seed of its own. An approach is judged to six seconds
+# after its last vehicle, and a second one of a queue comes four seconds after the first.
+DRIVES_S, DRIVES_EACH = {APPROACHES: 18.0, HAZARD_FREE: 12.0}, 1000
+MOUNTING = 2  # Number of the junction where wrong mountings are heard
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,8 @@ class CommissionSettings:
         Sound is rendered up to here.
     seed : int
         Another seed, other streams.
+    moving_ego : bool
+        Whether the ego drives up to the corner, in many drives a junction, or stands there.
     leave_out : tuple of str
         Real junctions whose labelled windows are not learned.
     quick : bool
@@ -55,6 +61,12 @@ class CommissionSettings:
     seed: int = 1
     leave_out: tuple[str, ...] = ()
     quick: bool = False
+    moving_ego: bool = False
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """The junctions with a name, which examine."""
+        return MOVING_SITES if self.moving_ego else SITES
 
     def __post_init__(self) -> None:
         in_range("junctions", self.junctions, 2, 200)
@@ -75,40 +87,52 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams that a model learns from: drawn junctions, none of the five with a name."""
     kinds = ((APPROACHES, settings.approach_minutes), (HAZARD_FREE, settings.hazard_free_minutes))
+    motion = settings.sites[0][0]
     return [
-        _stream(f"S{'AB'[i % 2]}{101 + i // 2}", traffic, minutes, LEARNED_SEED + i, settings)
+        one
         for i in range(settings.junctions)
         for traffic, minutes in kinds
+        for one in _streams(
+            f"{motion}{'AB'[i % 2]}{101 + i // 2}", traffic, minutes, LEARNED_SEED + i, settings
+        )
     ]
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams of an exam: the five junctions with a name, twenty singles of each and more."""
     kinds = ((APPROACHES, 0.6 * settings.exam_minutes), (HAZARD_FREE, settings.exam_minutes))
+    chosen = (MOUNTING,) if settings.quick else range(len(settings.sites))
     return [
-        _stream(name, traffic, minutes, EXAM_SEED + SITES.index(name), settings)
-        for name in ((MOUNTING_SITE,) if settings.quick else SITES)
+        one
+        for i in chosen
         for traffic, minutes in kinds
+        for one in _streams(settings.sites[i], traffic, minutes, EXAM_SEED + i, settings)
     ]
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the streams of the exam at the junction where wrong mountings are heard, too."""
-    return [one for one in exam_streams(settings) if one.site.name == MOUNTING_SITE]
+    return [one for one in exam_streams(settings) if one.site.name == settings.sites[MOUNTING]]
 
 
 def junction_named(name: str) -> Site:
     """Return one of the five junctions, or the drawn one of another name."""
-    return site(name) if name in SITES else drawn_site(name)
+    return site(name) if name in SITES + MOVING_SITES else drawn_site(name)
 
 
-def _stream(
+def _streams(
     name: str, traffic: str, minutes: float, seed: int, settings: CommissionSettings
-) -> StreamSettings:
-    return StreamSettings(
+) -> list[StreamSettings]:
+    """Return the stream of a junction and traffic, or as many drives as last so long."""
+    own = seed + SEEDS_EACH * settings.seed
+    whole = StreamSettings(
         junction_named(name),
-        minutes,
-        seed + SEEDS_EACH * settings.seed,
+        DRIVES_S[traffic] / 60.0 if settings.moving_ego else minutes,
+        own,
         traffic_named(traffic),
         sample_rate_hz=rate_for(settings.bandwidth_hz),
     )
+    if not settings.moving_ego:
+        return [whole]
+    drives = ceil(minutes / whole.minutes - 1e-9)
+    return [replace(whole, seed=own * DRIVES_EACH + i) for i in range(drives)]

@@ -110,12 +110,14 @@ def alarm_for(quiet: Sequence[SequencePosterior], onsets_per_hour: float) -> Seq
     return SequenceAlarm(float(thresholds[np.sum(rates <= onsets_per_hour) - 1]), onsets_per_hour)
 
 
-def alarm_elsewhere(quiet: Sequence[SequencePosterior], onsets_per_hour: float) -> SequenceAlarm:
+def alarm_elsewhere(quiet: Sequence[Sequence[SequencePosterior]], onsets_per_hour: float) -> SequenceAlarm:
     """Return the lowest threshold that a junction not among these may be expected to have no more onsets at.
 
-    Takes one hazard-free stream a junction, two at least.
+    Takes the hazard-free streams of each junction, of two at least.
     """
-    thresholds, onsets, hours = _onsets(quiet)
+    thresholds, *counted = _onsets([one for there in quiet for one in there])
+    first = np.cumsum([0, *map(len, quiet[:-1])])
+    onsets, hours = (np.add.reduceat(one, first) for one in counted)
     kept = risk_controlling(onsets / hours[:, None], onsets_per_hour, LOUDEST * onsets_per_hour)
     if not kept:
         raise InvalidArgumentError(f"quiet: expected {LOUDEST - 1:g} junctions at least, got {len(quiet)}")
@@ -279,7 +281,7 @@ def quiet_figures(raised: Sequence[BoolArray]) -> dict[str, float | None]:
 
 def _worst(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     """Return what is detected at the junction with the least of it, and the most onsets of any junction."""
-    sites = np.array([str(one.heard.hops.about["site"]) for one in streams])
+    sites = np.array([one.heard.site for one in streams])
     there = [[streams[i] for i in np.flatnonzero(sites == site).tolist()] for site in np.unique(sites)]
     shares = [mean_of([one.detected for one in _loud(here)]) for here in there]
     rates = [_false_alarms(here)["onsets_per_hour"] for here in there]

@@ -22,6 +22,8 @@ from .stream_labels import SILENT_KINDS
 UNUSED = ""
 # Hidden: a second or less before it comes into view. Of two, the later one is as loud as that within 2.5 s.
 HIDDEN_S, SECOND_S = 1.0, 2.5
+# Windows of a moving ego lie so much later: its released ones of hidden vehicles end half a second after T0.
+MOVING_LATE_S = 0.5
 # In view: from half a second after it came, the released front windows end 1.5 s after; farther than this a
 # vehicle is hardly heard. Windows that hold its sound, to a second after it has gone, are of no other class.
 FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
@@ -44,9 +46,10 @@ def hop_labels(stream: HeardStream) -> TextArray:
     left, right = (_comes_within(stream, HIDDEN_S, side) for side in SIDES)
     left_soon, right_soon = (_comes_within(stream, SECOND_S, side) for side in SIDES)
     both = (left & right_soon) | (right & left_soon)
-    near, lately = _in_view(stream, *FRONT_S), _in_view(stream, 0.0, WINDOW_S)
+    late_s = MOVING_LATE_S if stream.ego_moves else 0.0
+    near, lately = _in_view(stream, FRONT_S[0] + late_s, FRONT_S[1]), _in_view(stream, 0.0, WINDOW_S)
     # The hop at which it comes into view is still the last of the hidden ones.
-    covered = _in_view(stream, 0.5 * HOP_S, WINDOW_S)
+    covered = _in_view(stream, late_s + 0.5 * HOP_S, WINDOW_S)
     anyone = _comes_within(stream, CALM_S) | _comes_within(stream, CALM_S, quiet=True)
     calm = ~anyone & ~lately
     # A vehicle in view covers one behind it: what is heard then is no clean window of either.
@@ -63,7 +66,7 @@ def stream_windows(
     chosen = settings or CuttingSettings()
     cut = [_cut(stream, chosen) for stream in streams]
     features = np.concatenate([stream.hops.feature[rows] for stream, rows, _ in cut]).astype(np.float64)
-    sites = np.concatenate([np.full(len(rows), stream.hops.about["site"]) for stream, rows, _ in cut])
+    sites = np.concatenate([np.full(len(rows), stream.site) for stream, rows, _ in cut])
     labels = np.concatenate([names for _, _, names in cut])
     references = np.empty((len(sites), 3 * features.shape[1]))
     for site in np.unique(sites):
@@ -106,7 +109,8 @@ def _comes_within(stream: HeardStream, seconds: float, side: str = "", *, quiet:
     asked = vehicles.hazard & (np.isin(vehicles.kind, SILENT_KINDS) == quiet)
     entries = vehicles.entry_s[asked & ((vehicles.arm == side) | (side == ""))]
     left_s = entries[None, :] - stream.hops.time_s[:, None]
-    return np.asarray(((left_s >= 0.0) & (left_s <= seconds)).any(axis=1))
+    latest_s = -MOVING_LATE_S if stream.ego_moves else 0.0
+    return np.asarray(((left_s >= latest_s) & (left_s <= seconds)).any(axis=1))
 
 
 def _in_view(stream: HeardStream, after_s: float, stays_s: float) -> BoolArray:
