@@ -43,7 +43,9 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
         return simulated_beside(tables) if tables else None
     # A table that does not say, as the released one, is OVAD's.
     array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
-    in_the_open = open_field_windows(open_field_features(array, N_OPEN, np.random.default_rng(0)))
+    moves = any(one.ego_moves for one in streams)
+    features = open_field_features(array, N_OPEN, np.random.default_rng(0), moving_ego=moves)
+    in_the_open = open_field_windows(features)
     return learned_beside(streams, in_the_open, tables).beside(table.environments)
 
 

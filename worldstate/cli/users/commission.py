@@ -56,6 +56,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
     add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
+    minutes = "of approaches at each; all other streams and the exam last in proportion (default: 7.2)"
+    add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
     add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
     add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
     wrong = "hear one junction of the exam with a turned array and with wrong positions, too"
@@ -147,8 +149,12 @@ def _mounted(
 def _settings(arguments: argparse.Namespace) -> "CommissionSettings":
     from worldstate.operations.commissioning.plan import CommissionSettings, quick_settings
 
+    minutes: float = arguments.minutes
     settings = CommissionSettings(
         junctions=arguments.junctions,
+        approach_minutes=minutes,
+        hazard_free_minutes=minutes / 1.2,
+        exam_minutes=minutes / 0.3,
         onsets_per_hour=ONSETS[arguments.ego] if arguments.onsets is None else arguments.onsets,
         seed=arguments.seed,
         leave_out=tuple(arguments.leave_out),
