@@ -23,6 +23,7 @@ ORDER = [
     "measurement",
     "state",
     "core",
+    "smoothing",
     "frontend",
     "abduction",
     "adapters",

@@ -1,0 +1,79 @@
+"""The synthetic problem of smoothing: bearing and looming while hidden, then range, from a standing ego."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.belief.kinematics import motion
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.measurement import Approach, Bearing
+from worldstate.smoothing import FixedLagSmoother, Range, SmoothingSettings
+
+HOP_S, HOP_NS, HOPS, HIDDEN_HOPS = 0.1, 100_000_000, 60, 35
+PSD = 1.0  # Of the vehicles' acceleration, m^2/s^3
+HIDDEN_STD_RAD, SEEN_STD_RAD, LOOMING_STD_HZ, RANGE_STD_M = math.radians(4.0), math.radians(1.0), 0.25, 0.5
+PRIOR = MotionBelief.around((0.9, -0.1, -0.2, math.log(25.0)), (0.35, 0.15, 0.15, 0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One vehicle, drawn from the prior where it comes neither too near nor too far, and what is measured."""
+
+    places_m: np.ndarray
+    observations: list
+
+
+def heard_then_seen(rng: np.random.Generator) -> Problem:
+    places, azimuth, rate = _drawn(rng)
+    r = np.hypot(*places.T)
+    observations = []
+    for hop in range(HOPS):
+        hidden = hop < HIDDEN_HOPS
+        std = HIDDEN_STD_RAD if hidden else SEEN_STD_RAD
+        seen = [Bearing(azimuth[hop] + rng.normal(0.0, std), std)]
+        seen.append(Approach(rate[hop] + rng.normal(0.0, LOOMING_STD_HZ), LOOMING_STD_HZ))
+        if not hidden:
+            seen.append(Range(max(r[hop] + rng.normal(0.0, RANGE_STD_M), 1.0), RANGE_STD_M))
+        observations.append(seen)
+    return Problem(places, observations)
+
+
+def _drawn(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    t = HOP_S
+    flow = np.eye(4) + t * np.eye(4, k=2)
+    jolt = np.linalg.cholesky(PSD * np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2)))
+    while True:
+        theta, turning, closing, log_m = rng.normal(PRIOR.mean, np.sqrt(np.diag(PRIOR.covariance)))
+        z = np.exp(log_m + 1j * theta)
+        v = z * (closing + 1j * turning)
+        states = [np.array([z.real, z.imag, v.real, v.imag])]
+        for _ in range(HOPS - 1):
+            states.append(flow @ states[-1] + jolt @ rng.standard_normal(4))
+        x, y, vx, vy = np.array(states).T
+        r = np.hypot(x, y)
+        if r.min() > 4.0 and r.max() < 70.0:
+            return np.stack([x, y], axis=1), np.arctan2(y, x), -(x * vx + y * vy) / r**2
+
+
+def hidden_errors_m(seed: int) -> tuple[float, float]:
+    """Return the rms error of the hidden positions of the filter and of the smoother."""
+    problem = heard_then_seen(np.random.default_rng(seed))
+    belief, filtered = PRIOR, []
+    smoother = FixedLagSmoother(SmoothingSettings(acceleration_psd=PSD))
+    smoother.begin("car", 0, belief)
+    for hop, observed in enumerate(problem.observations):
+        smoother.update(hop * HOP_NS, {"car": observed})
+        if hop < HIDDEN_HOPS:
+            belief = motion.predict(belief, HOP_S, PSD) if hop else belief
+            bearing, approach = observed
+            belief = motion.update_azimuth(belief, bearing.azimuth_rad, bearing.std_rad, 1.0)
+            belief = motion.update_approach(belief, approach.inverse_tta_hz, approach.std_hz, 1.0)
+            filtered.append(np.exp(belief.mean[3] + 1j * belief.mean[0]))
+    z = np.array(filtered)
+    true = problem.places_m[:HIDDEN_HOPS]
+    smoothed = smoother.track("car").states[:HIDDEN_HOPS, :2]
+    return tuple(
+        math.sqrt(((found - true) ** 2).sum(axis=1).mean())
+        for found in (np.stack([z.real, z.imag], axis=1), smoothed)
+    )

@@ -1,0 +1,5 @@
+"""The past corrected: a fixed-lag smoother over entities, ego and site, beside the filter."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,9 @@
+from .fixed_lag_smoother import FixedLagSmoother as FixedLagSmoother
+from .observations import AngularHeight as AngularHeight
+from .observations import Odometry as Odometry
+from .observations import PastEdge as PastEdge
+from .observations import Range as Range
+from .observations import ReflectedBearing as ReflectedBearing
+from .settings import SmoothingSettings as SmoothingSettings
+from .smoothed_track import FirstSight as FirstSight
+from .smoothed_track import SmoothedTrack as SmoothedTrack
