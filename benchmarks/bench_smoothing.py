@@ -3,8 +3,8 @@
 Run: python benchmarks/bench_smoothing.py [--json] [--seconds 40]
 
 Three entities, lag 15 s, two corners, four walls. Each entity is heard by bearing and approach rate and, at
-every tenth hop, by its image in a wall; once past its corner it is seen by bearing and box height, and looks
-say on which side of the edge it is. The peer filters and smooths the same lag anew at every hop, as who has no
+every tenth hop, by its image in a wall; past its corner it is seen by bearing and box height, and looks say
+on which side of the edge it is. The peer filters and smooths the same lag anew at every hop, as who has no
 incremental smoother must: constant velocity in Cartesian coordinates, positions measured. Processor time of
 one thread, in ms; `smoothing_times` is for other benchmarks and tests to call.
 """

@@ -153,7 +153,7 @@ def position_factor(node: Node, one: Position) -> Factor:
 
 def height_factor(node: Node, height_key: int, one: AngularHeight, settings: SmoothingSettings) -> Factor:
     r"""Return the height of a box: :math:`\log\alpha = \log h - \log r` with the entity's own height h."""
-    start, value = np.array([math.log(settings.height_m)]), math.log(one.height_rad)
+    start, value = np.array([math.log(one.true_height_m)]), math.log(one.height_rad)
 
     def error(*values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
         local, by_state, by_pose = node.seen(*values[:-1])

@@ -388,7 +388,7 @@ class FixedLagSmoother:
             case Range():
                 return f.range_factor(node, said, self.settings)
             case AngularHeight():
-                return f.height_factor(node, self._height(one), said, self.settings)
+                return f.height_factor(node, self._height(one, said), said, self.settings)
             case ReflectedBearing():
                 wall = self._landmark(said.wall)
                 return f.reflected_factor(node, wall.key, wall.start, said, self.settings)
@@ -396,13 +396,13 @@ class FixedLagSmoother:
                 edge = self._landmark(said.corner)
                 return f.edge_factor(node, edge.key, edge.start, edge.side, said, self.settings)
 
-    def _height(self, one: _Entity) -> int:
+    def _height(self, one: _Entity, said: AngularHeight) -> int:
         """Return the key of an entity's height, which lives as long as its states."""
-        key, chosen = key_of(HEIGHT, one.number), self.settings
+        key = key_of(HEIGHT, one.number)
         if not one.sized:
-            one.sized, start = True, np.array([math.log(chosen.height_m)])
+            one.sized, start = True, np.array([math.log(said.true_height_m)])
             self._graph.add_variable(key, start, self._time_s(self._now_ns))
-            self._graph.add(f.prior_factor(key, start, np.array([[chosen.height_log_std**2]])))
+            self._graph.add(f.prior_factor(key, start, np.array([[said.true_relative_std**2]])))
         return key
 
     def _move_ego(self, stamp_ns: int, odometry: Odometry) -> None:

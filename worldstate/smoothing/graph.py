@@ -99,7 +99,7 @@ class FactorGraph:
         parameters.setRelativeErrorTol(1e-12)
         parameters.setAbsoluteErrorTol(1e-12)
         parameters.setMaxIterations(30)
-        start = self._smoother.calculateEstimate()
+        start = self._smoother.getLinearizationPoint()
         values = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
         # gtsam's `Marginals` know Cholesky only from Python, which finds them indeterminate.
         solved = gtsam.ISAM2(_parameters())

@@ -36,15 +36,20 @@ class AngularHeight:
         Radians, > 0.
     relative_std : float
         Its standard deviation over itself, > 0.
+    true_height_m, true_relative_std : float
+        How high such an entity is, and how widely that varies; said once, with the first of its boxes.
 
     Examples
     --------
-    >>> AngularHeight(0.12, 0.03).height_rad
-    0.12
+    >>> AngularHeight(0.12, 0.03).true_height_m
+    1.5
     """
 
     height_rad: float
     relative_std: float
+    true_height_m: float = 1.5
+    # From a small car to a sports utility vehicle.
+    true_relative_std: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)

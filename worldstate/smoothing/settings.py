@@ -24,8 +24,6 @@ class SmoothingSettings:
         turning off then cost less than as white acceleration. None for a Gaussian.
     range_m, range_log_std : float
         Prior of the distance at which an entity is first observed, and its deviation as a factor's logarithm.
-    height_m, height_log_std : float
-        Prior of the height of what a box stands around, and its deviation, by which boxes tell the distance.
     edge_std_rad : float
         How sharply line of sight begins at an edge: a vehicle is no point.
     relinearize_every : int
@@ -49,16 +47,14 @@ class SmoothingSettings:
     manoeuvre_k: float | None = None
     range_m: float = 25.0
     range_log_std: float = 0.7
-    height_m: float = 1.5
-    height_log_std: float = 0.1
     edge_std_rad: float = math.radians(1.0)
     # Relinearising at every update costs four times as much and moves the result by less than a percent.
     relinearize_every: int = 10
 
     def __post_init__(self) -> None:
         in_range("lag_s", self.lag_s, 0.0, 600.0, open_low=True)
-        positive = ("acceleration_psd", "robust_k", "range_m", "range_log_std", "height_m", "height_log_std")
-        for name in (*positive, "edge_std_rad"):
+        positive = ("acceleration_psd", "robust_k", "range_m", "range_log_std", "edge_std_rad")
+        for name in positive:
             in_range(name, getattr(self, name), 0.0, 1e6, open_low=True)
         if self.manoeuvre_k is not None:
             in_range("manoeuvre_k", self.manoeuvre_k, 0.0, 1e6, open_low=True)
