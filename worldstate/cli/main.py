@@ -20,6 +20,7 @@ COMMANDS = (
     "users.run",
     "users.explain",
     "users.replay",
+    "users.plot",
     "users.bearings",
     "users.doctor",
     "users.bounds",

@@ -1,0 +1,200 @@
+"""A run over time, drawn from its snapshots, over the power of the sound where the recording is at hand."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from worldstate.adapters.audio.sound_file import Audio
+from worldstate.adapters.export.scene import sector_of
+from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import seconds
+from worldstate.operations.figure_style import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    figure_file,
+    legend_beside,
+)
+from worldstate.state import Entity, WorldState
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Of the sides, told apart from red and blue, which say hidden and in view.
+_SIDE_COLORS = (PURPLE, GREEN, ORANGE, SKY)
+# States further apart are not joined by a line: nobody heard what was between them.
+_GAP_S = 0.25
+# An entity is drawn where it more likely exists than not.
+_LIKELY = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SoundPower:
+    """Steered response power of a recording, one row a hop."""
+
+    time_s: FloatArray  # Middle of the window of each row, on the clock of the recording
+    azimuths_rad: FloatArray
+    power: FloatArray  # shape (hops, azimuths)
+
+
+def sound_power(audio: Audio, front_end: FrontEnd) -> SoundPower:
+    """Read the power over azimuth of every hop of an open recording."""
+    rows = [
+        (seconds(frame.stamp_ns), frame.srp.astype(np.float32))
+        for block in audio.blocks(audio.sample_rate_hz)
+        for frame in front_end.process(block)
+    ]
+    time_s, power = np.array([t for t, _ in rows]), np.array([row for _, row in rows])
+    settings = front_end.settings
+    # Drawn at its end, a window of a second would lag the camera by half of one.
+    age_s = 0.5 * settings.window_hops / settings.hop_rate_hz
+    return SoundPower(time_s - age_s, settings.azimuths_rad(), power)
+
+
+def write_state_figure(
+    states: Sequence[WorldState], path: Path, *, title: str = "", sound: SoundPower | None = None
+) -> None:
+    """Draw azimuths, what was raised and seen, existence and risk over time."""
+    with figure_file(path, 10.0, 8.6 if sound is None else 9.6) as figure:
+        heights = (1.0 if sound is None else 1.4, 0.42, 0.6, 0.6)
+        azimuths, rows, existence, risk = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+        if sound is not None:
+            _draw_sound(azimuths, sound)
+        _draw_azimuths(azimuths, states)
+        _draw_rows(rows, states)
+        _draw_existence(existence, states)
+        _draw_risk(risk, states)
+        for axes in (azimuths, existence, risk):
+            legend_beside(axes)
+        time_s = _times(states)
+        risk.set(xlabel="time (s), end of the decision window", xlim=(time_s[0] - 0.1, time_s[-1] + 0.1))
+        figure.suptitle(title)
+
+
+def _draw_sound(axes: "Axes", sound: SoundPower) -> None:
+    level = sound.power / np.median(sound.power, axis=1, keepdims=True)
+    mesh = axes.pcolormesh(
+        sound.time_s,
+        np.degrees(sound.azimuths_rad),
+        level.T,
+        shading="nearest",
+        cmap="Greys",
+        rasterized=True,
+    )
+    bar = axes.figure.colorbar(mesh, ax=axes, location="top", aspect=60, pad=0.02, fraction=0.05)
+    bar.set_label("power of the sound over its median over azimuth, each window at its middle")
+
+
+def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
+    """Draw where every entity is in nine of ten cases, and the bearing that was measured."""
+    heard = [(seconds(state.stamp_ns), state.bearing.azimuth_rad) for state in states if state.bearing]
+    if heard:
+        time_s, azimuth_rad = np.array(heard).T
+        axes.plot(time_s, np.degrees(azimuth_rad), ".", color="0.45", ms=3, label="bearing of the sound")
+    ids = dict.fromkeys(one.id for state in states for one in state.entities if one.moving)
+    for entity_id in ids:
+        for hidden, color, label in (
+            (True, RED, "hidden, nine of ten"),
+            (False, BLUE, "in view, nine of ten"),
+        ):
+            track = [_azimuth_row(state, entity_id, hidden) for state in states]
+            time_s, azimuth, low, high = _with_gaps(np.array(track)).T
+            if np.isfinite(azimuth).any():
+                axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
+                axes.plot(time_s, azimuth, color=color, label=f"entity, {label}")
+    axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
+
+
+def _azimuth_row(state: WorldState, entity_id: str, hidden: bool) -> tuple[float, float, float, float]:
+    for entity in state.entities:
+        if entity.id == entity_id and _hidden(entity) == hidden and entity.existence_probability >= _LIKELY:
+            low, high = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
+            degrees = np.degrees([entity.azimuth_rad, low, high])
+            return (seconds(state.stamp_ns), *degrees.tolist())
+    return seconds(state.stamp_ns), np.nan, np.nan, np.nan
+
+
+def _with_gaps(rows: FloatArray) -> FloatArray:
+    """Put a row of NaN where states are missing, so that no line is drawn across."""
+    return np.insert(rows, np.flatnonzero(np.diff(rows[:, 0]) > _GAP_S) + 1, np.nan, axis=0)
+
+
+def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
+    """Draw a bar while an advisory is out, and a mark for each look that found something or nothing."""
+    names = [f"advisory {side}" for side in _sides(states)]
+    for row, side in enumerate(_sides(states)):
+        on = [seconds(s.stamp_ns) for s in states if any(c.direction == side and c.advisory for c in s.cues)]
+        axes.broken_barh([(t, 0.1) for t in on], (row - 0.4, 0.8), color=_SIDE_COLORS[row], lw=0)
+    looks = {
+        (one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched
+    }  # a look stands in every snapshot until the next one
+    for sensor in sorted({sensor for sensor, _, _ in looks}):
+        row = len(names)
+        for found, color, mark in ((True, BLUE, "|"), (False, "0.75", "|")):
+            at_s = [seconds(stamp_ns) for name, stamp_ns, was in looks if name == sensor and was == found]
+            axes.plot(at_s, [row] * len(at_s), mark, color=color, ms=9 if found else 4)
+        names.append(f"{sensor} (blue: found)")
+    foreign = [seconds(s.stamp_ns) for s in states if type(s.domain).__name__ == "Foreign"]
+    if foreign:
+        axes.broken_barh([(t, 0.1) for t in foreign], (len(names) - 0.3, 0.6), color="0.6", lw=0)
+        names.append("foreign sound")
+    axes.set(yticks=range(len(names)), yticklabels=names, ylim=(-0.6, len(names) - 0.4))
+    axes.tick_params(axis="y", length=0)
+
+
+def _draw_existence(axes: "Axes", states: Sequence[WorldState]) -> None:
+    rows = [
+        (seconds(s.stamp_ns), *(_existence(s, side) for side in _sides(states)), _in_view(s)) for s in states
+    ]
+    time_s, *columns = _with_gaps(np.array(rows)).T
+    for side, color, column in zip(_sides(states), _SIDE_COLORS, columns, strict=False):
+        axes.plot(time_s, column, color=color, label=f"somebody hidden, {side}")
+    axes.plot(time_s, columns[-1], color=BLUE, ls=":", label="the likeliest in view")
+    axes.set(ylabel="existence\nprobability", ylim=(-0.02, 1.02))
+
+
+def _draw_risk(axes: "Axes", states: Sequence[WorldState]) -> None:
+    for row, side in enumerate(_sides(states)):
+        cues = [(s.stamp_ns, next((c for c in s.cues if c.direction == side), None)) for s in states]
+        told = [
+            (
+                seconds(t),
+                np.nan if c is None else c.risk,
+                np.nan if c is None else (c.within or {}).get("3", np.nan),
+            )
+            for t, c in cues
+        ]
+        time_s, risk, within = _with_gaps(np.array(told)).T
+        axes.plot(time_s, risk, color=_SIDE_COLORS[row], label=f"risk, {side}")
+        if np.isfinite(within).any():
+            axes.plot(time_s, within, color=_SIDE_COLORS[row], ls="--", label=f"in view within 3 s, {side}")
+    axes.set(ylabel="risk,\nprobability", ylim=(-0.02, 1.02))
+
+
+def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
+    return states[0].context.directions[: len(_SIDE_COLORS)]
+
+
+def _times(states: Sequence[WorldState]) -> list[float]:
+    return [seconds(state.stamp_ns) for state in states]
+
+
+def _existence(state: WorldState, side: str) -> float:
+    found = [e.existence_probability for e in state.entities if _hidden(e) and e.direction == side]
+    return max(found, default=0.0)
+
+
+def _in_view(state: WorldState) -> float:
+    found = [e.existence_probability for e in state.entities if e.moving and not _hidden(e)]
+    return max(found, default=0.0)
+
+
+def _hidden(entity: Entity) -> bool:
+    return entity.status == "hidden"
