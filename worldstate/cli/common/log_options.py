@@ -1,65 +1,116 @@
-"""Viewers and logs that a command sends world-states to, hop by hop."""
+"""Viewers, logs and other stacks that a command sends world-states to, hop by hop."""
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_message import LogMessage, LogSink
     from worldstate.adapters.listen import Source, Step
+    from worldstate.state import WorldState
 
 FOXGLOVE_PORT = 8765
+# The options that name files to write.
+LOG_FILES = ("mcap", "osi", "autoware")
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --mcap and --live."""
-    add = parser.add_argument_group("viewers and logs").add_argument
+    """Declare --mcap, --live, --osi, --autoware, --odas and --crossing."""
+    add = parser.add_argument_group("viewers, logs and other stacks").add_argument
     add("--mcap", type=Path, metavar="FILE", help="write snapshots and scene for Foxglove")
     live = "serve the same on a Foxglove websocket, in real time (default port: 8765)"
     add("--live", type=int, nargs="?", const=FOXGLOVE_PORT, metavar="PORT", help=live)
+    add("--osi", type=Path, metavar="FILE", help="write a trace of ASAM OSI SensorData")
+    add("--autoware", type=Path, metavar="JSONL", help="write Autoware's PredictedObjects, one a line")
+    add("--odas", metavar="HOST:PORT", help="send tracks as ODAS does; ODAS Studio listens at port 9000")
+    crossing = "metres ahead of the lane in which --osi and --autoware put who is only heard (default: 9)"
+    add("--crossing", type=float, default=9.0, metavar="M", help=crossing)
+
+
+@dataclass(frozen=True, slots=True)
+class StateLogs:
+    """Everything that states are passed on to."""
+
+    viewers: "list[LogSink]" = field(default_factory=list)  # These take messages
+    stacks: "list[Callable[[WorldState], None]]" = field(default_factory=list)  # These take states
+
+    def message(self, message: "LogMessage") -> None:
+        """Pass a message on to every viewer."""
+        for viewer in self.viewers:
+            viewer(message)
+
+    def state(self, state: "WorldState") -> None:
+        """Pass a state on."""
+        from worldstate.adapters.export.log_message import state_messages
+
+        for message in state_messages(state) if self.viewers else ():
+            self.message(message)
+        for stack in self.stacks:
+            stack(state)
 
 
 @contextmanager
-def open_logs(arguments: argparse.Namespace) -> "Iterator[Callable[[LogMessage], None]]":
-    """Lend a function that passes a message to every log that was asked for."""
-    with ExitStack() as stack:
-        sinks: list[LogSink] = []
+def open_logs(arguments: argparse.Namespace) -> Iterator[StateLogs]:
+    """Open every log that was asked for."""
+    with ExitStack() as opened:
+        logs = StateLogs()
+        _open_stacks(arguments, logs, opened)
         if arguments.mcap is not None:
             from worldstate.adapters.export.mcap_file import mcap_file
 
-            sinks.append(stack.enter_context(mcap_file(arguments.mcap)))
+            logs.viewers.append(opened.enter_context(mcap_file(arguments.mcap)))
         if arguments.live is not None:
             from worldstate.adapters.export.live_server import live_server
 
-            send, port = stack.enter_context(live_server(arguments.live))
+            send, port = opened.enter_context(live_server(arguments.live))
             print(f"Foxglove: open connection ws://127.0.0.1:{port}", file=sys.stderr)
-            sinks.append(send)
+            logs.viewers.append(send)
+        yield logs
 
-        def pass_on(message: "LogMessage") -> None:
-            for sink in sinks:
-                sink(message)
 
-        yield pass_on
+def _open_stacks(arguments: argparse.Namespace, logs: StateLogs, opened: ExitStack) -> None:
+    from worldstate.ground.checks import in_range
+
+    crossing_m = in_range("--crossing", arguments.crossing, 1.0, 100.0)
+    if arguments.osi is not None:
+        from worldstate.adapters.export.osi import osi_trace
+
+        logs.stacks.append(opened.enter_context(osi_trace(arguments.osi, crossing_m)))
+    if arguments.autoware is not None:
+        from worldstate.adapters.export.autoware import autoware_objects
+        from worldstate.adapters.files.states_file import states_writer
+
+        write = opened.enter_context(states_writer(arguments.autoware))
+        logs.stacks.append(
+            lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
+        )
+    if arguments.odas is not None:
+        from worldstate.adapters.export.odas import odas_socket
+
+        logs.stacks.append(opened.enter_context(odas_socket(arguments.odas)))
 
 
 @contextmanager
 def log_hops(arguments: argparse.Namespace, source: "Source") -> "Iterator[Callable[[Step], None]]":
     """Lend a function that logs a hop of a recording: state, power over azimuth, and the camera's image."""
-    if arguments.mcap is None and arguments.live is None:
-        yield lambda step: None
-        return
-    from worldstate.adapters.export.camera_images import camera_images
-    from worldstate.adapters.export.log_message import srp_message, state_messages
+    with open_logs(arguments) as logs:
+        if not logs.viewers:
+            yield lambda step: logs.state(step.state)
+            return
+        from worldstate.adapters.export.camera_images import camera_images
+        from worldstate.adapters.export.log_message import srp_message
 
-    with open_logs(arguments) as log:
         image_before = camera_images(source.audio_path.parent, source.start_ns)
 
         def log_hop(step: "Step") -> None:
-            for message in (*image_before(step.state.stamp_ns), *state_messages(step.state)):
-                log(message)
-            log(srp_message(step.state, step.frame.azimuths_rad, step.frame.srp))
+            for message in image_before(step.state.stamp_ns):
+                logs.message(message)
+            logs.state(step.state)
+            logs.message(srp_message(step.state, step.frame.azimuths_rad, step.frame.srp))
 
         yield log_hop

@@ -7,7 +7,7 @@ Read the snapshots of an MCAP file or of JSON lines, and write or serve them ane
 import argparse
 from pathlib import Path
 
-from worldstate.cli.common.log_options import add_log_options, open_logs
+from worldstate.cli.common.log_options import LOG_FILES, add_log_options, open_logs
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 
@@ -15,7 +15,9 @@ EXAMPLE = """\
 examples:
   worldstate replay out.mcap --out states.jsonl
   worldstate replay states.jsonl --mcap out.mcap
-  worldstate replay states.jsonl --live"""
+  worldstate replay states.jsonl --live
+  worldstate replay states.jsonl --osi out.osi --autoware objects.jsonl
+  worldstate replay states.jsonl --odas 127.0.0.1:9000"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,24 +30,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.export.log_message import state_messages
     from worldstate.adapters.export.state_log import read_log
     from worldstate.adapters.files.states_file import states_writer
     from worldstate.cli.common.progress import progress_bar
     from worldstate.ground.values import seconds
     from worldstate.operations.recordings.warning import WarningMeter
 
-    check_outputs(arguments, "out", "mcap")
+    check_outputs(arguments, "out", *LOG_FILES)
     meter, stamps_ns, peak_risk = WarningMeter(t0_s=None), [], 0.0
     with (
         states_writer(arguments.out) as write,
-        open_logs(arguments) as log,
+        open_logs(arguments) as logs,
         progress_bar(f"reading {arguments.log.name}", None) as bar,
     ):
         for line, state in read_log(arguments.log):
             write(line)
-            for message in state_messages(state):
-                log(message)
+            logs.state(state)
             meter.update(state)
             stamps_ns.append(state.stamp_ns)
             peak_risk = max(peak_risk, state.risk)

@@ -29,7 +29,7 @@ from worldstate.cli.common.array_options import (
     stance,
 )
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
-from worldstate.cli.common.log_options import add_log_options, log_hops
+from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.sound_options import add_sound_options, sound_of
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.operations.recordings.bearing_gating import bearing_figures, write_gating_figure
     from worldstate.operations.recordings.timeline import write_timeline
 
-    check_outputs(arguments, "out", "save_state", "mcap", figures=("figure", "gating"))
+    check_outputs(arguments, "out", "save_state", *LOG_FILES, figures=("figure", "gating"))
     source = _source(arguments)
     try:
         with log_hops(arguments, source) as log:

@@ -1,0 +1,186 @@
+"""OSI, Autoware and ODAS: read back by their own package, or by a parser written from their definitions."""
+
+import json
+import math
+import re
+import socket
+import threading
+import uuid
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scripted_states import scripted_states
+
+from worldstate.adapters.export.autoware import autoware_objects
+from worldstate.adapters.export.lane_objects import lane_objects
+from worldstate.cli.main import main
+
+STATES = scripted_states()
+HIDDEN, PLACED = STATES[0], STATES[-1]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("stacks") / "states.jsonl"
+    path.write_text("".join(state.to_json() + "\n" for state in STATES))
+    return path
+
+
+def test_osi_reads_the_trace_and_finds_every_entity(log, tmp_path):
+    from osi3trace.osi_trace import OSITrace
+
+    assert main(["replay", str(log), "--osi", str(tmp_path / "out.osi"), "--crossing", "7"]) == 0
+    found = list(OSITrace(str(tmp_path / "out.osi"), type_name="SensorData"))
+    assert [m.timestamp.seconds * 10**9 + m.timestamp.nanos for m in found] == [s.stamp_ns for s in STATES]
+    for message, state in zip(found, STATES, strict=True):
+        moving = [one for one in state.entities if one.moving]
+        said = [one.header.existence_probability for one in message.moving_object]
+        assert said == [one.existence_probability for one in moving]
+        for told, entity in zip(message.moving_object, moving, strict=True):
+            azimuth = math.atan2(told.base.position.y, told.base.position.x)
+            assert azimuth == pytest.approx(entity.azimuth_rad, abs=0.05)
+    first = found[0].moving_object[0]
+    assert first.header.measurement_state == first.header.MEASUREMENT_STATE_PREDICTED
+    assert first.base.position.x == pytest.approx(7.0)
+    assert first.base.velocity.y < 0.0, "it is hidden on the left and comes towards the axis"
+    last = found[-1].moving_object[0]
+    assert last.header.measurement_state == last.header.MEASUREMENT_STATE_MEASURED
+    assert (last.base.position.x, last.base.position.y) == PLACED.entities[0].position_m[:2]
+    car, unknown = last.candidate
+    assert (car.probability, unknown.probability) == (0.7, 0.3)
+    assert car.vehicle_classification.type == car.vehicle_classification.TYPE_CAR
+    assert found[-2].moving_object[0].header.tracking_id == last.header.tracking_id
+
+
+# As the .msg files of autoware_perception_msgs, geometry_msgs and unique_identifier_msgs say.
+MESSAGES = {
+    "PredictedObjects": "Header header; PredictedObject[] objects",
+    "Header": "Time stamp; string frame_id",
+    "Time": "int32 sec; uint32 nanosec",
+    "Duration": "int32 sec; uint32 nanosec",
+    "PredictedObject": "UUID object_id; float32 existence_probability; "
+    "ObjectClassification[] classification; PredictedObjectKinematics kinematics; Shape shape",
+    "UUID": "uint8[16] uuid",
+    "ObjectClassification": "uint8 label; float32 probability",
+    "PredictedObjectKinematics": "PoseWithCovariance initial_pose_with_covariance; "
+    "TwistWithCovariance initial_twist_with_covariance; "
+    "AccelWithCovariance initial_acceleration_with_covariance; PredictedPath[] predicted_paths",
+    "PoseWithCovariance": "Pose pose; float64[36] covariance",
+    "TwistWithCovariance": "Twist twist; float64[36] covariance",
+    "AccelWithCovariance": "Accel accel; float64[36] covariance",
+    "Pose": "Point position; Quaternion orientation",
+    "Point": "float64 x; float64 y; float64 z",
+    "Vector3": "float64 x; float64 y; float64 z",
+    "Quaternion": "float64 x; float64 y; float64 z; float64 w",
+    "Twist": "Vector3 linear; Vector3 angular",
+    "Accel": "Vector3 linear; Vector3 angular",
+    "PredictedPath": "Pose[] path; Duration time_step; float32 confidence",
+    "Shape": "uint8 type; Polygon footprint; Vector3 dimensions",
+    "Polygon": "Point32[] points",
+    "Point32": "float32 x; float32 y; float32 z",
+}
+RANGES = {"uint8": (0, 255), "int32": (-(2**31), 2**31 - 1), "uint32": (0, 2**32 - 1)}
+
+
+def check(kind, value):
+    name, many, count = re.fullmatch(r"(\w+?)(\[(\d*)\])?", kind).groups()
+    if many:
+        assert isinstance(value, list)
+        assert not count or len(value) == int(count)
+        for one in value:
+            check(name, one)
+    elif name in MESSAGES:
+        wanted = dict(reversed(field.split()) for field in MESSAGES[name].split("; "))
+        assert list(value) == list(wanted), f"the fields of {name}"
+        for field, field_kind in wanted.items():
+            check(field_kind, value[field])
+    elif name in RANGES:
+        assert type(value) is int
+        assert RANGES[name][0] <= value <= RANGES[name][1]
+    else:
+        assert type(value) is {"string": str}.get(name, float)
+
+
+def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lane(log, tmp_path):
+    assert main(["replay", str(log), "--autoware", str(tmp_path / "objects.jsonl")]) == 0
+    lines = (tmp_path / "objects.jsonl").read_text().splitlines()
+    assert len(lines) == len(STATES)
+    for line, state in zip(lines, STATES, strict=True):
+        message = json.loads(line)
+        check("PredictedObjects", message)
+        ids = [str(uuid.UUID(bytes=bytes(one["object_id"]["uuid"]))) for one in message["objects"]]
+        assert ids == [one.id for one in state.entities if one.moving]
+    (path,) = json.loads(lines[0])["objects"][0]["kinematics"]["predicted_paths"]
+    ahead = [pose["position"]["x"] for pose in path["path"]]
+    across = [pose["position"]["y"] for pose in path["path"]]
+    assert ahead == pytest.approx([9.0] * 7)
+    assert np.diff(across) == pytest.approx(-0.5 * 0.5 * 9.0), "at the pace of the usual corner"
+    assert 0.0 < path["confidence"] <= 1.0
+
+
+@settings(max_examples=30)
+@given(st.floats(-3.1, 3.1), st.floats(0.001, 0.05), st.floats(3.0, 30.0))
+def test_who_is_only_heard_keeps_the_azimuth_and_its_deviation_in_the_lane(azimuth, std, crossing):
+    entity = replace(HIDDEN.entities[0], azimuth_rad=azimuth, azimuth_std_rad=std)
+    (one,) = lane_objects(replace(HIDDEN, entities=(entity,)), crossing)
+    x, y = one.position_m
+    assert math.atan2(y, x) == pytest.approx(azimuth, abs=1e-9)
+    if abs(azimuth) < math.radians(79.0):
+        assert x == pytest.approx(crossing)
+    # Linear propagation back: the gradient of atan2 gives the deviation of the azimuth again.
+    gradient = np.array([-y, x]) / (x * x + y * y)
+    assert math.sqrt(gradient @ one.covariance @ gradient) == pytest.approx(std, rel=1e-6)
+    assert np.linalg.eigvalsh(one.covariance).min() >= -1e-9
+
+
+def test_labels_and_sizes_are_those_of_the_likeliest_class():
+    (placed,) = autoware_objects(PLACED)["objects"]
+    assert placed["classification"] == [{"label": 1, "probability": 0.7}, {"label": 0, "probability": 0.3}]
+    assert placed["shape"]["dimensions"]["x"] == 4.5
+    speed = placed["kinematics"]["initial_twist_with_covariance"]["twist"]["linear"]["x"]
+    assert speed == pytest.approx(4.0)
+
+
+def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
+    received = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            connection, _ = server.accept()
+            with connection:
+                while data := connection.recv(4096):
+                    received.append(data)
+
+        listener = threading.Thread(target=serve)
+        listener.start()
+        assert main(["replay", str(log), "--odas", f"127.0.0.1:{server.getsockname()[1]}"]) == 0
+        listener.join(timeout=20.0)
+    # Packets are cut anywhere; a reader of ODAS splits the text where one object ends and the next begins.
+    parts = b"".join(received).decode().rstrip("\n").split("}\n{")
+    tracks = [json.loads("{" * (k > 0) + part + "}" * (k < len(parts) - 1)) for k, part in enumerate(parts)]
+    assert [one["timeStamp"] for one in tracks] == [state.seq for state in STATES]
+    for one, state in zip(tracks, STATES, strict=True):
+        assert len(one["src"]) == 4
+        assert set(one["src"][0]) == {"id", "tag", "x", "y", "z", "activity"}
+        assert math.hypot(one["src"][0]["x"], one["src"][0]["y"]) == pytest.approx(1.0, abs=1e-3)
+        assert [track["id"] > 0 for track in one["src"]] == [k < len(state.entities) for k in range(4)]
+    assert tracks[0]["src"][0]["id"] == tracks[-1]["src"][0]["id"]
+
+
+def test_what_is_missing_is_named(log, tmp_path, monkeypatch, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    for options, said in (
+        (["--odas", f"127.0.0.1:{port}"], "expected a listener at"),
+        (["--odas", "studio"], "expected HOST:PORT"),
+        (["--osi", str(tmp_path / "out.osi"), "--crossing", "0"], "--crossing"),
+    ):
+        assert main(["replay", str(log), *options]) == 2
+        assert said in capsys.readouterr().err
+    monkeypatch.setitem(__import__("sys").modules, "osi3", None)
+    assert main(["replay", str(log), "--osi", str(tmp_path / "out.osi")]) == 2
+    assert "worldstate[osi]" in capsys.readouterr().err
+    assert not (tmp_path / "out.osi").exists()
