@@ -37,6 +37,7 @@ COMMANDS = (
     "studies.foreign_sounds",
     "studies.road_users",
     "users.extract_features",
+    "studies.place",
     "studies.realism",
     "studies.ablations",
     "studies.identifiability",

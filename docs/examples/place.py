@@ -1,0 +1,29 @@
+"""A place behind the corner, for known walls and array: python docs/examples/place.py."""
+
+import numpy as np
+
+from worldstate import WorldFilter, WorldState
+from worldstate.frontend import MicrophoneArray
+from worldstate.place.place_filter import PlaceFilter
+from worldstate.place.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate.place.spectrum_model import SpectrumModel, StreetWalls
+
+AZIMUTHS = np.radians(np.linspace(90.0, -90.0, 61))
+ARRAY = MicrophoneArray([[x, y, 0.0] for x in (-0.2, 0.0, 0.2) for y in (-0.3, -0.1, 0.1, 0.3)])
+HZ = np.arange(200.0, 2000.0, 200.0)
+MODEL = SpectrumModel.of(StreetWalls(4.5, 2.8, 2.8, 7.2), ARRAY, AZIMUTHS, HZ)
+
+
+def behind_the_corner(hops: int) -> WorldState:
+    """Return what is known of a vehicle on the left, heard off the right wall and round the corner."""
+    world, places = WorldFilter(), PlaceMeasurements(PlaceFilter(MODEL))
+    waves = ARRAY.steering(HZ, np.radians([-59.0, 32.0])) * [1.0, 0.3]
+    heard = (np.abs(ARRAY.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1) @ waves) ** 2).sum(axis=(0, 2))
+    for hop in range(1, hops + 1):
+        for found in places.measure(SpatialSpectrum(hop * 100_000_000, heard)):
+            world = world.update(found)
+    return world.state
+
+
+if __name__ == "__main__":
+    print(behind_the_corner(25).entities)

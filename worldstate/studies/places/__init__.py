@@ -1,0 +1,1 @@
+"""How well a place behind the corner is known: simulated passes, and real maps with a metric truth."""
