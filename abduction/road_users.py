@@ -18,6 +18,15 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 UNKNOWN, SIREN = "unknown", "siren"
+# As detectors of COCO's classes call them; a van is a car to some and a truck to others.
+SEEN_AS = {
+    "car": {"car"},
+    "van": {"car", "truck"},
+    "truck": {"truck", "bus"},
+    "motorcycle": {"motorcycle"},
+    "bicycle": {"bicycle"},
+    "tram": {"train"},
+}
 ClassShares: TypeAlias = tuple[tuple[str, float], ...]
 """Names of classes with their probabilities, sorted by name."""
 

@@ -1,20 +1,19 @@
 """What kind of road user is heard, and as what a camera would see it."""
 
-from worldstate.abduction.road_users import SIREN, UNKNOWN, ClassShares, RoadUserModel, likeliest, with_siren
+from worldstate.abduction.road_users import (
+    SEEN_AS,
+    SIREN,
+    UNKNOWN,
+    ClassShares,
+    RoadUserModel,
+    likeliest,
+    with_siren,
+)
 from worldstate.abduction.signature.domain_guard import DomainVerdict, Foreign, WarningSignal
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import FloatArray
 
-# As detectors of COCO's classes call them; a van is a car to some and a truck to others.
-_SEEN_AS = {
-    "car": {"car"},
-    "van": {"car", "truck"},
-    "truck": {"truck", "bus"},
-    "motorcycle": {"motorcycle"},
-    "bicycle": {"bicycle"},
-    "tram": {"train"},
-}
 # Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
 # would take a wrong guess of the ear for a look at the right thing.
 _ASKED = 0.95
@@ -50,4 +49,4 @@ def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
     likely = likeliest(kinds, _ASKED)
     if not likely or likely & {UNKNOWN, SIREN}:
         return None
-    return frozenset().union(*(_SEEN_AS[name] for name in likely))
+    return frozenset().union(*(SEEN_AS[name] for name in likely))

@@ -11,7 +11,7 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, wrap_angle
 from worldstate.measurement.position import Position, PositionScan, SearchedSector
 
-from .association import FORBIDDEN, assigned, emergence_density
+from .association import FORBIDDEN, emergence_density, joint_association
 from .existence import after_empty_look, after_sighting
 from .explanation import ExplanationBelief
 from .kinematics.cartesian import (
@@ -67,16 +67,21 @@ def position_update(
     """Return tracks and explanations after one scan; its misses count by `weight`."""
     # Sorted, so that the state does not depend on the order in which a sensor lists what it found.
     positions = tuple(sorted(scan.positions, key=_BY_ALL))
-    found = assigned(_scores(tracks, positions, scan, site), _log_new(scan, site))
-    after = [
-        _found(track, positions[found[i]], scan, site)
-        if i in found
-        else _missed(track, scan.searched, weight, site)
-        for i, track in enumerate(tracks)
-    ]
-    handed_over = tuple(tracks[i].side for i in found if after[i].seen and not tracks[i].seen)
-    for side in handed_over:
-        explanation = explanation.emerge(side, site.settings.handover_residual)
+    whose = joint_association(
+        _log_ratios(tracks, positions, scan, site), np.array([track.detected for track in tracks], bool)
+    )
+    found, after = whose.found, []
+    for i, (track, chance) in enumerate(zip(tracks, whose.chances, strict=True)):
+        existence = track.existence
+        if scan.searched is not None:
+            existence = _existence(track, chance, scan.searched, weight, site)
+        if i in found:
+            after.append(_found(track, positions[found[i]], existence, scan, site))
+        else:
+            after.append(_missed(track, existence, scan.searched))
+    handed_over = whose.handed_over(tracks, after, site.settings)
+    for side, residual in handed_over.items():
+        explanation = explanation.emerge(side, residual)
     counts, fresh = list(births), []
     unknown = [one for j, one in enumerate(positions) if j not in found.values()]
     for position in unknown[: max(_MOST_ENTITIES - len(tracks), 0)]:
@@ -99,12 +104,12 @@ def _log_new(scan: PositionScan, site: SiteGeometry) -> float:
     return math.log(site.settings.unheard_probability / area_m2)
 
 
-def _scores(
+def _log_ratios(
     tracks: tuple[Track, ...], positions: tuple[Position, ...], scan: PositionScan, site: SiteGeometry
 ) -> FloatArray:
-    r"""Return the score of every position and track, shape (positions, tracks), nats.
+    r"""Return how much likelier than somebody new every pair is, nats, shape (positions, tracks).
 
-    .. math:: \log \frac{r\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, N(z_v; 0, V + R_v)}
+    .. math:: \log \frac{r\, p_D\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, N(z_v; 0, V + R_v)} \frac{A}{u}
 
     The velocity enters by how much likelier it is than that of anybody, so that an entity without a place is
     scored in the same units, by its azimuth and range.
@@ -122,11 +127,8 @@ def _scores(
         scores[:, others] = _polar([tracks[i] for i in others], z, noise, scan.searched is not None, site)
     found = 0.0 if scan.searched is None else scan.searched.detection_probability
     existence = np.array([track.existence for track in tracks]).clip(_LEAST_EXISTENCE, _MOST_EXISTENCE)
-    expected = scores + np.log(existence) - np.log1p(-existence * found)
-    # Within its gate a detected entity takes a position before that counts as somebody new.
-    detected = np.array([track.seen or track.place is not None for track in tracks])
-    expected = np.where(detected, np.logaddexp(expected, _log_new(scan, site)), expected)
-    return np.where(scores > FORBIDDEN, expected, FORBIDDEN)
+    ratios = scores + np.log(existence * (found or 1.0)) - np.log1p(-existence * found) - _log_new(scan, site)
+    return np.where(scores > FORBIDDEN, ratios, FORBIDDEN)
 
 
 def _cartesian(tracks: list[Track], z: FloatArray, noise: FloatArray) -> FloatArray:
@@ -172,15 +174,16 @@ def _polar(
     return np.where(distance > _GATE, FORBIDDEN, log_azimuth + log_range - 0.5 * distance)
 
 
-def _found(track: Track, position: Position, scan: PositionScan, site: SiteGeometry) -> Track:
+def _found(
+    track: Track, position: Position, existence: float, scan: PositionScan, site: SiteGeometry
+) -> Track:
     """Return a track after a position of its own."""
     labels = track.labels
     if position.classes:
-        detected = track.seen or track.place is not None
-        labels = relabelled(labels, position.classes) if detected else position.classes
+        labels = relabelled(labels, position.classes) if track.detected else position.classes
     changed = replace(
         track,
-        existence=_existence(track, position, scan),
+        existence=existence if scan.searched is not None else _told(track, position, scan),
         labels=labels,
         moving=_moving(position, track.moving),
         sources=merged(track.sources, scan.source),
@@ -218,10 +221,8 @@ def _sighted(track: Track, stamp_ns: int, searched: SearchedSector) -> Track:
     return replace(track, seen=True, last_seen_ns=stamp_ns, answer="visible", miss_rate=miss_rate)
 
 
-def _existence(track: Track, position: Position, scan: PositionScan) -> float:
-    """Return the existence after a detection, or after a message."""
-    if scan.searched is not None:
-        return _detected(track.existence, scan.searched)
+def _told(track: Track, position: Position, scan: PositionScan) -> float:
+    """Return the existence after a message."""
     # Whoever lies in one message lies in the next: what a source repeats counts once.
     if scan.source in track.sources:
         return track.existence
@@ -239,21 +240,32 @@ def _moving(position: Position, before: bool) -> bool:
     return before if velocity is None else math.hypot(*velocity) > _PARKED_MPS
 
 
-def _missed(track: Track, searched: SearchedSector | None, weight: float, site: SiteGeometry) -> Track:
-    r"""Return a track that a scan has not found, by its chances to be in range and not hidden.
+def _existence(
+    track: Track, chance: float, searched: SearchedSector, weight: float, site: SiteGeometry
+) -> float:
+    r"""Return the existence after a scan, with the chance c that one of its positions is of the track.
 
-    .. math:: r \leftarrow \frac{r (1 - p)}{1 - r p}, \qquad p = p_D\, P_{range}\, (1 - P_{hidden})
+    .. math:: r \leftarrow c\, r_+ + (1 - c)\, \frac{r (1 - p)}{1 - r p}, \qquad
+              p = p_D\, P_{range}\, (1 - P_{hidden})
     """
-    detectable = track.seen or track.place is not None
-    if searched is None or not detectable or not searched.sector.touches(track.motion.azimuth_rad):
+    if not track.detected:
+        return _detected(track.existence, searched)
+    missed = track.existence
+    if searched.sector.touches(track.motion.azimuth_rad):
+        mean, variance = track.motion.mean[LOG_RANGE], track.motion.covariance[LOG_RANGE, LOG_RANGE]
+        in_range = normal_share((math.log(searched.range_m) - mean) / math.sqrt(variance))
+        in_sight = 1.0 if track.seen else 1.0 - track.behind
+        miss = 1.0 - in_range * in_sight * (1.0 - (1.0 - searched.detection_probability) ** weight)
+        missed = after_empty_look(missed, miss)
+        if not track.seen:
+            missed = max(missed, _LEAST_EXISTENCE)
+    return missed + chance * (_detected(track.existence, searched) - missed)
+
+
+def _missed(track: Track, existence: float, searched: SearchedSector | None) -> Track:
+    """Return a track that a scan has not found."""
+    if searched is None or not track.detected or not searched.sector.touches(track.motion.azimuth_rad):
         return track
-    mean, variance = track.motion.mean[LOG_RANGE], track.motion.covariance[LOG_RANGE, LOG_RANGE]
-    in_range = normal_share((math.log(searched.range_m) - mean) / math.sqrt(variance))
-    in_sight = 1.0 if track.seen else 1.0 - track.behind
-    miss = 1.0 - in_range * in_sight * (1.0 - (1.0 - searched.detection_probability) ** weight)
-    existence = after_empty_look(track.existence, miss)
-    if not track.seen:
-        existence = max(existence, _LEAST_EXISTENCE)
     return replace(
         track, existence=existence, answer="absent", miss_rate=1.0 - searched.detection_probability
     )

@@ -62,6 +62,11 @@ class Track:
     place: CartesianBelief | None = field(default=None, metadata=ADDED)  # Then `motion` follows from it
     behind: Probability = field(default=1.0, metadata=ADDED)  # P(behind its side's occluder), by that place
 
+    @property
+    def detected(self) -> bool:
+        """Whether a sensor or a message has told where it is: it was not only heard."""
+        return self.seen or self.place is not None
+
 
 def entity_id(stream: str, kind: str, number: int) -> str:
     """Return the name-based UUID of the n-th entity of a kind in a stream; the same run gives the same ids.

@@ -1,13 +1,13 @@
 """Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.ground.typing import FloatArray
 from worldstate.measurement.measurement import Measurement, Sighting
 
@@ -29,6 +29,7 @@ _PARKED_RATE_STD = (1e-3, 1e-3)
 _BY_ALL = attrgetter("azimuth_rad", "label", "score", "std_rad", "width_rad", "moving")
 # A detection by a channel said to miss everything would carry no information; its miss rate is capped here.
 _MOST_MISSES = 0.99
+_OUTSIDE = Unqueried("outside the field of view")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class VisionUpdate:
 
     tracks: tuple[Track, ...]
     explanation: ExplanationBelief
-    handed_over: tuple[int, ...]  # Sides of hand-overs
+    handed_over: Mapping[int, float]  # Share of P(hidden) that a hand-over has left, by its side
     emerged: tuple[int, ...]  # Sides past whose edge somebody came into view, heard before or not
     born: int  # Entities born in view so far
 
@@ -59,27 +60,28 @@ def vision_update(
     """Return tracks and explanations after one look; `born` counts the entities born in view so far."""
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings = tuple(sorted(measurement.sightings, key=_BY_ALL))
-    found = associated(tracks, sightings, site)
-    turned, after = _turned(tracks, sightings, found, site), []
+    whose = associated(tracks, sightings, site)
+    found, after = whose.found, []
+    turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence, site.settings)
     for i, track in enumerate(tracks):
+        answer = _searched(track, measurement, site)
+        existence = _existence(track, whose.chances[i], answer, weight, rates)
         if i not in found:
-            after.append(_not_sighted(track, _searched(track, measurement), weight, site))
+            after.append(_not_sighted(track, existence, answer))
         elif track.seen:
-            after.append(_sighted(turned[i], sightings[found[i]], measurement, site))
+            after.append(_sighted(turned[i], sightings[found[i]], existence, measurement, site))
         else:
             after.append(_handed_over(turned[i], sightings[found[i]], measurement, site))
-    handed_over = tuple(tracks[i].side for i in found if not tracks[i].seen)
-    for side in handed_over:
-        explanation = explanation.emerge(side, site.settings.handover_residual)
+    handed_over = whose.handed_over(tracks, after, site.settings)
+    for side, residual in handed_over.items():
+        explanation = explanation.emerge(side, residual)
     unheard = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
     fresh = [_born(sighting, measurement, born + n, site) for n, sighting in enumerate(unheard)]
     emerged = emerged_sides(handed_over, fresh, site)
     return VisionUpdate((*after, *fresh), explanation, handed_over, emerged, born + len(fresh))
 
 
-def emerged_sides(
-    handed_over: tuple[int, ...], fresh: Sequence[Track], site: SiteGeometry
-) -> tuple[int, ...]:
+def emerged_sides(handed_over: Iterable[int], fresh: Sequence[Track], site: SiteGeometry) -> tuple[int, ...]:
     """Return the sides past whose edge somebody has just come: hidden before, or first seen there."""
     near = (
         track.side
@@ -111,12 +113,14 @@ def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
     return min(answer.miss_rate, _MOST_MISSES), answer.clutter_rate or settings.clutter_rate
 
 
-def _found(track: Track, measurement: Measurement, settings: FilterSettings, **changes: Any) -> Track:
+def _found(
+    track: Track, existence: float, measurement: Measurement, settings: FilterSettings, **changes: Any
+) -> Track:
     """Return an associated track with existence, sources and time stamps updated, and more changes."""
-    miss, clutter = _rates(measurement.co_evidence, settings)
+    miss, _ = _rates(measurement.co_evidence, settings)
     return replace(
         track,
-        existence=after_sighting(track.existence, miss, clutter),
+        existence=existence,
         sources=merged(track.sources, "vision"),
         updated_ns=measurement.stamp_ns,
         last_seen_ns=measurement.stamp_ns,
@@ -126,21 +130,25 @@ def _found(track: Track, measurement: Measurement, settings: FilterSettings, **c
     )
 
 
-def _sighted(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
+def _sighted(
+    track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
+) -> Track:
     labels = relabelled(track.labels, ((sighting.label, sighting.score),))
-    return _found(track, measurement, site.settings, labels=labels, moving=sighting.moving)
+    return _found(track, existence, measurement, site.settings, labels=labels, moving=sighting.moving)
 
 
 def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
     """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
-    seen = replace(
+    existence = max(track.existence, site.settings.sighting_existence)
+    return _found(
         track,
+        after_sighting(existence, *_rates(measurement.co_evidence, site.settings)),
+        measurement,
+        site.settings,
         seen=True,
         side=site.nearest_side(sighting.azimuth_rad),
-        existence=max(track.existence, site.settings.sighting_existence),
         labels=((sighting.label, sighting.score),),
     )
-    return _found(seen, measurement, site.settings)
 
 
 def _turned(
@@ -167,38 +175,51 @@ def _turned(
     return turned
 
 
-def _searched(track: Track, measurement: Measurement) -> CoEvidence:
+def _searched(track: Track, measurement: Measurement, site: SiteGeometry) -> CoEvidence:
     """Return the answer that speaks of a track: of the sector of a sound, or of all that the sensor sees.
 
     Of whoever is in view the look itself: by the miss rate of a sector half outside the image, vehicles that
     have gone stay for up to two seconds.
     """
-    if measurement.look is None or (not track.seen and track.place is None):
+    if not track.detected:
         return measurement.co_evidence
-    return measurement.look.answer
+    # What stands outside the field of view was not looked for.
+    if not site.in_view(track.motion.azimuth_rad):
+        return _OUTSIDE
+    return measurement.co_evidence if measurement.look is None else measurement.look.answer
 
 
-def _not_sighted(track: Track, answer: CoEvidence, weight: float, site: SiteGeometry) -> Track:
-    if not track.seen and track.place is None:
-        searched = isinstance(answer, Absent)
-        miss = answer.miss_rate if isinstance(answer, Absent) else None
-        return replace(track, answer="absent" if searched else "unqueried", miss_rate=miss)
-    # Absent speaks of one sector; what stands outside the field of view was not looked for.
-    if isinstance(answer, Unqueried) or not site.in_view(track.motion.azimuth_rad):
-        return replace(track, answer="unqueried", miss_rate=None)
-    # Who may still be behind the corner is missed there for certain.
-    hidden = 0.0 if track.seen else track.behind
-    miss = hidden + (1.0 - hidden) * answer.miss_rate**weight
-    existence = after_empty_look(track.existence, miss)
-    return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
+def _existence(
+    track: Track, chance: float, answer: CoEvidence, weight: float, rates: tuple[float, float]
+) -> float:
+    r"""Return the existence after a look, with the chance p that one of its sightings is of the track.
+
+    .. math:: r \leftarrow p\, r_+ + (1 - p)\, r_-
+    """
+    missed = track.existence
+    if not track.detected:
+        return missed
+    if not isinstance(answer, Unqueried):
+        # Who may still be behind the corner is missed there for certain.
+        hidden = 0.0 if track.seen else track.behind
+        missed = after_empty_look(missed, hidden + (1.0 - hidden) * answer.miss_rate**weight)
+    return missed + chance * (after_sighting(track.existence, *rates) - missed)
+
+
+def _not_sighted(track: Track, existence: float, answer: CoEvidence) -> Track:
+    # Present speaks of whoever is in view.
+    if isinstance(answer, Absent) or (track.detected and isinstance(answer, Present)):
+        return replace(track, existence=existence, answer="absent", miss_rate=answer.miss_rate)
+    return replace(track, existence=existence, answer="unqueried", miss_rate=None)
 
 
 def _born(sighting: Sighting, measurement: Measurement, number: int, site: SiteGeometry) -> Track:
+    existence = site.settings.sighting_existence
     unseen = Track(
         id=entity_id(site.settings.stream, "visible", number),
         side=site.nearest_side(sighting.azimuth_rad),
         seen=True,
-        existence=site.settings.sighting_existence,
+        existence=existence,
         motion=_motion_at(sighting, None),
         labels=((sighting.label, sighting.score),),
         moving=sighting.moving,
@@ -206,7 +227,8 @@ def _born(sighting: Sighting, measurement: Measurement, number: int, site: SiteG
         created_ns=measurement.stamp_ns,
         updated_ns=measurement.stamp_ns,
     )
-    return _found(unseen, measurement, site.settings)
+    existence = after_sighting(existence, *_rates(measurement.co_evidence, site.settings))
+    return _found(unseen, existence, measurement, site.settings)
 
 
 def _motion_at(sighting: Sighting, before: MotionBelief | None) -> MotionBelief:

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence, Sized
-from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, ClassVar
 
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
@@ -126,58 +126,33 @@ class FilterRecord:
 def memory_record(memory: Memory) -> _Memory:
     """Return what a checkpoint keeps of a memory."""
     lag, instant = memory.lag, memory.instant
-    return _Memory(
-        stamp_ns=memory.stamp_ns,
-        log_explanations=memory.explanation.log_probabilities,
-        trail=_BeliefLag(tuple((ns, b.log_probabilities) for ns, b in lag.beliefs), lag.heard),
-        rules=memory.rules,
-        births=memory.births,
-        handover_ns=memory.handover_ns,
-        tracks=memory.tracks,
-        seq=memory.seq,
-        sighted=memory.sighted,
-        last=memory.last_ns,
-        predicted=memory.predicted,
-        instant=None if instant is None else _posterior_record(instant),
-        threshold=memory.threshold,
-        looks=memory.looks,
-        bearing=memory.bearing,
-        domain=memory.domain,
-        sequence=memory.sequence,
-        no_sequence=memory.no_sequence,
-        heard_nats=memory.heard_nats,
-        advised_ns=memory.advised_ns,
-        events=memory.events,
-    )
+    changed: dict[str, Any] = {
+        "log_explanations": memory.explanation.log_probabilities,
+        "trail": _BeliefLag(tuple((ns, b.log_probabilities) for ns, b in lag.beliefs), lag.heard),
+        "last": memory.last_ns,
+        "instant": None if instant is None else _posterior_record(instant),
+    }
+    return _Memory(**(_as_it_is(memory) | changed))
 
 
 def memory_of(kept: _Memory, record: FilterRecord) -> Memory:
     """Return the memory that `memory_record` kept in a record."""
     directions = record.context.directions
     beliefs = tuple((ns, ExplanationBelief(directions, logs)) for ns, logs in kept.trail.beliefs)
-    return Memory(
-        stamp_ns=kept.stamp_ns,
-        explanation=ExplanationBelief(directions, kept.log_explanations),
-        lag=BeliefLag(beliefs, kept.trail.heard),
-        rules=kept.rules,
-        births=kept.births,
-        handover_ns=kept.handover_ns,
-        tracks=kept.tracks,
-        seq=kept.seq,
-        sighted=kept.sighted,
-        last_ns=kept.last,
-        predicted=kept.predicted,
-        instant=None if kept.instant is None else _posterior_of(kept.instant, directions),
-        threshold=kept.threshold,
-        looks=kept.looks,
-        bearing=kept.bearing,
-        domain=kept.domain,
-        sequence=kept.sequence,
-        no_sequence=kept.no_sequence,
-        heard_nats=kept.heard_nats,
-        advised_ns=kept.advised_ns or (None,) * len(directions),
-        events=kept.events,
-    )
+    changed: dict[str, Any] = {
+        "explanation": ExplanationBelief(directions, kept.log_explanations),
+        "lag": BeliefLag(beliefs, kept.trail.heard),
+        "last_ns": kept.last,
+        "instant": None if kept.instant is None else _posterior_of(kept.instant, directions),
+        "advised_ns": kept.advised_ns or (None,) * len(directions),
+    }
+    return Memory(**(_as_it_is(kept) | changed))
+
+
+def _as_it_is(memory: Memory | _Memory) -> dict[str, Any]:
+    """Return what a memory and its record have alike."""
+    shared = {one.name for one in fields(Memory)} & {one.name for one in fields(_Memory)} - {"instant"}
+    return {name: getattr(memory, name) for name in shared}
 
 
 def _posterior_record(instant: Posterior) -> _Posterior:

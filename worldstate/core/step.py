@@ -151,7 +151,8 @@ def _places_passed(before: Sequence[Track], memory: Memory, model: FilterModel) 
         others = [one for one in memory.tracks if not one.seen and one.place is None and one.side == old.side]
         if now[old.id] in others and (len(others) > 1 or not heard[old.side]):
             memory = replace(memory, tracks=tuple(one for one in memory.tracks if one.id != old.id))
-    look = VisionUpdate(memory.tracks, memory.explanation, emerged, emerged, memory.sighted)
+    left = dict.fromkeys(emerged, model.site.settings.handover_residual)
+    look = VisionUpdate(memory.tracks, memory.explanation, left, emerged, memory.sighted)
     return _after_look(memory, look, memory.stamp_ns, model)
 
 
@@ -216,8 +217,8 @@ def _after_look(memory: Memory, seen: VisionUpdate, stamp_ns: int, model: Filter
         stamp_ns if k in seen.handed_over else before_ns for k, before_ns in enumerate(memory.handover_ns)
     )
     # The lagged beliefs are what the next windows build on: they have to know of the hand-over, too.
-    residual, lag = model.site.settings.handover_residual, memory.lag
-    for side in seen.handed_over:
+    lag = memory.lag
+    for side, residual in seen.handed_over.items():
         lag = lag.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
     return replace(
         memory,

@@ -1,0 +1,157 @@
+"""Association over all joint events: Stone Soup's JPDA and plain enumeration are the oracles."""
+
+import itertools
+import math
+from datetime import datetime
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from worldstate import Measurement, Sighting, WorldFilter
+from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.belief.association import FORBIDDEN, association_probabilities, joint_association
+from worldstate.ground.values import NotUsable
+from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
+
+FOUND, CLUTTER, RANGE_M, UNHEARD = 0.7, 0.1, 1e3, 0.05
+RADAR = SearchedSector(Sector(0.0, 1.2), RANGE_M, FOUND, CLUTTER)
+SCAN_S, STD = 0.5, 1.0
+NOISE = tuple(map(tuple, (np.eye(4) * STD**2).tolist()))
+
+
+def scan(number, places):
+    stated = tuple(Position(place, NOISE, (0.0, 0.0)) for place in places)
+    return PositionScan("radar", round(1e9 * SCAN_S * number), stated, RADAR)
+
+
+def stone_soup_chances(before, places):
+    """Return P(a position is its) of every entity, as Stone Soup's JPDA has it."""
+    from stonesoup.dataassociator.probability import JPDA
+    from stonesoup.hypothesiser.probability import PDAHypothesiser
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, RandomWalk
+    from stonesoup.predictor.kalman import KalmanPredictor
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.numeric import Probability
+    from stonesoup.types.state import GaussianState
+    from stonesoup.types.track import Track
+    from stonesoup.updater.kalman import KalmanUpdater
+
+    now, existence = datetime(2000, 1, 1), {}
+    for one in before:
+        mean = np.array([*one.position_m[:2], *one.velocity_mps[:2]])
+        existence[Track([GaussianState(mean, np.array(one.covariance), now)])] = one.existence_probability
+
+    class OfExistence(PDAHypothesiser):
+        """An entity that exists with r is detected with r p_D."""
+
+        def hypothesise(self, track, *rest, **options):
+            self.prob_detect = Probability(existence[track] * FOUND)
+            return super().hypothesise(track, *rest, **options)
+
+    model = LinearGaussian(4, (0, 1, 2, 3), np.eye(4) * STD**2)
+    # A scan tells velocities, too: those of anybody have 15 m/s beside the noise.
+    anybody = 1.0 / (2.0 * math.pi * (STD**2 + 15.0**2))
+    density = UNHEARD / (RADAR.sector.half_width_rad * RANGE_M**2) * anybody
+    still = CombinedLinearGaussianTransitionModel([RandomWalk(0.0)] * 4)
+    association = JPDA(
+        OfExistence(
+            KalmanPredictor(still),
+            KalmanUpdater(model),
+            clutter_spatial_density=density,
+            prob_gate=1.0,
+            include_all=True,
+        )
+    )
+    found = [Detection(np.array([*place, 0.0, 0.0]), now, measurement_model=model) for place in places]
+    joint = association.associate(set(existence), set(found), now)
+    return [sum(float(one.probability) for one in joint[track] if one) for track in existence]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_existence_is_summed_over_the_joint_events_of_stone_soups_jpda(seed):
+    pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
+    rng = np.random.default_rng(seed)
+    # So near one another that every position may be anybody's, and as many of them as there may be.
+    places = np.array([20.0, 0.0]) + rng.normal(0.0, 1.0, (3, 2))
+    again = places[: rng.integers(1, 4)] + rng.normal(0.0, 0.5, (1, 2))
+    world = WorldFilter().update(scan(1, places.tolist()))
+    before = world.predict(SCAN_S).state.entities
+    after = {
+        one.id: one.existence_probability for one in world.update(scan(2, again.tolist())).state.entities
+    }
+    for one, chance in zip(before, stone_soup_chances(before, again.tolist()), strict=True):
+        r, p = one.existence_probability, FOUND
+        hit = r * (p + (1 - p) * CLUTTER) / (r * (p + (1 - p) * CLUTTER) + (1 - r) * CLUTTER)
+        missed = r * (1 - p) / (1 - r * p)
+        assert after[one.id] == pytest.approx(chance * hit + (1 - chance) * missed, abs=1e-9)
+
+
+def counted(log_ratios):
+    """Return the association probabilities by going through all joint events."""
+    rows, columns = log_ratios.shape
+    chances, total = np.zeros((rows, columns)), 0.0
+    for event in itertools.product(range(rows + 1), repeat=columns):
+        taken = [row for row in event if row < rows]
+        if len(set(taken)) < len(taken):
+            continue
+        pairs = [(row, column) for column, row in enumerate(event) if row < rows]
+        weight = math.prod(math.exp(log_ratios[pair]) for pair in pairs)
+        total += weight
+        for pair in pairs:
+            chances[pair] += weight
+    return chances / total
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    arrays(float, st.tuples(st.integers(1, 3), st.integers(1, 4)), elements=st.floats(-8.0, 8.0)), st.data()
+)
+def test_probabilities_are_those_of_all_joint_events(log_ratios, data):
+    gated = data.draw(arrays(bool, log_ratios.shape))
+    ratios = np.where(gated, log_ratios, FORBIDDEN)
+    found = joint_association(ratios, np.ones(ratios.shape[1], bool))
+    np.testing.assert_allclose(association_probabilities(ratios, {}), counted(ratios), atol=1e-12)
+    np.testing.assert_allclose(found.chances, counted(ratios).sum(axis=0), atol=1e-12)
+    assert all(gated[row, column] for column, row in found.found.items())
+
+
+def test_of_a_crowd_the_likeliest_assignment_is_taken():
+    crowd = np.full((8, 8), -2.0) + 6.0 * np.eye(8)
+    found = joint_association(crowd, np.ones(8, bool))
+    assert found.found == {i: i for i in range(8)} and found.chances == [1.0] * 8
+
+
+def looked(time_s, nats, *sightings, kinds=()):
+    heard, unknown = SignatureEvidence(("left", "right"), nats, 0.0, 0.0), NotUsable("not scripted")
+    answer = Present(0.04) if sightings else Absent(0.04)
+    return Measurement(round(time_s * 1e9), heard, answer, unknown, unknown, sightings, kinds=kinds)
+
+
+@pytest.mark.parametrize(
+    ("label", "same"), [("car", True), ("bus", True), ("bicycle", False), ("person", False)]
+)
+def test_whoever_comes_into_view_has_to_be_what_was_heard(label, same):
+    """At the edge of the side that may have been misheard; a van is a car to some, a truck to others."""
+    world = WorldFilter()
+    for hop in range(1, 30):
+        world = world.update(looked(hop / 10, (3.0, 0.0), kinds=(("truck", 0.4), ("van", 0.6))))
+    (heard,) = world.state.entities
+    seen = world.update(looked(3.0, (3.0, 0.0), Sighting(-0.75, 0.02, label, 0.9))).state.entities
+    assert {one.status: one.id == heard.id for one in seen}["visible"] == same
+
+
+def test_of_two_who_may_have_been_found_the_other_one_keeps_his_existence():
+    """Two cars a degree apart and one box between them: an empty look would take both down by .04."""
+    world = WorldFilter()
+    for hop in range(1, 8):
+        both = [Sighting(azimuth, 0.03, "car", 0.9) for azimuth in (0.0, 0.02)]
+        world = world.update(looked(hop / 10, (0.0, 0.0), *both))
+    left = world.update(looked(1.0, (0.0, 0.0), Sighting(0.01, 0.03, "car", 0.9))).state.entities
+    assert len(left) == 2 and all(one.existence_probability > 0.5 for one in left)
+    gone = world.update(looked(1.0, (0.0, 0.0))).state.entities
+    assert all(one.existence_probability < 0.9 * left[0].existence_probability for one in gone)
