@@ -9,7 +9,7 @@ from worldstate.ground.values import nanoseconds
 
 from .log_message import LogMessage, image_message
 
-# OVAD's images, 1936 pixels wide, are shown in a third of a screen: halved they take 30 kB instead of 170.
+# OVAD's images, 1936 pixels wide, are shown in a third of a screen: halved they take 77 kB in a log, not 245.
 _WIDEST_PX, _QUALITY = 1000, 80
 
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from worldstate.ground.errors import MissingExtraError
+from worldstate.ground.errors import InvalidArgumentError, MissingExtraError
 from worldstate.ground.values import seconds
 
 from .log_message import LogMessage, LogSink
@@ -23,7 +23,10 @@ def live_server(port: int) -> Iterator[tuple[LogSink, int]]:
 
     # A context of its own: the global one keeps its channels for all servers of the process.
     context = foxglove.Context()
-    server = foxglove.start_server(name="worldstate", port=port, context=context)
+    try:
+        server = foxglove.start_server(name="worldstate", port=port, context=context)
+    except (RuntimeError, OverflowError) as error:
+        raise InvalidArgumentError(f"--live: expected a free port, got {port} ({error})") from error
     channels: dict[str, foxglove.Channel] = {}
     begun_s: float | None = None
 

@@ -12,6 +12,7 @@ from scripted_states import scripted_states
 
 from worldstate.adapters.export.live_server import live_server
 from worldstate.adapters.export.log_message import state_messages
+from worldstate.ground.errors import InvalidArgumentError
 
 pytest.importorskip("foxglove")
 
@@ -99,3 +100,10 @@ def test_a_recording_plays_no_faster_than_its_sound():
                 send(message)
         lasted_s = (states[3].stamp_ns - states[0].stamp_ns) / 1e9
         assert time.monotonic() - begun_s >= lasted_s
+
+
+def test_a_port_that_is_taken_is_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InvalidArgumentError, match=f"free port, got {port}"), live_server(port):
+            pass

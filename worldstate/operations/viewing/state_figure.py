@@ -1,6 +1,6 @@
 """A run over time, drawn from its snapshots, over the power of the sound where the recording is at hand."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,13 +44,14 @@ class SoundPower:
     power: FloatArray  # shape (hops, azimuths)
 
 
-def sound_power(audio: Audio, front_end: FrontEnd) -> SoundPower:
+def sound_power(
+    audio: Audio, front_end: FrontEnd, on_second: Callable[[], None] = lambda: None
+) -> SoundPower:
     """Read the power over azimuth of every hop of an open recording."""
-    rows = [
-        (seconds(frame.stamp_ns), frame.srp.astype(np.float32))
-        for block in audio.blocks(audio.sample_rate_hz)
-        for frame in front_end.process(block)
-    ]
+    rows = []
+    for block in audio.blocks(audio.sample_rate_hz):
+        rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.process(block)]
+        on_second()
     time_s, power = np.array([t for t, _ in rows]), np.array([row for _, row in rows])
     settings = front_end.settings
     # Drawn at its end, a window of a second would lag the camera by half of one.
@@ -98,27 +99,23 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
     if heard:
         time_s, azimuth_rad = np.array(heard).T
         axes.plot(time_s, np.degrees(azimuth_rad), ".", color="0.45", ms=3, label="bearing of the sound")
-    ids = dict.fromkeys(one.id for state in states for one in state.entities if one.moving)
-    for entity_id in ids:
-        for hidden, color, label in (
-            (True, RED, "hidden, nine of ten"),
-            (False, BLUE, "in view, nine of ten"),
-        ):
-            track = [_azimuth_row(state, entity_id, hidden) for state in states]
-            time_s, azimuth, low, high = _with_gaps(np.array(track)).T
-            if np.isfinite(azimuth).any():
-                axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
-                axes.plot(time_s, azimuth, color=color, label=f"entity, {label}")
+    tracks: dict[tuple[str, bool], list[tuple[float, ...]]] = {}
+    for state in states:
+        for one in state.entities:
+            if one.moving and one.existence_probability >= _LIKELY:
+                row = seconds(state.stamp_ns), *_nine_of_ten_deg(one)
+                tracks.setdefault((one.id, _hidden(one)), []).append(row)
+    for (_, hidden), rows in tracks.items():
+        color, label = (RED, "hidden") if hidden else (BLUE, "in view")
+        time_s, azimuth, low, high = _with_gaps(np.array(rows)).T
+        axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
+        axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
     axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
 
 
-def _azimuth_row(state: WorldState, entity_id: str, hidden: bool) -> tuple[float, float, float, float]:
-    for entity in state.entities:
-        if entity.id == entity_id and _hidden(entity) == hidden and entity.existence_probability >= _LIKELY:
-            low, high = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
-            degrees = np.degrees([entity.azimuth_rad, low, high])
-            return (seconds(state.stamp_ns), *degrees.tolist())
-    return seconds(state.stamp_ns), np.nan, np.nan, np.nan
+def _nine_of_ten_deg(entity: Entity) -> tuple[float, ...]:
+    low, high = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
+    return tuple(np.degrees([entity.azimuth_rad, low, high]).tolist())
 
 
 def _with_gaps(rows: FloatArray) -> FloatArray:
