@@ -58,6 +58,7 @@ class SimulatedWindows:
     y: TextArray  # shape (n,): Of `WINDOW_CLASSES`
     sites: TextArray  # shape (n,): Names as of the real sites: one that is held out is left out of both
     weights: FloatArray  # shape (n,): Beside a real window of weight 1
+    other_side: FloatArray  # shape (n,): Part of a hazard's weight that says the other side
 
     def at(self, sites: AnyArray) -> "SimulatedWindows":
         """Return those of some sites, and those of no street."""
@@ -116,7 +117,7 @@ class SiteEnsembleClassifier:
         .. math:: \hat W_e, \hat b_e = \arg\min_{W, b} \Big[ \frac{\lambda_e}{2} \|W\|^2
                   - \frac{\sum_i w_i \ell_e(c_i, x_i)}{\sum_i w_i} \Big]
 
-        with weight 1 for real windows and their own for simulated ones, a quarter of which is given to the
+        with weight 1 for real windows and their own for simulated ones, of which a part may be given to the
         other side of a simulated hazard: streets that are simulated tell hidden from none as real ones do,
         sides less so. The classes both and direct are known where there are simulated windows of them.
 
@@ -205,7 +206,8 @@ def _simulated_rows(
     other = _mirrored(codes)
     hidden = other != codes
     rows = np.concatenate([np.arange(len(codes)), np.flatnonzero(hidden)])
-    shares = np.concatenate([np.where(hidden, 1.0 - OTHER_SIDE, 1.0), np.full(hidden.sum(), OTHER_SIDE)])
+    part = np.where(hidden, windows.other_side, 0.0)
+    shares = np.concatenate([1.0 - part, part[hidden]])
     sides = np.concatenate([codes, other[hidden]])
     mirrored = _with_mirror_images(levels[rows], reference[rows], sides)
     return (*mirrored, np.tile(shares * windows.weights[rows], 2))

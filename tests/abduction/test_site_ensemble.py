@@ -11,6 +11,7 @@ from scipy.special import log_softmax
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import (
+    OTHER_SIDE,
     RECIPES,
     Recipe,
     SimulatedWindows,
@@ -101,7 +102,7 @@ def simulated(rng, sites, more=()):
     y = y.astype("<U6")
     for position, name in enumerate(more):
         y[np.flatnonzero(y == CLASSES[position])[:20]] = name
-    return SimulatedWindows(X, y, rng.choice(sites, len(y)), np.ones(len(y)))
+    return SimulatedWindows(X, y, rng.choice(sites, len(y)), np.ones(len(y)), np.full(len(y), OTHER_SIDE))
 
 
 def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too():
@@ -110,7 +111,11 @@ def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too(
     groups, everywhere = np.tile(["SA1", "SA2"], 100), simulated(rng, ["SA1", "SA2", "SB1"])
     chosen = np.isin(everywhere.sites, ["SA1", "SA2"])
     here = SimulatedWindows(
-        everywhere.X[chosen], everywhere.y[chosen], everywhere.sites[chosen], everywhere.weights[chosen]
+        everywhere.X[chosen],
+        everywhere.y[chosen],
+        everywhere.sites[chosen],
+        everywhere.weights[chosen],
+        everywhere.other_side[chosen],
     )
     with_all, with_some, without = (
         SiteEnsembleClassifier(simulated=some).fit(X, y, groups).model_ for some in (everywhere, here, None)
@@ -134,7 +139,8 @@ def test_streets_that_a_table_does_not_have_are_learned_whatever_is_held_out():
     assert len(kept.y) == np.sum(drawn.sites != "SA1") > 0
 
 
-def test_a_quarter_of_a_simulated_hazard_says_the_other_side():
+@pytest.mark.parametrize("other_side", [0.0, OTHER_SIDE])
+def test_a_part_of_a_simulated_hazard_says_the_other_side(other_side):
     # Three windows of one pattern, of which real ones say nothing: the posterior is the share, by weight.
     rng, n = np.random.default_rng(9), 300
     X, y = windows(rng, n)
@@ -143,7 +149,11 @@ def test_a_quarter_of_a_simulated_hazard_says_the_other_side():
     rest = np.tile(np.hstack([np.full(60, 1.0), np.zeros(180)]), (2, 1))
     labels = np.concatenate([np.repeat("left", n), ["front", "none"]])
     more = SimulatedWindows(
-        np.concatenate([left, rest]), labels, np.repeat("SA1", n + 2), np.full(n + 2, 1.0)
+        np.concatenate([left, rest]),
+        labels,
+        np.repeat("SA1", n + 2),
+        np.full(n + 2, 1.0),
+        np.full(n + 2, other_side),
     )
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.5, 0.5], abs=0.02)
@@ -151,7 +161,7 @@ def test_a_quarter_of_a_simulated_hazard_says_the_other_side():
     left[:, :20] = 400.0
     more = replace(more, X=np.concatenate([left, rest]))
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
-    assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.75, 0.25], abs=0.05)
+    assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([1.0 - other_side, other_side], abs=0.05)
 
 
 def test_the_reference_of_another_site_matters(trained):

@@ -92,7 +92,7 @@ def open_field_windows(features: FloatArray, weight: float = OPEN_WEIGHT) -> Sim
     n = len(features)
     nowhere = np.full((n, len(KINDS) * N_FEATURES), np.nan)
     names = np.full(n, DIRECT), np.full(n, OPEN_FIELD)
-    return SimulatedWindows(np.hstack([features, nowhere]), *names, np.full(n, weight))
+    return SimulatedWindows(np.hstack([features, nowhere]), *names, np.full(n, weight), np.zeros(n))
 
 
 def open_feature(

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.ensemble_training import SIMULATED_WEIGHT, SimulatedWindows
+from worldstate.abduction.signature.ensemble_training import OTHER_SIDE, SIMULATED_WEIGHT, SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.adapters.datasets.feature_table import FeatureTable
@@ -43,7 +43,11 @@ def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
     return SimulatedWindows.joined(
         [
             SimulatedWindows(
-                part.features, part.labels, part.environments, np.full(len(part), SIMULATED_WEIGHT)
+                part.features,
+                part.labels,
+                part.environments,
+                np.full(len(part), SIMULATED_WEIGHT),
+                np.full(len(part), OTHER_SIDE),
             )
             for part in parts
         ]
