@@ -12,7 +12,8 @@ def evidence_of(rng: np.random.Generator, hops: int) -> HopEvidence:
     single = rng.normal(size=(7, hops)).cumsum(axis=1)
     single[4:6][:, rng.random(hops) < 0.3] = np.nan
     single[5] = np.abs(single[5]) + 0.01
-    return HopEvidence(rng.normal(size=(hops, 2)).cumsum(axis=0), *single)
+    sides, bands = (rng.normal(size=(hops, width)).cumsum(axis=0) for width in (2, 4))
+    return HopEvidence(sides, *single, bands)
 
 
 def sequence_model(rng: np.random.Generator, alarm: SequenceAlarm | None = None) -> SequenceModel:

@@ -17,12 +17,17 @@ QUIET_HOPS = 600
 # of the minute does: another junction moves both, and a vehicle a few seconds long neither.
 QUIET_SHARE, USUAL_SHARE = 0.2, 0.5
 _SECOND, _TWO, _THREE = 10, 20, 30
+# Groups of neighbouring bands, read as means over so many hops more. Behind a corner sound is dull: the
+# nearer a vehicle comes to the edge, the more of its high frequencies come round it, and they go first when
+# it has passed. At junctions left out, Brier skill at 3 s .265 without, .273 with the four levels above the
+# street's own, .293 with their changes, too; time to visible .756, .751, .727 of the constant's error.
+BANDS, _BAND_HOPS = 4, 3
 SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HopEvidence:
-    """What the hops of a stream said, each of shape (n,), the two sides of shape (n, 2)."""
+    """What the hops of a stream said, each of shape (n,), the sides of shape (n, 2), the bands of (n, 4)."""
 
     sides: FloatArray  # Log ratio of hidden on the left, on the right, to visible or none; nats
     visible: FloatArray  # Log ratio of visible to none, nats
@@ -32,6 +37,7 @@ class HopEvidence:
     looming_hz: FloatArray  # 1/TTA; NaN where refused
     looming_std_hz: FloatArray
     bearing_rad: FloatArray  # Left positive; NaN where refused
+    bands: FloatArray  # shape (n, 4): Log energy of four groups of neighbouring bands, low ones first, nats
 
     def __len__(self) -> int:
         return len(self.visible)
@@ -54,18 +60,21 @@ class HopEvidence:
         The only way from either to a sequence: a model that learns one and reads another is worth nothing.
         """
         # In double precision: streams on disk keep half of it, and its logarithm would have the other half's.
+        energy = np.asarray(band_log_energy, np.float64)
         return cls(
             sides=sides,
             visible=visible,
             level=np.log(np.asarray(feature, np.float64)).mean(axis=1),
-            loudness=np.asarray(band_log_energy, np.float64).mean(axis=1),
+            loudness=energy.mean(axis=1),
             prominence=np.log(prominence),
             looming_hz=looming_hz,
             looming_std_hz=looming_std_hz,
             bearing_rad=bearing_rad,
+            bands=np.stack([part.mean(axis=1) for part in np.array_split(energy, BANDS, axis=1)], axis=1),
         )
 
 
+_BANDS = tuple(f"band_{number}" for number in range(1, BANDS + 1))
 INPUTS = (
     *("this", "this_above", "this_1s", "this_2s", "this_before", "this_highest"),
     *("other", "other_above", "other_1s", "other_2s", "other_highest"),
@@ -77,16 +86,21 @@ INPUTS = (
     *("prominence", "prominence_1s"),
     *("approach", "approach_std"),
     *("bearing", "bearing_1s", "bearing_spread"),
+    *(f"{name}{ago}" for ago in ("", "_1s", "_2s") for name in _BANDS),
 )
 
 
 # What is kept of a hop, without gaps: the first five change, the first three have a highest.
-COLUMNS = ("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing")
+COLUMNS = (
+    *("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing"),
+    *_BANDS,
+)
 _CHANGING, _HIGHEST = 5, 3
 _PROMINENCE, _RATE, _SPREAD, _BEARING = range(5, 9)
-# What of it is usual in the street: two levels that the quietest fifth stays below, then evidence.
-USUAL = ("level", "loudness", "left", "right", "visible")
-_LEVELS = 2
+_BAND_COLUMNS = slice(_BEARING + 1, _BEARING + 1 + BANDS)
+# What of it is usual in the street: levels that the quietest fifth stays below, then evidence.
+USUAL = (*_BANDS, "level", "loudness", "left", "right", "visible")
+_LEVELS = BANDS + 2
 _EVERY = (
     *COLUMNS[:_HIGHEST],
     *("level", "loudness", "left_above", "right_above", "visible_above"),
@@ -97,6 +111,7 @@ _EVERY = (
     *("prominence", "prominence_1s", "approach", "approach_std"),
     *("bearing", "bearing_1s", "bearing_spread"),
     *("left_mean", "right_mean", "lean", "lean_1s", "lean_3s"),
+    *(f"{name}{ago}" for ago in ("", "_1s", "_2s") for name in _BANDS),
 )
 
 
@@ -114,7 +129,7 @@ _MIRRORED = np.where(np.isin(INPUTS, ("bearing", "bearing_1s", "lean", "lean_1s"
 class _Columns:
     """What inputs are made of: columns now and before, and what is usual in the street, one row a hop."""
 
-    now: FloatArray  # shape (n, 9): `columns_of`
+    now: FloatArray  # shape (n, 13): `columns_of`
     second: FloatArray  # The same one, two and three seconds before
     two: FloatArray
     three: FloatArray
@@ -122,7 +137,8 @@ class _Columns:
     swing: FloatArray  # shape (n,): Of the bearing, over one
     mean_1s: FloatArray  # shape (n, 2): Of the sides, over one second and over three
     mean_3s: FloatArray
-    usual: FloatArray  # shape (n, 5): `level` and `loudness` of the quiet street, then usual evidence
+    usual: FloatArray  # shape (n, 9): Levels of the quiet street, then usual evidence, as `USUAL`
+    bands: FloatArray  # shape (3, n, 4): Levels of the bands now, one and two seconds before
 
     def inputs(self) -> FloatArray:
         """Return the inputs of both sides, shape (n, 2, inputs)."""
@@ -132,24 +148,25 @@ class _Columns:
         rest += [now[:, _BEARING], now[:, _BEARING] - second[:, _BEARING], self.swing]
         changes = [(now - one)[:, :_CHANGING] for one in (second, self.two)]
         before = (second - self.three)[:, : len(SIDES)]
-        above = streets_own(now) - self.usual
+        above = (streets_own(now) - self.usual)[:, BANDS:]
         leans = [side[:, :1] - side[:, 1:2] for side in (now, self.mean_1s, self.mean_3s)]
         parts = [now[:, :_HIGHEST], above, *changes, before, self.highest, np.stack(rest, axis=1)]
-        parts += [self.mean_3s, *leans]
+        bands = [self.bands[0] - self.usual[:, :BANDS], *(self.bands[0] - self.bands[1:])]
+        parts += [self.mean_3s, *leans, *bands]
         every = np.concatenate(parts, axis=1)
         left, right = (every[:, order] for order in _ORDER)
         return np.stack([left, right * _MIRRORED], axis=1)
 
 
 def columns_of(evidence: HopEvidence) -> FloatArray:
-    """Return evidence as columns without gaps, shape (n, 9), as `COLUMNS` names them."""
+    """Return evidence as columns without gaps, shape (n, 13), as `COLUMNS` names them."""
     # Where nothing could be read the rate is 0 and its deviation that of knowing nothing.
     refused = ~np.isfinite(evidence.looming_hz)
     rate = np.where(refused, 0.0, evidence.looming_hz)
     spread = np.where(refused, 10.0, np.minimum(evidence.looming_std_hz, 10.0))
     azimuth = np.where(np.isfinite(evidence.bearing_rad), evidence.bearing_rad, 0.0)
     single = [evidence.visible, evidence.level, evidence.loudness, evidence.prominence, rate, spread, azimuth]
-    return np.concatenate([evidence.sides, np.stack(single, axis=1)], axis=1)
+    return np.concatenate([evidence.sides, np.stack(single, axis=1), evidence.bands], axis=1)
 
 
 def streets_own(columns: FloatArray) -> FloatArray:
@@ -162,14 +179,14 @@ def sequence_inputs(evidence: HopEvidence) -> FloatArray:
 
     Examples
     --------
-    >>> flat = HopEvidence(np.zeros((5, 2)), *np.ones((7, 5)))
+    >>> flat = HopEvidence(np.zeros((5, 2)), *np.ones((7, 5)), bands=np.ones((5, 4)))
     >>> sequence_inputs(flat).shape == (5, 2, len(INPUTS))
     True
     """
     columns = columns_of(evidence)
     shares = [QUIET_SHARE] * _LEVELS + [USUAL_SHARE] * (len(USUAL) - _LEVELS)
     usual = [running(one, share) for one, share in zip(streets_own(columns).T, shares, strict=True)]
-    azimuth = columns[:, _BEARING]
+    azimuth, bands = columns[:, _BEARING], mean(columns[:, _BAND_COLUMNS], _BAND_HOPS)
     return _Columns(
         now=columns,
         second=ago(columns, _SECOND),
@@ -180,19 +197,24 @@ def sequence_inputs(evidence: HopEvidence) -> FloatArray:
         mean_1s=mean(evidence.sides, _SECOND),
         mean_3s=mean(evidence.sides, _THREE),
         usual=np.stack(usual, axis=1),
+        bands=np.stack([bands, ago(bands, _SECOND), ago(bands, _TWO)]),
     ).inputs()
 
 
 def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
     """Return the inputs of the last hop, shape (1, 2, inputs), from what is kept of a stream.
 
-    Shapes: recent (up to 31, 9), minute (up to 600, 5).
+    Shapes: recent (up to 31, 13), minute (up to 600, 9).
     """
     now = len(recent) - 1
 
     def before(hops: int) -> FloatArray:
         at = max(now - hops, 0)
         return recent[at : at + 1]
+
+    def bands(hops: int) -> FloatArray:
+        at = max(now - hops, 0)
+        return np.asarray(recent[max(at - _BAND_HOPS, 0) : at + 1, _BAND_COLUMNS].mean(axis=0))
 
     swing = recent[-1 - _SECOND :, _BEARING]
     usual = [_ranked(minute[:, :_LEVELS], QUIET_SHARE), _ranked(minute[:, _LEVELS:], USUAL_SHARE)]
@@ -206,6 +228,7 @@ def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
         mean_1s=recent[-1 - _SECOND :, : len(SIDES)].mean(axis=0)[None],
         mean_3s=recent[:, : len(SIDES)].mean(axis=0)[None],
         usual=np.concatenate(usual)[None],
+        bands=np.stack([bands(0), bands(_SECOND), bands(_TWO)])[:, None],
     ).inputs()
 
 

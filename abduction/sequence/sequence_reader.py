@@ -37,7 +37,7 @@ class SequenceHistory:
     0
     """
 
-    # shapes (up to 31, 9), as `columns_of`, and (up to 600, 5), as `streets_own`; the last hop last
+    # shapes (up to 31, 13), as `columns_of`, and (up to 600, 9), as `streets_own`; the last hop last
     recent: FloatArray = field(default_factory=partial(np.zeros, (0, len(COLUMNS))))
     minute: FloatArray = field(default_factory=partial(np.zeros, (0, len(USUAL))))
 
@@ -98,7 +98,7 @@ class SequenceReader:
     >>> stump = dict(split=[[0, 0, 0]], threshold=[[0.5, 0, 0]], yes=[[1, 1, 2]], no=[[2, 1, 2]])
     >>> trees = BoostedTrees(**stump, value=[[0.0, -1.0, 1.0]], tree_class=[0], baseline=[0.0] * len(GROUPS))
     >>> reader = SequenceReader(SequenceModel(trees, np.full(len(GROUPS), 1 / len(GROUPS))))
-    >>> hop = HopEvidence(np.array([[2.0, -2.0]]), *np.ones((7, 1)))
+    >>> hop = HopEvidence(np.array([[2.0, -2.0]]), *np.ones((7, 1)), bands=np.ones((1, 4)))
     >>> [isinstance(reader.read(hop), SequenceReading) for _ in range(10)].count(True)
     1
     """

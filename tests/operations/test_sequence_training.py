@@ -38,7 +38,7 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> LabelledStream:
     rest = np.abs(rng.normal(size=(7, hops)))
     nobody = np.full((hops, 2), -np.inf)
     return LabelledStream(
-        HopEvidence(sides, *rest),
+        HopEvidence(sides, *rest, bands=rng.normal(size=(hops, 4))),
         StreamTruth(coming, np.zeros(hops, bool), nobody, nobody, np.zeros((hops, 2), bool)),
     )
 
