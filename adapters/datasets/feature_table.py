@@ -107,6 +107,18 @@ class FeatureTable:
         in_group = np.char.startswith(self.environments, _PREFIX[group])
         return self._not_empty(in_group, f"group: expected windows of group {group}")
 
+    def joined(self, other: "FeatureTable") -> "FeatureTable":
+        """Return these windows and those of another table below them; the domain is this table's."""
+        return FeatureTable(
+            np.concatenate([self.features, other.features]),
+            np.concatenate([self.labels, other.labels]),
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.environments, other.environments]),
+            np.concatenate([self.recordings, other.recordings]),
+            self.t0_frames + other.t0_frames,
+            self.domain,
+        )
+
     def only(self, ids: Collection[str]) -> "FeatureTable":
         """Return all windows of the recordings that hold a window of one of these IDs.
 

@@ -25,6 +25,7 @@ COMMANDS = (
     "users.doctor",
     "users.bounds",
     "users.simulate",
+    "users.label",
     "users.train",
     "users.model",
     "users.calibrate",

@@ -19,14 +19,15 @@ from typing import TYPE_CHECKING
 from worldstate.cli.common.feature_options import add_table_options, read_beside
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.progress import progress_bar, track
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_table import FeatureTable
 
 EXAMPLE = """\
-example:
-  worldstate train features.csv --group static --exclude testset.csv --out model.json"""
+examples:
+  worldstate train features.csv --group static --exclude testset.csv --out model.json
+  worldstate train features.csv --labels recordings/labels.csv --out model.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +35,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_table_options(parser)
     add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    labels = (
+        "windows of recordings of one's own, learned as those of the table: what `label --windows` writes"
+    )
+    add("--labels", type=Path, nargs="+", default=[], metavar="CSV", help=labels)
     ids = "CSV files with a column ID: leave out the recordings of these windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--array", type=Path, metavar="FILE", help="microphones that the windows were heard by")
@@ -51,6 +56,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     check_outputs(arguments, "out")
     table = _with_domain(arguments, read_features(arguments.table)).group(arguments.group)
+    labelled = [_heard_windows(path, table) for path in arguments.labels]
+    for one in labelled:
+        table = table.joined(one.group(arguments.group))
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
     settings = TrainingSettings(
         seed=arguments.seed, sustain_hops=arguments.sustain_hops, method=arguments.method
@@ -73,7 +81,31 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "n_excluded_windows": len(table) - len(kept),
         **(model.provenance.figures or {}),
     }
+    if labelled:
+        summary |= {"n_labelled": sum(map(len, labelled)), **_reach(arguments, kept)}
     return CommandResult(summary)
+
+
+def _heard_windows(labels: Path, table: "FeatureTable") -> "FeatureTable":
+    """Return the features of labelled windows, by the microphones that the table's were heard by."""
+    from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table, read_labels
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.frontend.array.ovad_array import ovad_array
+
+    array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
+    windows = read_labels(labels, labels.parent)
+    features = list(track(extract_features(windows, array), "listening", len(windows)))
+    return feature_table(windows, features, array)
+
+
+def _reach(arguments: argparse.Namespace, table: "FeatureTable") -> dict[str, float]:
+    """Return the error on windows left out beside the bound of section VI: what sound holds at all."""
+    import numpy as np
+
+    from worldstate.studies.paper.identifiability import reach_on_table
+
+    found = reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
+    return {"error_left_out": found.error, "fano_bound": found.fano, "sharp_fano_bound": found.sharp_fano}
 
 
 def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "FeatureTable":

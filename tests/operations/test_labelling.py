@@ -1,0 +1,178 @@
+"""Labels of passes: tracks of boxes, T0 and hidden places of a camera that is simulated by hand."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.feature_extraction import read_labels
+from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.labelling.box_tracks import box_tracks
+from worldstate.operations.labelling.label_files import file_below, open_label, window_rows
+from worldstate.operations.labelling.pass_labels import label_passes
+
+CAMERA = PinholeCamera(position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+FOCAL_PX = 0.5 * CAMERA.width_px / math.tan(CAMERA.half_angle_rad)
+LANE_M, EDGE_RAD, WIDTH_M, HEIGHT_M, LENGTH_M = 9.0, math.radians(28.0), 1.8, 1.55, 4.5
+
+
+def box_of(front_m: float, side: int) -> list[float] | None:
+    """A car whose front's middle is at y = side * front_m, on its way across; cut by the corner."""
+    limit = math.tan(EDGE_RAD)
+    slopes = []
+    for x in (LANE_M - 0.5 * WIDTH_M, LANE_M + 0.5 * WIDTH_M):
+        slopes += [min(y / x, limit) for y in (front_m, front_m + LENGTH_M) if front_m / x < limit]
+    if not slopes or front_m / LANE_M > limit:
+        return None
+    columns = [0.5 * CAMERA.width_px - FOCAL_PX * side * slope for slope in (min(slopes), max(slopes))]
+    height = FOCAL_PX * HEIGHT_M / (LANE_M - 0.5 * WIDTH_M)
+    return [*sorted(np.clip(columns, 0.0, CAMERA.width_px)), 600.0, 600.0 + height]
+
+
+def passing(starts_s: list[tuple[float, int]], speed: float, rng: np.random.Generator) -> DetectionLog:
+    """Ten images a second of vehicles whose fronts are 20 m beside the axis at their start."""
+    frames = []
+    for image in range(round(10.0 * (max(start for start, _ in starts_s) + 12.0))):
+        boxes = []
+        for start, side in starts_s:
+            found = box_of(20.0 - speed * (0.1 * image - start), side)
+            if found is not None and found[0] < found[1] - 30.0 and rng.random() > 0.1:
+                left, right, top, bottom = np.array(found) + rng.normal(0.0, 2.0, 4)
+                boxes.append([left, top, right, bottom])
+        pixels = np.array(boxes).reshape(-1, 4)
+        frames.append(DetectionFrame(pixels, np.full(len(boxes), 0.9), ("car",) * len(boxes)))
+    return DetectionLog.at_rate(frames, 10.0)
+
+
+def t0_s(start_s: float, speed: float) -> float:
+    return start_s + (20.0 - LANE_M * math.tan(EDGE_RAD)) / speed
+
+
+@pytest.fixture(scope="module")
+def labelled():
+    starts = [(1.0, 1), (1.5, -1), (16.0, 1)]
+    log = passing(starts, 5.0, np.random.default_rng(0))
+    tracks = box_tracks(log, CAMERA, DetectionFilter())
+    return starts, tracks, label_passes(tracks)
+
+
+def test_every_pass_has_its_arm_and_its_t0(labelled):
+    starts, _, passes = labelled
+    assert [one.arm for one in passes] == ["left", "right", "left"]
+    for (start, _), one in zip(starts, passes, strict=True):
+        assert abs(one.t0.time_s - t0_s(start, 5.0)) < 0.1
+        assert one.t0.std_s < 0.2
+
+
+def test_hidden_places_lie_within_what_is_stated(labelled):
+    starts, _, passes = labelled
+    for (start, side), one in zip(starts, passes, strict=True):
+        hidden = one.track.time_s < t0_s(start, 5.0)
+        true_y = side * (20.0 - 5.0 * (one.track.time_s[hidden] - start))
+        off = one.track.states[hidden, :2] - np.stack([np.full(true_y.size, LANE_M), true_y], axis=1)
+        assert np.hypot(*off[-10:].T).max() < 1.0
+        assert (np.hypot(*off.T) < 3.0 * one.track.position_std_m[hidden]).all()
+
+
+def test_who_drives_ahead_or_stands_comes_out_of_no_arm():
+    box = np.array([[900.0, 550.0, 1050.0, 750.0]])
+    frames = [
+        DetectionFrame(box + 2.0 * image * np.array([-1, -1, 1, 1]), np.ones(1), ("car",))
+        for image in range(40)
+    ]
+    tracks = box_tracks(DetectionLog.at_rate(frames, 10.0), CAMERA, DetectionFilter())
+    assert [one.arm for one in tracks] == [None]
+    assert label_passes(tracks) == []
+
+
+def test_open_label_holds_every_pass_with_its_hidden_phase(labelled):
+    _, _, passes = labelled
+    document = json.loads(json.dumps(open_label("street.wav", passes), allow_nan=False))["openlabel"]
+    assert [one["type"] for one in document["objects"].values()] == ["car"] * 3
+    sights = [
+        flag["val"]
+        for frame in document["frames"].values()
+        for number, one in frame["objects"].items()
+        for flag in one["object_data"]["boolean"]
+        if number == "2"
+    ]
+    assert sights == sorted(sights)
+    assert sights.count(False) > 30
+
+
+def test_windows_leave_out_two_at_once_and_busy_seconds(labelled):
+    starts, tracks, passes = labelled
+    time_s = np.arange(10, 420) / 10.0
+    seen = np.any([(time_s >= one.time_s[0]) & (time_s <= one.time_s[-1]) for one in tracks], axis=0)
+    rows = window_rows(passes, seen, time_s, "Sown", "street.wav")
+    by_class = {
+        label: [row[5] for row in rows if row[1] == label] for label in ("left", "right", "front", "none")
+    }
+    # The first two come half a second apart: neither is a clean window.
+    assert by_class["right"] == []
+    assert by_class["left"] == [pytest.approx(t0_s(starts[2][0], 5.0), abs=0.15)]
+    assert len(by_class["front"]) == 1
+    for end_s in by_class["none"]:
+        assert all(not -1.0 <= t0_s(start, 5.0) - end_s <= 5.0 for start, _ in starts)
+    assert by_class["none"]
+
+
+def test_a_list_of_labels_lies_with_its_recording(tmp_path):
+    sound = tmp_path / "a" / "street.wav"
+    assert file_below(sound, tmp_path / "labels.csv") == "a/street.wav"
+    with pytest.raises(InputFileError, match=r"folder of street\.wav or above"):
+        file_below(sound, tmp_path / "b" / "labels.csv")
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A silent recording with boxes of two passes beside it, and what the command is given."""
+    import soundfile
+
+    rng = np.random.default_rng(1)
+    folder = tmp_path / "street"
+    folder.mkdir()
+    rows = [
+        {"boxes": frame.boxes_px.tolist(), "scores": frame.scores.tolist(), "classes_str": list(frame.labels)}
+        for frame in passing([(1.0, 1), (14.0, -1)], 5.0, rng).frames
+    ]
+    boxes, camera, sound = tmp_path / "boxes.json", tmp_path / "camera.json", folder / "street.wav"
+    boxes.write_text(json.dumps({"detections_per_frame": rows}))
+    camera.write_text(json.dumps({"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75}))
+    soundfile.write(sound, rng.uniform(-0.01, 0.01, (2000 * 25, 56)), 2000)
+    return ["label", str(sound), "--detections", str(boxes), "--camera", str(camera)]
+
+
+def test_the_command_labels_a_recording(recording, tmp_path, capsys):
+    out, windows, figure = (tmp_path / name for name in ("labels.json", "labels.csv", "pass.png"))
+    written = ["--out", str(out), "--windows", str(windows), "--figure", str(figure)]
+    assert main([*recording, *written]) == 0
+    assert len(json.loads(out.read_text())["openlabel"]["objects"]) == 2
+    assert figure.stat().st_size > 5000
+    listed = read_labels(windows, tmp_path)
+    assert {one.label for one in listed} >= {"left", "right", "front"}
+    assert {one.path for one in listed} == {tmp_path / "street" / "street.wav"}
+    capsys.readouterr()
+    assert main([*recording[:2], "--out", str(out)]) == 2
+    assert "--detections" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_train_learns_what_was_labelled(recording, tmp_path, capsys):
+    windows, table, model = (tmp_path / name for name in ("labels.csv", "table.csv", "model.json"))
+    assert main([*recording, "--out", str(tmp_path / "labels.json"), "--windows", str(windows)]) == 0
+    rng, labels = np.random.default_rng(2), np.tile(["left", "right", "none", "front"], 15)
+    features = rng.uniform(0.2, 1.0, (60, 60)) + 0.3 * np.outer(labels == "left", np.arange(60) < 30)
+    ids, sites = np.arange(60).astype(str), np.repeat(["SA1", "SB1"], 30)
+    write_features(table, FeatureTable(features, labels, ids, sites, ids, (None,) * 60))
+    capsys.readouterr()
+    given = ["train", str(table), "--method", "baseline", "--labels", str(windows), "--out", str(model)]
+    assert main([*given, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["n_windows"] == 60 + told["n_labelled"] == 60 + len(read_labels(windows, tmp_path))
+    assert 0.0 <= told["fano_bound"] <= 1.0

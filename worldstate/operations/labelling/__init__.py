@@ -1,0 +1,1 @@
+"""Labels from smoothed passes: who was where while only heard, and when each came into line of sight."""

@@ -1,0 +1,156 @@
+"""Files of labels: trajectories in the layout of ASAM OpenLABEL, windows as `train --labels` reads them."""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.datasets.sample_windows import FRONT, window_ends_s
+from worldstate.adapters.files.atomic import atomic_path, write_text
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.version import __version__
+
+from .pass_labels import PassLabel
+
+COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
+# A window a second before T0 that is half a second off holds what the next class sounds like.
+SUREST_STD_S = 0.3
+# As in streams: nobody comes for so long, and what was in view is gone for a second.
+CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
+
+
+def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
+    """Return the passes as an OpenLABEL document: objects with T0, a frame every tenth of a second."""
+    objects, frames = {}, dict[str, dict[str, Any]]()
+    for number, one in enumerate(passes):
+        objects[str(number)] = {
+            "name": f"{one.arm}-{number}",
+            "type": one.label,
+            "coordinate_system": "base_link",
+            "object_data": {
+                "num": [_named("t0_s", one.t0.time_s), _named("t0_std_s", one.t0.std_s)],
+                "text": [{"name": "arm", "val": one.arm}],
+            },
+        }
+        for time_s, state, spread in zip(
+            one.track.time_s, one.track.states, one.track.covariance, strict=True
+        ):
+            frame = frames.setdefault(
+                str(round(time_s * FRAME_RATE_HZ)),
+                {"frame_properties": {"timestamp": round(float(time_s), 3)}, "objects": {}},
+            )
+            frame["objects"][str(number)] = {
+                "object_data": _placed(state, spread, bool(time_s >= one.t0.time_s))
+            }
+    return {
+        "openlabel": {
+            "metadata": {
+                "schema_version": "1.0.0",
+                "annotator": f"worldstate {__version__}, fixed-lag smoother",
+                "tagged_file": recording,
+            },
+            "coordinate_systems": {"base_link": {"type": "local_cs", "parent": ""}},
+            "objects": objects,
+            "frames": {key: frames[key] for key in sorted(frames, key=int)},
+        }
+    }
+
+
+def write_open_label(path: Path, recording: str, passes: Sequence[PassLabel]) -> None:
+    """Write the document, whole or not at all."""
+    write_text(path, json.dumps(open_label(recording, passes), allow_nan=False) + "\n")
+
+
+def window_rows(
+    passes: Sequence[PassLabel], in_view: BoolArray, time_s: FloatArray, environment: str, file: str
+) -> list[tuple[object, ...]]:
+    """Return the windows of one recording: of every arm at T0, in view after it, and where nobody comes.
+
+    Shapes: in_view (n,), of the times, time_s (n,).
+    """
+    rows: list[tuple[object, ...]] = []
+    sure = [one for one in passes if one.t0.std_s <= SUREST_STD_S]
+    # One recording a pass: what is split must not share a vehicle.
+    for number, one in enumerate(sure):
+        near = [abs(one.t0.time_s - two.t0.time_s) for two in passes if two is not one]
+        if min(near, default=np.inf) < TOGETHER_S:
+            continue
+        for label, end_s in window_ends_s(one.arm, one.t0.time_s, moving_ego=False).items():
+            if label == FRONT and not in_view[np.abs(time_s - end_s) < 0.5].any():
+                continue
+            frame, std_s = round(one.t0.time_s * FRAME_RATE_HZ), round(one.t0.std_s, 3)
+            rows.append(
+                (
+                    f"{number}{label}",
+                    label,
+                    environment,
+                    f"{file}:{number}",
+                    file,
+                    round(end_s, 2),
+                    frame,
+                    std_s,
+                )
+            )
+    entries = np.array([one.t0.time_s for one in passes])
+    last = -np.inf
+    for end_s in time_s.tolist():
+        coming = ((entries >= end_s - 1.0) & (entries <= end_s + CALM_S)).any()
+        busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s)].any()
+        if end_s - last >= NONE_EVERY_S and end_s <= time_s[-1] - CALM_S and not (coming or busy):
+            rows.append(
+                (
+                    f"{end_s:.0f}none",
+                    "none",
+                    environment,
+                    f"{file}:{end_s:.0f}s",
+                    file,
+                    round(end_s, 2),
+                    "",
+                    "",
+                )
+            )
+            last = end_s
+    return rows
+
+
+def file_below(sound: Path, labels: Path) -> str:
+    """Return the path of a recording as a list of labels names it, relative to its own folder.
+
+    Raises
+    ------
+    InputFileError
+        If the recording does not lie there or below.
+    """
+    try:
+        return sound.resolve().relative_to(labels.resolve().parent).as_posix()
+    except ValueError as error:
+        problem = f"expected it in the folder of {sound.name} or above, where readers of the list find that"
+        raise InputFileError(labels, problem) from error
+
+
+def write_window_labels(path: Path, rows: Sequence[Sequence[object]]) -> None:
+    """Write windows in the columns that `extract-features --labels` and `train --labels` read."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(rows)
+
+
+def _placed(state: FloatArray, spread: FloatArray, in_sight: bool) -> dict[str, Any]:
+    return {
+        "vec": [
+            {"name": "position_m", "val": state[:2].round(3).tolist()},
+            {"name": "velocity_mps", "val": state[2:].round(3).tolist()},
+            {"name": "covariance", "val": spread.round(5).ravel().tolist()},
+        ],
+        "boolean": [{"name": "in_line_of_sight", "val": in_sight}],
+    }
+
+
+def _named(name: str, value: float) -> dict[str, Any]:
+    return {"name": name, "val": round(value, 4)}

@@ -1,0 +1,129 @@
+"""Smooth every pass of a recording: where a vehicle was while it was hidden, and its T0."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.ground.values import nanoseconds
+from worldstate.measurement.measurement import Bearing
+from worldstate.smoothing import AngularHeight, FixedLagSmoother, SmoothingSettings
+from worldstate.smoothing.observations import Observation
+from worldstate.smoothing.smoothed_track import FirstSight, SmoothedTrack
+from worldstate.state.context import blind_corner
+
+from .box_tracks import BoxTrack
+
+# Who comes is heard for some three seconds; longer ago the motion since T0 says nothing of the place.
+HIDDEN_S, HOP_S = 5.0, 0.1
+# Height and width of the body by the detector's classes, m, and how widely the height varies, relative.
+_BODIES = {
+    "car": (1.55, 1.8, 0.1),
+    "truck": (2.9, 2.4, 0.25),
+    "bus": (3.1, 2.5, 0.1),
+    "train": (3.6, 2.5, 0.1),
+}
+_OTHER_BODY = (1.7, 0.7, 0.1)
+# Three pixels of an image that is 69 degrees wide, and what a detector adds at a body's rounded corners.
+_BOX_STD_RAD, _HEIGHT_STD = math.radians(0.4), 0.05
+# Where the corner stands is not seen, only its direction; any distance does for an ego that stands.
+_CORNER_M, _LEAST_EDGE_STD_RAD = 6.0, math.radians(0.5)
+# At the earliest hop: beyond the corner, at a walk to 15 m/s, from some 10 to 100 m away.
+_START_STD = (math.radians(25.0), 0.25, 0.3, 0.6)
+_START_RAD, _START_M = math.radians(55.0), 30.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassLabel:
+    """One vehicle that came out of a hidden arm."""
+
+    arm: str
+    label: str
+    t0: FirstSight
+    track: SmoothedTrack  # From some seconds before T0 until it was last seen
+
+
+def label_passes(
+    tracks: Sequence[BoxTrack],
+    camera_ahead_m: float = 0.0,
+    settings: SmoothingSettings | None = None,
+    on_pass: Callable[[], None] = lambda: None,
+) -> list[PassLabel]:
+    """Return the labels of all vehicles that came out of an arm, in the order of their boxes."""
+    # Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
+    # runs off and the system is indeterminate.
+    chosen = settings or SmoothingSettings(lag_s=30.0, relinearize_every=1000)
+    coming = [one for one in tracks if one.arm is not None]
+    edges = {arm: _edge(coming, arm) for arm in ("left", "right")}
+    found = []
+    for number, one in enumerate(coming):
+        label = _smoothed(f"{number}", one, edges, camera_ahead_m, chosen)
+        on_pass()
+        found += [] if label is None else [label]
+    return found
+
+
+def _edge(tracks: Sequence[BoxTrack], arm: str) -> tuple[float, float]:
+    """Return azimuth and deviation of an arm's edge: the median of where its vehicles came out."""
+    seen = np.array([one.edge_rad for one in tracks if one.arm == arm])
+    seen = seen[np.isfinite(seen)]
+    if not seen.size:
+        # Cut by the edge of the image: the corner of a usual junction, so that T0 is stated widely.
+        usual = blind_corner(arm, 1 if arm == "left" else -1)
+        return usual.edge_azimuth_rad, usual.edge_std_rad
+    middle = float(np.median(seen))
+    # 1.48 makes the median deviation that of a Gaussian; a single pass tells the edge as well as its box.
+    spread = 1.48 * float(np.median(np.abs(seen - middle))) / math.sqrt(seen.size)
+    return middle, max(spread, _LEAST_EDGE_STD_RAD)
+
+
+def _smoothed(
+    name: str,
+    one: BoxTrack,
+    edges: dict[str, tuple[float, float]],
+    camera_ahead_m: float,
+    settings: SmoothingSettings,
+) -> PassLabel | None:
+    edge = edges[one.arm or ""]
+    smoother = FixedLagSmoother(settings)
+    side: Literal[1, -1] = 1 if one.arm == "left" else -1
+    place = _CORNER_M * np.array([math.cos(edge[0]), math.sin(edge[0])])
+    smoother.add_corner("edge", side, place.tolist(), (_CORNER_M * edge[1],) * 2)
+    observations = _observations(one, camera_ahead_m)
+    times = sorted(observations)
+    start = MotionBelief.around((side * _START_RAD, -side * 0.1, -0.15, math.log(_START_M)), _START_STD)
+    smoother.begin(name, nanoseconds(times[0] * HOP_S), start)
+    for at in times:
+        smoother.update(nanoseconds(at * HOP_S), {name: observations[at]})
+    t0 = smoother.first_sight(name, "edge")
+    return None if t0 is None else PassLabel(one.arm or "", one.label, t0, smoother.track(name))
+
+
+def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observation]]:
+    """Return what is observed of a vehicle every tenth of a second: nothing before its boxes, then these."""
+    # Approach rates of the hidden phase are left out: a source that nears its corner grows louder out of the
+    # shadow, too, which of trucks said 1.0 1/s in place of .45, to a stated .12. With 0.3 1/s added to their
+    # deviation hidden places two seconds before T0 were off by 1.8 m in the median, without them by 1.1 m.
+    first = round(float(one.time_s[0]) / HOP_S)
+    found: dict[int, list[Observation]] = {at: [] for at in range(first - round(HIDDEN_S / HOP_S), first)}
+    for time_s, azimuth, height in zip(one.time_s, one.leading_rad, one.height_rad, strict=True):
+        found.setdefault(round(float(time_s) / HOP_S), []).extend(
+            _seen(float(azimuth), float(height), one.label, camera_ahead_m)
+        )
+    return found
+
+
+def _seen(azimuth_rad: float, height: float, label: str, camera_ahead_m: float) -> list[Observation]:
+    """Return what a box says of the middle of a vehicle's front."""
+    if not (math.isfinite(azimuth_rad) and math.isfinite(height)):
+        return []
+    true_m, width_m, spread = _BODIES.get(label, _OTHER_BODY)
+    # The box is as high as the near side, and its leading edge that of the far one: half a body's width each.
+    ahead_m = true_m / height + camera_ahead_m + 0.5 * width_m
+    aside_m = (ahead_m + 0.5 * width_m) * math.tan(azimuth_rad)
+    range_m = math.hypot(ahead_m, aside_m)
+    middle = Bearing(math.atan2(aside_m, ahead_m), _BOX_STD_RAD)
+    return [middle, AngularHeight(true_m / range_m, _HEIGHT_STD, true_m, spread)]
