@@ -66,6 +66,12 @@ def label_passes(
     return found
 
 
+def start_of(arm: str) -> MotionBelief:
+    """Return what is believed of a vehicle some seconds before it comes into view."""
+    side = 1 if arm == "left" else -1
+    return MotionBelief.around((side * _START_RAD, -side * 0.1, -0.15, math.log(_START_M)), _START_STD)
+
+
 def _edge(tracks: Sequence[BoxTrack], arm: str) -> tuple[float, float]:
     """Return azimuth and deviation of an arm's edge: the median of where its vehicles came out."""
     seen = np.array([one.edge_rad for one in tracks if one.arm == arm])
@@ -94,8 +100,7 @@ def _smoothed(
     smoother.add_corner("edge", side, place.tolist(), (_CORNER_M * edge[1],) * 2)
     observations = _observations(one, camera_ahead_m)
     times = sorted(observations)
-    start = MotionBelief.around((side * _START_RAD, -side * 0.1, -0.15, math.log(_START_M)), _START_STD)
-    smoother.begin(name, nanoseconds(times[0] * HOP_S), start)
+    smoother.begin(name, nanoseconds(times[0] * HOP_S), start_of(one.arm or ""))
     for at in times:
         smoother.update(nanoseconds(at * HOP_S), {name: observations[at]})
     t0 = smoother.first_sight(name, "edge")
