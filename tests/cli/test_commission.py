@@ -49,3 +49,15 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     told = read_model(out).sequence
     assert told is not None and told.alarm is not None and told.alarm.onsets_per_hour == 600.0
     assert told.alarm.threshold_nats != model.sequence.alarm.threshold_nats
+
+
+@pytest.mark.slow
+def test_an_ego_that_drives_gets_a_sequence_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "mics.csv").write_text(ARRAY)
+    out = tmp_path / "model.json"
+    command = ["commission", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick", "--no-exam"]
+    assert main([*command, "--ego", "moving"]) == 0
+    model = read_model(out)
+    assert model.domain is not None and model.domain.ego_motion == "moving"
+    assert model.sequence is not None and model.sequence.alarm is not None
+    assert model.sequence.alarm.onsets_per_hour == 60.0
