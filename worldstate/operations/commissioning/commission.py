@@ -244,8 +244,12 @@ def _table_and_beside(
     open_field: SimulatedWindows,
     domain: ModelDomain,
     streams: Sequence[HeardStream],
-) -> tuple[FeatureTable, SimulatedWindows]:
-    """Return the windows that a model is trained on, and what it learns beside them."""
+) -> tuple[FeatureTable, SimulatedWindows | None]:
+    """Return the windows that a model is trained on, and what it learns beside them, if anything."""
+    # At real junctions of a moving ego left out the AUROC is .86 of real windows alone, .84 with those of
+    # drives beside, .69 with sources in the open as well.
+    if real is not None and domain.ego_motion == "moving":
+        return real, None
     learned = learned_beside(streams, open_field)
     if real is not None:
         return real, learned.beside(real.environments)
