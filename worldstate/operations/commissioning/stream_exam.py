@@ -24,7 +24,7 @@ from worldstate.abduction.sequence.sequence_model import (
 )
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.alarm_rate import poisson_interval
+from worldstate.operations.metrics.alarm_rate import poisson_interval, share_interval
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.recordings.advisories import (
@@ -218,16 +218,12 @@ def shortly_before(time_s: FloatArray, entry_s: float) -> BoolArray:
 
 
 def _detections(told: Sequence[AlarmOutcome]) -> dict[str, float | None]:
-    from scipy.stats import beta
-
     hits, n = sum(one.detected for one in told), len(told)
-    # The exact interval of a share (C. Clopper and E. Pearson, Biometrika 26, 1934).
-    low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(0.975, hits + 1, n - hits)) if hits < n else 1.0
+    low, high = share_interval(hits, n) if n else (None, None)
     return {
         "detected": mean_of([one.detected for one in told]),
-        "detected_low": low if n else None,
-        "detected_high": high if n else None,
+        "detected_low": low,
+        "detected_high": high,
         "lead_s": mean_of([one.lead_s for one in told if one.detected]),
         "lead_missed_as_0_s": mean_of([one.lead_s for one in told]),
     }

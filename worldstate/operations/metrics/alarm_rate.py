@@ -1,4 +1,4 @@
-"""Rates of alarms: the exact interval of a count, and what alarms at random moments would detect."""
+"""Rates of alarms: exact intervals of counts and shares, and what alarms at random moments would detect."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,24 @@ def poisson_interval(count: int, exposure: float, confidence: float = 0.95) -> t
     # A chi-square with 2 n degrees of freedom is twice a Gamma(n), whose inverse needs no scipy.stats.
     low = float(gammaincinv(whole, tail)) if whole else 0.0
     return low / time, float(gammaincinv(whole + 1.0, 1.0 - tail)) / time
+
+
+def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the exact interval of a share.
+
+    Examples
+    --------
+    >>> low, high = share_interval(0, of=1000)
+    >>> low, round(high, 4)
+    (0.0, 0.0037)
+    """
+    # C. Clopper and E. Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
+    from scipy.special import betaincinv
+
+    whole = in_range("count", count, 0, in_range("of", of, 1, np.inf))
+    tail = (1.0 - in_range("confidence", confidence, 0.0, 1.0, open_low=True, open_high=True)) / 2.0
+    low = float(betaincinv(whole, of - whole + 1.0, tail)) if whole else 0.0
+    return low, float(betaincinv(whole + 1.0, of - whole, 1.0 - tail)) if whole < of else 1.0
 
 
 def random_detection(
