@@ -34,6 +34,7 @@ COMMANDS = (
     "studies.evaluate",
     "studies.evaluate_features",
     "studies.evaluate_signatures",
+    "studies.evaluate_planner",
     "studies.evaluate_streams",
     "studies.foreign_sounds",
     "studies.road_users",
