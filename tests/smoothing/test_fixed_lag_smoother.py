@@ -107,6 +107,14 @@ def test_an_entity_that_is_silent_beyond_the_lag_begins_anew():
     assert smoother.track("car").stamps_ns.tolist() == [101 * HOP_NS]
 
 
+def test_entities_with_heights_come_and_go():
+    from bench_smoothing import smoothing_times
+
+    # At the 581st step a height that had outlived its states was refused by gtsam.
+    spent, _ = smoothing_times(620, np.random.default_rng(0))
+    assert len(spent) == 620
+
+
 def test_an_outlier_among_bearings_costs_little():
     def final(outlier: float) -> np.ndarray:
         smoother = FixedLagSmoother()

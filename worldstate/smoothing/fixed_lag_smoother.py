@@ -437,11 +437,14 @@ class FixedLagSmoother:
     def _keep_lasting(self) -> None:
         """Keep what outlives the lag: corners, walls, heights of the entities, the latest pose."""
         lasting = [one.key for one in self._landmarks.values()]
-        lasting += [key_of(HEIGHT, one.number) for one in self._entities.values() if one.sized]
         if self._ego:
             lasting.append(self._ego[max(self._ego)])
         for key in lasting:
             self._graph.keep(key, self._time_s(self._now_ns))
+        # A height that outlives the states of its entity is refused by gtsam when its turn comes.
+        for one in self._entities.values():
+            if one.sized:
+                self._graph.keep(key_of(HEIGHT, one.number), self._time_s(one.stamps_ns[-1]))
 
     def _forget(self) -> None:
         """Forget states that gtsam has marginalised."""
