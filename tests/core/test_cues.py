@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
+from worldstate import Context, FilterSettings, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
@@ -196,7 +196,8 @@ def test_events_account_for_every_entity(seed: int, sequence: bool) -> None:
             if event.kind == "handed_over":
                 assert alive[event.entity_id] != "visible"
             alive[event.entity_id] = event.kind
-            if event.kind == "died":
+            assert (event.kind == "merged") == (event.into is not None)
+            if event.kind in ("died", "merged"):
                 del alive[event.entity_id]
         now = {one.id: one.status for one in world.state.entities}
         assert set(now) == set(alive)
@@ -264,3 +265,47 @@ def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
             right, left = cue.sector_rad
             assert right < cue.azimuth_rad < left
             assert left - right == pytest.approx(3.29 * cue.azimuth_std_rad, abs=1e-5)
+
+
+def box(hop: int, *azimuths: float) -> Measurement:
+    boxes = tuple(Sighting(one, 0.02, "car", 0.9) for one in azimuths)
+    heard = SignatureEvidence(("left", "right"), (-1.0, -1.0), -1.0, -1.0)
+    return Measurement(hop * 10**8, heard, Present(0.3) if boxes else Absent(0.3), SILENT, SILENT, boxes)
+
+
+def test_two_that_have_become_one_go_on_as_the_first() -> None:
+    """A car seen in two boxes, one split off the other: when one box is left, one car is."""
+    told: list[Event] = []
+    world = WorldFilter().update(box(1, 0.1))
+    (first,) = world.state.entities
+    for hop in range(2, 40):
+        world = world.update(box(hop, 0.1, 0.13) if hop < 8 else box(hop, 0.13))
+        told += world.state.events
+    (left,) = world.state.entities
+    (merged,) = (one for one in told if one.kind == "merged")
+    (born,) = (one for one in told if one.kind == "born")
+    assert (merged.entity_id, merged.into, left.id) == (born.entity_id, first.id, first.id)
+    assert "died" not in {one.kind for one in told}
+
+
+def test_two_of_which_each_is_found_stay_two() -> None:
+    world = WorldFilter()
+    for hop in range(1, 40):
+        world = world.update(box(hop, 0.1, 0.13))
+    assert len(world.state.entities) == 2
+
+
+def test_halves_of_one_vehicle_heard_on_both_sides_become_one_when_it_comes_into_view() -> None:
+    told: list[Event] = []
+    both, none = (SignatureEvidence(("left", "right"), (one, one), 0.0, 0.0) for one in (4.0, -4.0))
+    world = WorldFilter(settings=FilterSettings(birth_probability=0.3))
+    for hop in range(1, 60):
+        seen = (Sighting(0.55 - 0.03 * (hop - 30), 0.02, "car", 0.9),) if hop >= 30 else ()
+        answer = Present(0.04) if seen else Absent(0.04)
+        world = world.update(
+            Measurement(hop * 10**8, both if hop < 30 else none, answer, SILENT, SILENT, seen)
+        )
+        told += world.state.events
+    (merged,) = (one for one in told if one.kind == "merged")
+    assert merged.into == next(one.entity_id for one in told if one.kind == "handed_over")
+    assert [one.id for one in world.state.entities] == [merged.into]

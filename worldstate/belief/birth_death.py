@@ -1,16 +1,21 @@
-"""Birth and death of hidden entities, one at most on each side."""
+"""Birth and death of hidden entities, one at most on each side; entities that have become one."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.ground.values import NANOSECONDS_PER_SECOND
+from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
 from .hidden_belief import HiddenBelief
+from .kinematics.polar import AZIMUTH, LOG_RANGE
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, heard_as
+
+# Of two at one place; whoever is found by himself within it is somebody else.
+_ALONE_NS = nanoseconds(1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,43 @@ def birth_death(
             elif existence >= settings.death_probability or alarmed[k]:
                 kept.append(replace(current, existence=existence, labels=labels))
     return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))
+
+
+def merged_tracks(tracks: tuple[Track, ...], stamp_ns: int) -> tuple[tuple[Track, ...], dict[str, str]]:
+    """Return the tracks with those that have become one as one, and by the ids that end those that go on.
+
+    Of two at one place, of the same class, one has just been found and the other not for a second. They go
+    on where the first is, as whoever was known earlier.
+    """
+    left, into = list(tracks), dict[str, str]()
+    found = [one for one in tracks if one.seen and one.last_seen_ns == stamp_ns]
+    lost = [one for one in tracks if one.seen and stamp_ns - (one.last_seen_ns or 0) >= _ALONE_NS]
+    for other in lost:
+        same = next((one for one in found if _at_one_place(one, other)), None)
+        if same is not None:
+            first, second = sorted((same, other), key=lambda one: (one.created_ns, one.id))
+            known = max(same.existence, other.existence)
+            one = replace(
+                same, id=first.id, created_ns=first.created_ns, was_hidden=first.was_hidden, existence=known
+            )
+            left.remove(other)
+            left[left.index(same)] = found[found.index(same)] = one
+            into[second.id] = first.id
+    return tuple(left), into
+
+
+def _at_one_place(one: Track, other: Track) -> bool:
+    """Tell whether two tracks of one class stand within each other's deviations of azimuth and range."""
+    gap = one.motion.mean - other.motion.mean
+    gap[AZIMUTH] = wrap_angle(gap[AZIMUTH])
+    variance = (one.motion.covariance + other.motion.covariance).diagonal()
+    near = all(gap[k] ** 2 <= variance[k] for k in (AZIMUTH, LOG_RANGE))
+    alike = _likeliest(one) == _likeliest(other)
+    return near and alike and one.moving == other.moving
+
+
+def _likeliest(track: Track) -> str:
+    return max(track.labels, key=itemgetter(1), default=(UNKNOWN, 1.0))[0]
 
 
 def hidden_on(tracks: Iterable[Track], k: int) -> Track | None:

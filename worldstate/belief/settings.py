@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import Probability
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +84,8 @@ class FilterSettings:
     window_s: float = 1.0  # Of the published feature
     look_interval_s: float = 0.3  # Three images at 10 Hz: misses of consecutive images repeat each other
     # Far apart: with one threshold for both, a belief that wavers about it would change ids at every hop.
-    birth_probability: float = 0.5
-    death_probability: float = 0.1
+    birth_probability: Probability = 0.5
+    death_probability: Probability = 0.1
     rearm_s: float = 1.0  # One window
     relaxation_s: float = 1.0  # One window: what the sound of the last one did not confirm fades
     acceleration_psd: float = 2.0  # 1.4 m/s of speed in a second: braking and turning in town
@@ -92,10 +93,10 @@ class FilterSettings:
     hidden_std: tuple[float, float, float] = (0.15, 0.25, 0.6)
     hidden_inverse_tta_hz: float = 0.2
     hidden_range_m: float = 25.0
-    hidden_path_probability: float = 0.25  # 21 % of the peaks in real hidden windows, rounded up
+    hidden_path_probability: Probability = 0.25  # 21 % of the peaks in real hidden windows, rounded up
     hidden_bearing_std_rad: float = 0.25  # 14 deg: peaks spread from the edge to the vehicle itself
     hidden_bias_std_rad: float = 0.17  # 10 deg, half the spread of hidden vehicles behind a default corner
-    line_of_sight_path_probability: float = 0.8  # The rest are images in walls, other sources
+    line_of_sight_path_probability: Probability = 0.8  # The rest are images in walls, other sources
     # The second bounds the first: four deviations of an entity unseen for a second are most of the view.
     gate_sigma: float = 4.0
     gate_rad: float = 0.35
@@ -104,15 +105,17 @@ class FilterSettings:
     edge_std_rad: float = 0.15
     reocclusion_gate_rad: float = 0.8  # Less than the 64 deg between the edges of a default junction
     # Rarely wrong on junctions that the signature model was trained on, often on others.
-    side_confusion: float = 0.2
-    unheard_probability: float = 0.05  # One in twenty: most vehicles from a side street are heard before
+    side_confusion: Probability = 0.2
+    unheard_probability: Probability = (
+        0.05  # One in twenty: most vehicles from a side street are heard before
+    )
     # Above zero: a second vehicle behind the same corner would have to be found anew.
-    handover_residual: float = 0.02
-    sighting_existence: float = 0.5  # Indifferent: the first sighting decides
-    clutter_rate: float = 0.01
+    handover_residual: Probability = 0.02
+    sighting_existence: Probability = 0.5  # Indifferent: the first sighting decides
+    clutter_rate: Probability = 0.01
     visible_life_s: float = 10.0
     # Three full looks that find nothing take .99 below it, at a miss rate of .04.
-    delete_existence: float = 0.05
+    delete_existence: Probability = 0.05
     lost_std_rad: float = 0.8  # Beyond, the azimuth says no more than which half of the view
     reocclusion_after_s: float = 0.15  # More than one image at 10 Hz: a single miss is no occlusion
     reocclusion_s: float = 3.0  # Longer, and a following vehicle would get the id of the one ahead
@@ -125,21 +128,7 @@ class FilterSettings:
                 for number in value:
                     in_range(field.name, number, 0.0, 1e6, open_low=True)
             elif not isinstance(value, str):
-                high = 1.0 if field.name in _PROBABILITIES else 1e6
+                high = 1.0 if field.type is Probability else 1e6
                 in_range(field.name, value, 0.0, high, open_low=True)
         if self.death_probability > self.birth_probability:
             raise InvalidArgumentError("death_probability: expected at most birth_probability")
-
-
-_PROBABILITIES = {
-    "birth_probability",
-    "death_probability",
-    "hidden_path_probability",
-    "line_of_sight_path_probability",
-    "handover_residual",
-    "side_confusion",
-    "unheard_probability",
-    "sighting_existence",
-    "clutter_rate",
-    "delete_existence",
-}

@@ -17,7 +17,7 @@ from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
-from worldstate.belief.birth_death import birth_death
+from worldstate.belief.birth_death import birth_death, merged_tracks
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.position_update import position_update
@@ -30,7 +30,7 @@ from worldstate.measurement.measurement import Look, Measurement
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context
 
-from .entity_events import events_between, published
+from .entity_events import events_between, halves_of_one, published
 from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
 from .sequence_memory import carried, informed
 
@@ -436,6 +436,13 @@ def chronicled(before: Memory, carried: Memory, after: Memory, model: FilterMode
         (since_ns if since_ns is not None and held else after.stamp_ns) if named else None
         for since_ns, held, named in sides
     )
-    known, now = (published(one.tracks, model.site.settings) for one in (before, after))
-    events = events_between(known, now, after.stamp_ns)
-    return replace(after, advised_ns=advised_ns, events=events)
+    tracks, into = merged_tracks(after.tracks, after.stamp_ns)
+    if halves := halves_of_one(before, after):
+        # As after a hand-over of its own: the sound of before must not bring it forth again.
+        ended = {one.side for one in before.tracks if one.id in halves}
+        handover_ns = (after.stamp_ns if k in ended else ns for k, ns in enumerate(after.handover_ns))
+        after = replace(after, handover_ns=tuple(handover_ns))
+        tracks = tuple(one for one in tracks if one.id not in halves)
+    known, now = (published(one, model.site.settings) for one in (before.tracks, tracks))
+    events = events_between(known, now, after.stamp_ns, into | halves)
+    return replace(after, tracks=tracks, advised_ns=advised_ns, events=events)

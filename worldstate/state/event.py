@@ -16,9 +16,11 @@ class Event:
         Of the measurement that brought it, ns.
     kind : {"born", "handed_over", "coasting", "hidden_again", "died", "merged"}
         Begun; come into view of a sensor that had not seen it; in view before and not found by the last look;
-        seen before and now behind an occluder; dropped; gone on as another one, which no step does so far.
+        seen before and now behind an occluder; dropped; gone on as another one.
     entity_id : str
         Whose.
+    into : str or None
+        As whom a merged one goes on; None of all other kinds.
 
     Examples
     --------
@@ -29,3 +31,4 @@ class Event:
     stamp_ns: int
     kind: EventKind
     entity_id: str
+    into: str | None = None
