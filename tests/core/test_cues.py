@@ -309,3 +309,23 @@ def test_halves_of_one_vehicle_heard_on_both_sides_become_one_when_it_comes_into
     (merged,) = (one for one in told if one.kind == "merged")
     assert merged.into == next(one.entity_id for one in told if one.kind == "handed_over")
     assert [one.id for one in world.state.entities] == [merged.into]
+
+
+def test_a_relation_says_since_when_it_holds_and_until_when_it_did() -> None:
+    """Occluded from the birth to the hand-over, and that is told for five more seconds."""
+    loud, quiet = (SignatureEvidence(("left", "right"), (one, -1.0), -1.0, -one) for one in (4.0, -4.0))
+    told, world = {}, WorldFilter()
+    for hop in range(1, 95):
+        seen = (Sighting(0.55 - 0.003 * (hop - 20), 0.02, "car", 0.9),) if hop >= 20 else ()
+        answer = Present(0.04) if seen else Absent(0.04)
+        heard = loud if hop < 20 else quiet
+        world = WorldFilter.from_dict(
+            world.update(Measurement(hop * 10**8, heard, answer, SILENT, SILENT, seen)).to_dict()
+        )
+        told[hop] = {one.kind: (one.since_ns, one.until_ns) for one in world.state.relations}
+    (born,) = {since for hop in told for since, _ in [told[hop].get("occluded_by", (None, 0))] if since}
+    assert told[19]["occluded_by"] == (born, None)
+    assert told[20]["occluded_by"] == told[69]["occluded_by"] == (born, 2 * 10**9)
+    assert told[94] == {"emerged_from": (2 * 10**9, None)}
+    edges = world.predict(0.1).state.graph().edges(data=True)
+    assert [edge["since_ns"] for _, _, edge in edges] == [2 * 10**9]

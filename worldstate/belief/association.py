@@ -164,8 +164,10 @@ def _scores(
     in_view = _in_view(tracks, azimuth_rad, std_rad, moving, site.settings)
     if detected.all():
         return in_view
-    emergence = _emergence(tracks, azimuth_rad, site) + _class_match(tracks, sightings)
-    return np.where(detected, in_view, np.where(moving, emergence, FORBIDDEN))
+    classes = np.log([[_shared_class(track, one.label) for track in tracks] for one in sightings])
+    existence = np.array([track.existence for track in tracks])
+    heard = np.maximum(existence * emergence_density(tracks, azimuth_rad, site), _LEAST)
+    return np.where(detected, in_view, np.where(moving, np.log(heard) + classes, FORBIDDEN))
 
 
 def _in_view(
@@ -185,22 +187,12 @@ def _in_view(
     return np.where(outside, FORBIDDEN, density + expected + mismatch)
 
 
-def _class_match(tracks: tuple[Track, ...], sightings: tuple[Sighting, ...]) -> FloatArray:
-    """Return log P(the label of a sighting | what a track sounds like), shape (sightings, tracks)."""
-    return np.log([[_shared_class(track, one.label) for track in tracks] for one in sightings])
-
-
 def _shared_class(track: Track, label: str) -> float:
+    """Return P(a detector calls what a track sounds like by this label)."""
     if label not in _VEHICLES:
         return _MISREAD if label in _ON_FOOT else 1.0
     kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in track.labels)
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
-
-
-def _emergence(tracks: tuple[Track, ...], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
-    existence = np.array([track.existence for track in tracks])
-    own = emergence_density(tracks, azimuth_rad, site)
-    return np.asarray(np.log(np.maximum(existence * own, _LEAST)))
 
 
 def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:

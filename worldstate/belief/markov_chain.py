@@ -13,7 +13,7 @@ import numpy as np
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
-RatesHz = tuple[float, float, float, float, float, float]
+RatesHz = tuple[float, ...]
 """arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""
 
 # At any rate above .01/s the chain is in equilibrium by then; a larger exponent of expm only costs digits.

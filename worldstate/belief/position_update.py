@@ -1,7 +1,7 @@
 """Update the entities with the positions of a radar, a lidar or a radio: found, missed, announced."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
@@ -47,14 +47,6 @@ _MOST_ENTITIES = 128
 _BY_ALL = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
 
 
-@dataclass(frozen=True, slots=True)
-class PositionUpdate:
-    """Result of a scan: as of a look, and the hidden entities born so far on each side."""
-
-    seen: VisionUpdate
-    births: tuple[int, ...]
-
-
 def position_update(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
@@ -63,8 +55,8 @@ def position_update(
     born: int,
     births: tuple[int, ...],
     site: SiteGeometry,
-) -> PositionUpdate:
-    """Return tracks and explanations after one scan; its misses count by `weight`."""
+) -> tuple[VisionUpdate, tuple[int, ...]]:
+    """Return the result of one scan, and the hidden ones born so far by side; misses count by `weight`."""
     # Sorted, so that the state does not depend on the order in which a sensor lists what it found.
     positions = tuple(sorted(scan.positions, key=_BY_ALL))
     whose = joint_association(
@@ -92,7 +84,7 @@ def position_update(
     known = follow_places([*after, *fresh], site)
     emerged = emerged_sides(handed_over, known[len(after) :], site)
     seen = VisionUpdate(known, explanation, handed_over, emerged, born)
-    return PositionUpdate(seen, tuple(counts))
+    return seen, tuple(counts)
 
 
 def _log_new(scan: PositionScan, site: SiteGeometry) -> float:

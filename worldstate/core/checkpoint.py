@@ -18,7 +18,7 @@ from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing, Measurement
 from worldstate.measurement.position import PositionScan
-from worldstate.state import Context, Delivery, Event, Priors
+from worldstate.state import Context, Delivery, Event, Priors, Relation
 
 from .memory import CountedLook, Memory, SourceRule
 from .sequence_memory import SequenceMemory
@@ -65,6 +65,7 @@ class _Memory:
     heard_nats: float = field(default=0.0, metadata=ADDED)
     advised_ns: tuple[Annotated[int | None, Keys("stamp_ns")], ...] = field(default=(), metadata=ADDED)
     events: tuple[Event, ...] = field(default=(), metadata=ADDED)
+    relations: tuple[Relation, ...] = field(default=(), metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)

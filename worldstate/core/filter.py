@@ -27,10 +27,10 @@ from worldstate.state import Context, WorldState
 
 from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
 from .cue_builder import cues_of
-from .entity_events import published
+from .entity_events import published, relations_at
 from .fixed_lag import FixedLag, restored
 from .memory import Memory, first_memory, priors_of
-from .snapshot_builder import entities_of, relations_of, searched_views, sensors_of
+from .snapshot_builder import entities_of, searched_views, sensors_of
 from .step import (
     NEWS_HOLDS_NS,
     FilterModel,
@@ -179,14 +179,12 @@ class WorldFilter:
     def state(self) -> WorldState:
         """The snapshot S_t."""
         memory, context, settings = self._memory, self.context, self.settings
-        sides, sensors, tracks = memory.sides, sensors_of(memory), published(memory.tracks, settings)
+        sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
             entities=entities_of(tracks, memory, self._model.site),
-            relations=tuple(
-                edge for track in tracks for edge in relations_of(track, sides, context, memory.stamp_ns)
-            ),
+            relations=relations_at(memory, tracks, context),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
             cues=cues_of(memory, self._model, self.risk, sensors),
             calibrated=self.policy.alpha > 0.0,

@@ -14,7 +14,7 @@ from worldstate.belief.track import Track
 from worldstate.ground.serialisation import ADDED, Count
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
-from worldstate.state import Context, Event, Priors
+from worldstate.state import Context, Event, Priors, Relation
 
 from .sequence_memory import SequenceMemory
 
@@ -69,6 +69,7 @@ class Memory:
     no_sequence: NotUsable | None = None  # Why the last one that should have said so could not
     advised_ns: tuple[int | None, ...] = ()  # Since when an advisory has been out on each side
     events: tuple[Event, ...] = ()  # Of the last measurement
+    relations: tuple[Relation, ...] = ()  # Then, with the intervals in which they have held
 
     @property
     def sides(self) -> HiddenBelief:

@@ -14,19 +14,17 @@ from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
-from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track
 from worldstate.ground.values import seconds
 from worldstate.state import (
     Classification,
     Context,
     Entity,
-    Relation,
     SearchedView,
     SensorHealth,
     Visibility,
 )
-from worldstate.state.relation import EGO
 
 from .forecast import Forecast, forecasts
 from .memory import CountedLook, Memory
@@ -153,20 +151,6 @@ def hidden_azimuth(
     # Sound round a corner comes from its edge, not from the vehicle; averaging over hops does not remove
     # that.
     return motion.azimuth_rad, math.hypot(motion.azimuth_std_rad, site.settings.hidden_bias_std_rad)
-
-
-def relations_of(track: Track, sides: HiddenBelief, context: Context, stamp_ns: int) -> list[Relation]:
-    """Return the relations of one entity to its occluder and to the ego vehicle."""
-    occluder, edges = context.occluders[track.side].id, []
-    if not track.seen:
-        share = hidden_share(track, sides)
-        edges.append(Relation(track.id, occluder, "occluded_by", share, stamp_ns))
-    elif track.was_hidden:
-        edges.append(Relation(track.id, occluder, "emerged_from", 1.0, stamp_ns))
-    if track.approach_heard:
-        deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
-        edges.append(Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns))
-    return edges
 
 
 def _place(track: Track, range_m: float | None, hidden: bool, site: SiteGeometry) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from worldstate.measurement.measurement import Look, Measurement
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context
 
-from .entity_events import events_between, halves_of_one, published
+from .entity_events import events_between, halves_of_one, published, relations_at
 from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
 from .sequence_memory import carried, informed
 
@@ -236,12 +236,12 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     settings, last = model.site.settings, _last_look(memory, scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    found = position_update(
+    seen, births = position_update(
         memory.tracks, memory.explanation, scan, weight, memory.sighted, memory.births, model.site
     )
-    memory = _after_look(memory, found.seen, scan.stamp_ns, model)
+    memory = _after_look(memory, seen, scan.stamp_ns, model)
     looks = _with_look(memory, _scan_look(scan))
-    memory = replace(memory, births=found.births, looks=looks, seq=memory.seq + 1)
+    memory = replace(memory, births=births, looks=looks, seq=memory.seq + 1)
     chances = announced(memory.tracks, model.site)
     if not any(chances):
         # Whoever has come into view, or is gone, ends the rule of the source that announced it.
@@ -445,4 +445,5 @@ def chronicled(before: Memory, carried: Memory, after: Memory, model: FilterMode
         tracks = tuple(one for one in tracks if one.id not in halves)
     known, now = (published(one, model.site.settings) for one in (before.tracks, tracks))
     events = events_between(known, now, after.stamp_ns, into | halves)
-    return replace(after, tracks=tracks, advised_ns=advised_ns, events=events)
+    relations = relations_at(replace(after, relations=before.relations), now, model.context)
+    return replace(after, tracks=tracks, advised_ns=advised_ns, events=events, relations=relations)

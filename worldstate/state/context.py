@@ -54,16 +54,9 @@ class Rates:
             in_range(field.name, getattr(self, field.name), 0.0, 1e3)
 
     @property
-    def values_hz(self) -> tuple[float, float, float, float, float, float]:
+    def values_hz(self) -> tuple[float, ...]:
         """All six in the order of the fields."""
-        return (
-            self.arrival_hz,
-            self.emergence_hz,
-            self.departure_hz,
-            self.reocclusion_hz,
-            self.visible_arrival_hz,
-            self.visible_departure_hz,
-        )
+        return tuple(getattr(self, field.name) for field in fields(self))
 
 
 @dataclass(frozen=True, slots=True)

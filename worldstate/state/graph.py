@@ -17,7 +17,7 @@ def scene_graph(
     """Return a networkx MultiDiGraph, nodes keyed by id, edges by the kind of relation.
 
     A node carries ``type`` (``"ego"``, ``"occluder"`` or ``"entity"``) and the object as ``value``; an edge
-    carries ``probability`` and ``stamp_ns``.
+    carries ``probability``, ``stamp_ns``, ``since_ns`` and ``until_ns``.
 
     Parameters
     ----------
@@ -49,6 +49,6 @@ def scene_graph(
     for entity in entities:
         graph.add_node(entity.id, type="entity", value=entity)
     for edge in relations:
-        attributes = {"probability": edge.probability, "stamp_ns": edge.stamp_ns}
-        graph.add_edge(edge.src, edge.dst, key=edge.kind, **attributes)
+        names = ("probability", "stamp_ns", "since_ns", "until_ns")
+        graph.add_edge(edge.src, edge.dst, key=edge.kind, **{name: getattr(edge, name) for name in names})
     return graph

@@ -21,6 +21,9 @@ class Relation:
         Probability that it holds, given that both ends exist.
     stamp_ns : int
         Time of the belief, ns.
+    since_ns, until_ns : int or None
+        Interval in which the probability was last at least .5, ns; the first is None if it never was, the
+        second while it is. Both are forgotten five seconds after its end.
 
     Examples
     --------
@@ -33,3 +36,5 @@ class Relation:
     kind: str
     probability: Probability
     stamp_ns: int
+    since_ns: int | None = None
+    until_ns: int | None = None
