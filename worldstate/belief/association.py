@@ -93,8 +93,11 @@ def association_probabilities(log_ratios: FloatArray, found: Mapping[int, int]) 
     >>> association_probabilities(np.log([[3.0, 1.0]]), {}).round(3)
     array([[0.6, 0.2]])
     """
-    chances = np.zeros_like(log_ratios)
-    for rows, columns in _groups(log_ratios > FORBIDDEN):
+    gated, chances = log_ratios > FORBIDDEN, np.zeros_like(log_ratios)
+    # Pairs that compete with nobody, which most are, all at once.
+    alone = gated & (gated.sum(axis=0) == 1) & (gated.sum(axis=1) == 1)[:, None]
+    chances[alone] = np.exp(-np.logaddexp(0.0, -log_ratios[alone]))
+    for rows, columns in _groups(gated & ~alone):
         events = _joint_events(len(rows), len(columns))
         if events is None:
             shared = [column for column in columns if column in found]
