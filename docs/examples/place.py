@@ -3,10 +3,10 @@
 import numpy as np
 
 from worldstate import WorldFilter, WorldState
+from worldstate.adapters.place.place_filter import PlaceFilter
+from worldstate.adapters.place.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate.adapters.place.spectrum_model import SpectrumModel, StreetWalls
 from worldstate.frontend import MicrophoneArray
-from worldstate.place.place_filter import PlaceFilter
-from worldstate.place.place_measurements import PlaceMeasurements, SpatialSpectrum
-from worldstate.place.spectrum_model import SpectrumModel, StreetWalls
 
 AZIMUTHS = np.radians(np.linspace(90.0, -90.0, 61))
 ARRAY = MicrophoneArray([[x, y, 0.0] for x in (-0.2, 0.0, 0.2) for y in (-0.3, -0.1, 0.1, 0.3)])

@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from worldstate.adapters.place.estimate import KnownPlace
+from worldstate.adapters.place.place_filter import PlaceBelief, PlaceFilter
+from worldstate.adapters.place.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate.adapters.place.sound_paths import sound_paths
+from worldstate.adapters.place.spectrum_model import SpectrumModel
+from worldstate.adapters.place.street_walls import StreetWalls
 from worldstate.frontend import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Measurement, PositionScan
-from worldstate.place.estimate import KnownPlace
-from worldstate.place.place_filter import PlaceBelief, PlaceFilter
-from worldstate.place.place_measurements import PlaceMeasurements, SpatialSpectrum
-from worldstate.place.sound_paths import sound_paths
-from worldstate.place.spectrum_model import SpectrumModel
-from worldstate.place.street_walls import StreetWalls
 from worldstate.studies.places.place_exam import followed_places
 from worldstate.studies.places.simulated_passes import simulated_pass
 

@@ -18,9 +18,9 @@ from worldstate.ground.version import __version__
 COMMANDS = (
     "users.demo",
     "users.run",
-    "users.explain",
-    "users.replay",
-    "users.plot",
+    "logs.explain",
+    "logs.replay",
+    "logs.plot",
     "users.bearings",
     "users.doctor",
     "users.bounds",

@@ -14,7 +14,7 @@ from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Approach, Bearing
 from worldstate.measurement.position import Position
 
-from .geometry import azimuth, cartesian, closing_rate, in_ego_axes, log_range, mirrored
+from .geometry import azimuth, cartesian, closing_rate, in_ego_axes, log_range, reflected_place
 from .observations import AngularHeight, Odometry, PastEdge, Range, ReflectedBearing
 from .settings import SmoothingSettings
 from .vector_factor import Factor, NoiseModel, vector_factor
@@ -174,7 +174,7 @@ def reflected_factor(
 
     def error(*values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
         place, slope = node.placed(values[0])
-        image, by_place, by_wall = mirrored(place, values[-1])
+        image, by_place, by_wall = reflected_place(place, values[-1])
         local, turn, by_pose = in_ego_axes(image, values[1] if len(values) > _PLANE else _STANDING)
         found, toward = azimuth(local)
         slopes = [toward @ turn @ by_place @ slope, toward @ by_pose][: len(values) - 1]

@@ -98,7 +98,7 @@ def log_range(place: FloatArray) -> tuple[float, FloatArray]:
     return 0.5 * math.log(square), np.array([[x / square, y / square, 0.0, 0.0]])
 
 
-def mirrored(place: FloatArray, wall: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def reflected_place(place: FloatArray, wall: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     r"""Return the image of a place in a wall, and its derivatives by place and wall.
 
     The wall is (phi, d), the line :math:`n \cdot p = d` with the normal n at azimuth phi:
@@ -107,7 +107,7 @@ def mirrored(place: FloatArray, wall: FloatArray) -> tuple[FloatArray, FloatArra
 
     Examples
     --------
-    >>> image, _, _ = mirrored(np.array([5.0, 2.0, 0.0, -4.0]), np.array([0.0, 8.0]))
+    >>> image, _, _ = reflected_place(np.array([5.0, 2.0, 0.0, -4.0]), np.array([0.0, 8.0]))
     >>> image.round(3).tolist()
     [11.0, 2.0, 0.0, -4.0]
     """

@@ -11,11 +11,11 @@ from types import MappingProxyType
 import numpy as np
 
 from worldstate.adapters.datasets.spatial_spectra import AZIMUTHS_RAD
+from worldstate.adapters.place.spectrum_model import SpectrumModel
+from worldstate.adapters.place.street_walls import StreetWalls
 from worldstate.adapters.simulation.scene.junction import Site
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import FloatArray
-from worldstate.place.spectrum_model import SpectrumModel
-from worldstate.place.street_walls import StreetWalls
 
 _ASIDE_M, _AHEAD_M = (0.338, 0.162, -0.162, -0.338), (-0.192, -0.06, 0.06, 0.192)
 ROOF_ARRAY = MicrophoneArray(np.array([[x, y, 0.0] for x in _AHEAD_M for y in _ASIDE_M]), "roof array of 16")

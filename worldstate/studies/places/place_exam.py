@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.datasets.spatial_spectra import AZIMUTHS_RAD, SpectrumTable, read_spectra
+from worldstate.adapters.place.estimate import KnownPlace, PlaceEstimate
+from worldstate.adapters.place.place_filter import PlaceFilter
+from worldstate.adapters.place.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate.adapters.place.street_walls import StreetWalls
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import nanoseconds
-from worldstate.place.estimate import KnownPlace, PlaceEstimate
-from worldstate.place.place_filter import PlaceFilter
-from worldstate.place.place_measurements import PlaceMeasurements, SpatialSpectrum
-from worldstate.place.street_walls import StreetWalls
 
 from .junctions import SIMULATED, WALLS, place_models
 from .ray_model import RayModel

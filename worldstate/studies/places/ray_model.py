@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.adapters.datasets.spatial_spectra import AZIMUTHS_RAD
+from worldstate.adapters.place.sound_paths import sound_paths
+from worldstate.adapters.place.street_walls import StreetWalls
 from worldstate.ground.typing import FloatArray
-from worldstate.place.sound_paths import sound_paths
-from worldstate.place.street_walls import StreetWalls
 
 # Constant weights of direct, bent and once reflected rays.
 DIRECT, BENT, REFLECTED = 1.0, 0.5, 0.5

@@ -58,8 +58,8 @@ class PlaceMeasurements:
     --------
     >>> import numpy as np
     >>> from worldstate.frontend import MicrophoneArray
-    >>> from worldstate.place.spectrum_model import SpectrumModel
-    >>> from worldstate.place.street_walls import StreetWalls
+    >>> from worldstate.adapters.place.spectrum_model import SpectrumModel
+    >>> from worldstate.adapters.place.street_walls import StreetWalls
     >>> array = MicrophoneArray([[x, y, 0.0] for x in (0.0, 0.12) for y in (-0.3, -0.1, 0.1, 0.3)])
     >>> azimuths, walls = np.radians(np.linspace(90.0, -90.0, 37)), StreetWalls(4.45, 2.8, 2.8, 7.15)
     >>> frequencies = np.arange(300.0, 2000.0, 300.0)
