@@ -33,9 +33,7 @@ def events_between(
 ) -> tuple[Event, ...]:
     """Return what became of every entity, those that were there before first; `into` by merged ids."""
     known, left = {track.id: track for track in before}, {track.id: track for track in after}
-    kinds = {
-        name: "merged" if name in into else _became(track, left.get(name)) for name, track in known.items()
-    }
+    kinds = {name: "merged" if name in into else _became(one, left.get(name)) for name, one in known.items()}
     kinds |= {name: "born" for name in left if name not in known}
     events = (Event(stamp_ns, kind, name, into.get(name)) for name, kind in kinds.items() if kind is not None)
     return tuple(events)[:MOST_EVENTS]
@@ -48,9 +46,7 @@ def halves_of_one(before: Memory, after: Memory) -> dict[str, str]:
     """
     still = {one.id for one in after.tracks if one.detected or hidden_share(one, after.sides) >= _HIDDEN}
     halves = [one for one in before.tracks if not one.detected and one.id not in still]
-    sides = {
-        k for k, ns in enumerate(after.handover_ns) if ns is not None and after.stamp_ns - ns <= _HALF_NS
-    }
+    sides = {k for k, ns in enumerate(after.handover_ns) if ns and after.stamp_ns - ns <= _HALF_NS}
     seen = [one for one in after.tracks if one.seen and one.was_hidden]
     latest = max(seen, key=lambda one: one.last_seen_ns or 0, default=None)
     return {} if latest is None else {one.id: latest.id for one in halves if sides - {one.side}}
@@ -61,8 +57,7 @@ def _became(before: Track, after: Track | None) -> EventKind | None:
         return "died"
     if before.seen != after.seen:
         return "handed_over" if after.seen else "hidden_again"
-    lost = after.seen and before.answer == "visible" != after.answer
-    return "coasting" if lost else None
+    return "coasting" if after.seen and before.answer == "visible" != after.answer else None
 
 
 def relations_at(memory: Memory, tracks: Sequence[Track], context: Context) -> tuple[Relation, ...]:
