@@ -7,7 +7,8 @@ from .stream_exam import ExaminedStream, examine
 
 Figures = dict[str, float | int | None]
 # What OVAD's 56 microphones reach with the model that ships, in 395 loud approaches and six hours without
-# hazards (seeds 1 to 3 of the exam; docs/commission.md): its window model knows real windows of these junctions.
+# hazards (seeds 1 to 3 of the exam; docs/commission.md). Its window model knows real windows of these
+# junctions.
 REFERENCE: Mapping[str, float] = {
     "detected": 0.924,
     "lead_s": 2.2,
