@@ -44,7 +44,7 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     noise = np.random.default_rng(1).standard_normal((6000 * 25, 4)) * 0.01
     soundfile.write(quiet, noise, 6000, subtype="FLOAT")
     assert main([*command, "--no-exam", "--quiet", str(quiet)]) == 2
-    assert "expected 0.15 hours" in capsys.readouterr().err
+    assert "expected 0.10 hours" in capsys.readouterr().err
     assert main([*command, "--no-exam", "--quiet", str(quiet), "--onsets", "600"]) == 0
     told = read_model(out).sequence
     assert told is not None and told.alarm is not None and told.alarm.onsets_per_hour == 600.0

@@ -144,7 +144,7 @@ def recording(tmp_path):
     boxes, camera, sound = tmp_path / "boxes.json", tmp_path / "camera.json", folder / "street.wav"
     boxes.write_text(json.dumps({"detections_per_frame": rows}))
     camera.write_text(json.dumps({"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75}))
-    soundfile.write(sound, rng.uniform(-0.01, 0.01, (2000 * 25, 56)), 2000)
+    soundfile.write(sound, rng.uniform(-0.01, 0.01, (4000 * 25, 56)), 4000)
     return ["label", str(sound), "--detections", str(boxes), "--camera", str(camera)]
 
 
