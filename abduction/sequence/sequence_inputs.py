@@ -75,6 +75,7 @@ class HopEvidence:
 
 
 _BANDS = tuple(f"band_{number}" for number in range(1, BANDS + 1))
+_BAND_INPUTS = tuple(f"{name}{before}" for before in ("", "_1s", "_2s") for name in _BANDS)
 INPUTS = (
     *("this", "this_above", "this_1s", "this_2s", "this_before", "this_highest"),
     *("other", "other_above", "other_1s", "other_2s", "other_highest"),
@@ -86,7 +87,7 @@ INPUTS = (
     *("prominence", "prominence_1s"),
     *("approach", "approach_std"),
     *("bearing", "bearing_1s", "bearing_spread"),
-    *(f"{name}{ago}" for ago in ("", "_1s", "_2s") for name in _BANDS),
+    *_BAND_INPUTS,
 )
 
 
@@ -111,7 +112,7 @@ _EVERY = (
     *("prominence", "prominence_1s", "approach", "approach_std"),
     *("bearing", "bearing_1s", "bearing_spread"),
     *("left_mean", "right_mean", "lean", "lean_1s", "lean_3s"),
-    *(f"{name}{ago}" for ago in ("", "_1s", "_2s") for name in _BANDS),
+    *_BAND_INPUTS,
 )
 
 

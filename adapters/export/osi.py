@@ -10,6 +10,7 @@ from typing import Any
 
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.errors import MissingExtraError
+from worldstate.ground.values import seconds
 from worldstate.state import WorldState
 
 from .autoware import CAR_M, LABELS, SIZES_M, likeliest_label
@@ -66,7 +67,7 @@ def _fill(moving: Any, one: LaneObject) -> None:
     # OSI counts in 64 bits, of which the highest marks a value that is not set.
     header.tracking_id.value = uuid.UUID(entity.id).int & (1 << 63) - 1
     header.existence_probability = entity.existence_probability
-    header.age = 1e-9 * (entity.updated_ns - entity.created_ns)
+    header.age = seconds(entity.updated_ns - entity.created_ns)
     predicted = entity.status == "hidden" or not one.measured
     header.measurement_state = (
         header.MEASUREMENT_STATE_PREDICTED if predicted else header.MEASUREMENT_STATE_MEASURED

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from worldstate.core.snapshot_builder import NINE_OF_TEN
 from worldstate.ground.typing import FloatArray
 from worldstate.state import Entity, Occluder, RiskCue, SearchedView, WorldState
 
@@ -26,8 +27,6 @@ from .scene_messages import (
 
 # How far a sector is drawn. Sound gives no distance: the radius only tells the layers apart.
 SECTOR_M, SEARCHED_M, CUE_M, SRP_M = 30.0, 15.0, 24.0, 12.0
-# Half of an interval that holds nine of ten of a normal deviate, in standard deviations.
-NINE_OF_TEN = 1.645
 # Of the sectors that are drawn in one plane the later lie higher, or a viewer lets them flicker.
 _HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
 # Triangles of a sector span at most this.
@@ -89,6 +88,13 @@ def sector_of(
     return sector_rad or (azimuth_rad - half_rad, azimuth_rad + half_rad)
 
 
+def hidden_sector(occluder: Occluder) -> tuple[float, float]:
+    """Return where behind an occluder's edge somebody is in nine of ten cases, from right to left."""
+    edge_rad, hidden_rad = occluder.edge_azimuth_rad, occluder.hidden_azimuth_rad
+    far_rad = hidden_rad + math.copysign(NINE_OF_TEN * occluder.hidden_std_rad, hidden_rad - edge_rad)
+    return min(edge_rad, far_rad), max(edge_rad, far_rad)
+
+
 def label_of(entity: Entity) -> str:
     """Return the likeliest class of an entity and its existence probability.
 
@@ -108,13 +114,10 @@ def _ego() -> SceneArrow:
 
 def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
     """Draw the edge as a line and what lies behind it as a sector."""
-    far_rad = occluder.hidden_azimuth_rad
-    far_rad += math.copysign(NINE_OF_TEN * occluder.hidden_std_rad, far_rad - occluder.edge_azimuth_rad)
-    sides = sorted((occluder.edge_azimuth_rad, far_rad))
     edge = SceneLine(
         0, (_at(occluder.edge_azimuth_rad, 4.0), _at(occluder.edge_azimuth_rad, SECTOR_M)), _ink(_GREY)
     )
-    behind = _sector((sides[0], sides[1]), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
+    behind = _sector(hidden_sector(occluder), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
     pairs = _pairs(direction=occluder.direction, assumed=occluder.assumed)
     return _item(state, f"occluder {occluder.id}", metadata=pairs, lines=(edge,), triangles=(behind,))
 

@@ -8,7 +8,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.position import Position, PositionScan
 
@@ -75,7 +75,7 @@ class PlaceMeasurements:
     def __init__(self, places: PlaceFilter, interval_s: float = 1.0) -> None:
         self.source = "place"
         self._places = places
-        self._interval_ns = round(in_range("interval_s", interval_s, 0.1, 10.0) * NANOSECONDS_PER_SECOND)
+        self._interval_ns = nanoseconds(in_range("interval_s", interval_s, 0.1, 10.0))
         self._heard = self._carried = places.unknown
         self._begin_ns: int | None = None
         self._last_ns = 0
@@ -109,7 +109,7 @@ class PlaceMeasurements:
             raise InvalidArgumentError(
                 f"stamp_ns: expected one after {self._last_ns}, got {spectrum.stamp_ns}"
             )
-        dt_s = (spectrum.stamp_ns - self._last_ns) / NANOSECONDS_PER_SECOND
+        dt_s = seconds(spectrum.stamp_ns - self._last_ns)
         self._heard = self._places.update(self._places.predict(self._heard, dt_s), spectrum.values)
         self._carried = self._places.predict(self._carried, dt_s)
         self._last_ns = spectrum.stamp_ns

@@ -18,7 +18,7 @@ from .memory import Memory
 MOST_EVENTS = 64
 # A window of sound, and the second for which an advisory holds an entity that is no longer heard.
 _HALF_NS = nanoseconds(2.0)
-_HIDDEN = _HOLDS = 0.5
+HIDDEN = _HOLDS = 0.5  # P(hidden | exists) from which on an entity is said to be; as relations hold
 _KEPT_NS = nanoseconds(5.0)  # Of a relation that has ended
 
 
@@ -44,7 +44,7 @@ def halves_of_one(before: Memory, after: Memory) -> dict[str, str]:
 
     Within two seconds of that they have ended, or sound as if they were in view.
     """
-    still = {one.id for one in after.tracks if one.detected or hidden_share(one, after.sides) >= _HIDDEN}
+    still = {one.id for one in after.tracks if one.detected or hidden_share(one, after.sides) >= HIDDEN}
     halves = [one for one in before.tracks if not one.detected and one.id not in still]
     sides = {k for k, ns in enumerate(after.handover_ns) if ns and after.stamp_ns - ns <= _HALF_NS}
     seen = [one for one in after.tracks if one.seen and one.was_hidden]

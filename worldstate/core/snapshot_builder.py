@@ -35,7 +35,7 @@ from .step import NEWS_HOLDS_NS
 _KNOWN_LOG_RANGE_STD = 0.25
 # A lane and a half, and a change of pace: beyond, a number would be taken for more than it says.
 _KNOWN_POSITION_STD_M, _KNOWN_VELOCITY_STD_MPS = 5.0, 5.0
-_NINE_OF_TEN = 1.645  # Standard deviations to either side
+NINE_OF_TEN = 1.645  # Standard deviations to either side
 _ROUNDING = 1e-9
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
 # Of what is published: numbers in full precision take twice as long to write.
@@ -119,7 +119,7 @@ def _classes(track: Track) -> tuple[Classification, ...]:
 
 def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
     """Return the sector that holds nine of ten, from its right end to its left one."""
-    half_rad = _NINE_OF_TEN * std_rad
+    half_rad = NINE_OF_TEN * std_rad
     if half_rad >= math.pi:
         return -math.pi, math.pi
     # wrap_angle goes through arrays, which takes ten times as long for one number.
@@ -180,7 +180,7 @@ def visible_in(track: Track, site: SiteGeometry) -> tuple[float, float, float] |
     if expected is None:
         return None
     mean_s, std_s = expected
-    return max(mean_s - _NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + _NINE_OF_TEN * std_s
+    return max(mean_s - NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + NINE_OF_TEN * std_s
 
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:

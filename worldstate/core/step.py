@@ -30,7 +30,7 @@ from worldstate.measurement.measurement import Look, Measurement
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context
 
-from .entity_events import events_between, halves_of_one, published, relations_at
+from .entity_events import HIDDEN, events_between, halves_of_one, published, relations_at
 from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
 from .sequence_memory import carried, informed
 
@@ -39,7 +39,6 @@ _TIE = 1e-9
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
 _MOST_CERTAIN = 0.999  # Of a message
-_HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
 _NO_LOOK = Unqueried("sound alone")
 
 
@@ -420,7 +419,7 @@ def _on_their_way(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry)
     coming, shares = kept.coming, [hidden_share(one, sides) for one in tracks]
     return tuple(
         replace(one, motion=hidden_motion(coming[one.side], share, site.sides[one.side], one.motion))
-        if not one.seen and one.place is None and share >= _HIDDEN
+        if not one.seen and one.place is None and share >= HIDDEN
         else one
         for one, share in zip(tracks, shares, strict=True)
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from worldstate.belief.site_geometry import normal_share
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
@@ -222,7 +223,7 @@ def beyond_edge(node: Node, side: int, *values: FloatArray) -> tuple[float, list
 
 def _sight_error(u: float, one: PastEdge) -> tuple[float, float]:
     """Return the error of a look and its derivative by u."""
-    in_sight, density = 0.5 * math.erfc(u / math.sqrt(2.0)), math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi)
+    in_sight, density = normal_share(-u), math.exp(-0.5 * u * u) / math.sqrt(2.0 * math.pi)
     gain = one.detection_probability - one.clutter_rate
     found = one.clutter_rate + gain * in_sight
     # Relative to the most likely case, so that the error is 0 where the look says nothing new.

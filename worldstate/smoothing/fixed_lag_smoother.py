@@ -270,7 +270,7 @@ class FixedLagSmoother:
         if not crossed:
             return None
         i = crossed[-1]
-        step_s = 1e-9 * (stamps[i] - stamps[i - 1])
+        step_s = seconds(stamps[i] - stamps[i - 1])
         share, rate = beyond[i - 1] / (beyond[i - 1] - beyond[i]), (beyond[i - 1] - beyond[i]) / step_s
         spread = refined.joint_covariance(one.keys[stamps[i]], edge.key)
         std_s = math.sqrt(slopes[i] @ spread @ slopes[i]) / rate

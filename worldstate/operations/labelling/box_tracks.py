@@ -11,6 +11,7 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.static_boxes import ParkedRule, kept_and_parked
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import seconds
 from worldstate.operations.metrics.assignment import gated_pairs
 
 # A vehicle three metres ahead at 10 m/s turns by a fifth of a radian from image to image; boxes of two
@@ -91,7 +92,7 @@ def _moving_boxes(
     focal_px = 0.5 * camera.width_px / math.tan(camera.half_angle_rad)
     for number, stamp_ns in enumerate(log.stamps_ns.tolist()):
         kept, still = kept_and_parked(log, number, keep, ParkedRule())
-        frame, boxes = log.frames[number], []
+        frame, time_s, boxes = log.frames[number], seconds(stamp_ns), []
         for i in np.asarray(kept)[~still].tolist():
             left_px, top_px, right_px, bottom_px = frame.boxes_px[i].tolist()
             edges = camera.azimuth(np.clip([left_px, right_px], 0.0, camera.width_px))
@@ -99,7 +100,7 @@ def _moving_boxes(
             whole = top_px > _BORDER_PX and bottom_px < camera.height_px - _BORDER_PX
             boxes.append(
                 _Box(
-                    stamp_ns * 1e-9,
+                    time_s,
                     float(edges[0]) if left_px > _BORDER_PX else math.nan,
                     float(edges[1]) if right_px < camera.width_px - _BORDER_PX else math.nan,
                     middle,
@@ -107,7 +108,7 @@ def _moving_boxes(
                     frame.labels[i],
                 )
             )
-        yield stamp_ns * 1e-9, boxes
+        yield time_s, boxes
 
 
 def _predicted(boxes: list[_Box], time_s: float) -> float:

@@ -84,38 +84,23 @@ def window_rows(
             if label == FRONT and not in_view[np.abs(time_s - end_s) < 0.5].any():
                 continue
             frame, std_s = round(one.t0.time_s * FRAME_RATE_HZ), round(one.t0.std_s, 3)
-            rows.append(
-                (
-                    f"{number}{label}",
-                    label,
-                    environment,
-                    f"{file}:{number}",
-                    file,
-                    round(end_s, 2),
-                    frame,
-                    std_s,
-                )
-            )
+            rows.append((*_window(label, environment, file, str(number), "", end_s), frame, std_s))
     entries = np.array([one.t0.time_s for one in passes])
     last = -np.inf
     for end_s in time_s.tolist():
         coming = ((entries >= end_s - 1.0) & (entries <= end_s + CALM_S)).any()
         busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s)].any()
         if end_s - last >= NONE_EVERY_S and end_s <= time_s[-1] - CALM_S and not (coming or busy):
-            rows.append(
-                (
-                    f"{end_s:.0f}none",
-                    "none",
-                    environment,
-                    f"{file}:{end_s:.0f}s",
-                    file,
-                    round(end_s, 2),
-                    "",
-                    "",
-                )
-            )
+            rows.append((*_window("none", environment, file, f"{end_s:.0f}", "s", end_s), "", ""))
             last = end_s
     return rows
+
+
+def _window(
+    label: str, environment: str, file: str, number: str, unit: str, end_s: float
+) -> tuple[object, ...]:
+    """Return what all windows have in their row; of those of nobody the number is a time."""
+    return f"{number}{label}", label, environment, f"{file}:{number}{unit}", file, round(end_s, 2)
 
 
 def file_below(sound: Path, labels: Path) -> str:

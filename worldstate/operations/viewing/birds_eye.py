@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, label_of, sector_of
+from worldstate.adapters.export.scene import CUE_M, SEARCHED_M, SECTOR_M, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import seconds
@@ -87,9 +87,8 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
 
 
 def _draw_occluder(axes: "Axes", occluder: Occluder) -> None:
-    edge, hidden = occluder.edge_azimuth_rad, occluder.hidden_azimuth_rad
-    far = hidden + math.copysign(1.645 * occluder.hidden_std_rad, hidden - edge)
-    _wedge(axes, (min(edge, far), max(edge, far)), SECTOR_M, "0.5", 0.13)
+    edge = occluder.edge_azimuth_rad
+    _wedge(axes, hidden_sector(occluder), SECTOR_M, "0.5", 0.13)
     axes.plot(*zip(_at(edge, 4.0), _at(edge, SECTOR_M), strict=True), color="0.3", lw=2)
 
 

@@ -23,7 +23,7 @@ def stream_detections(
 ) -> DetectionLog:
     """Return the boxes of everybody in view, missed as often as the paper's detector misses them."""
     camera = camera or PinholeCamera()
-    site = junction_named(str(heard.hops.about["site"]))
+    site = junction_named(heard.site)
     frames: dict[int, list[tuple[FloatArray, float, str]]] = {}
     kinds = dict(zip(heard.vehicles.vehicle.tolist(), heard.vehicles.kind.tolist(), strict=True))
     for number, name in kinds.items():

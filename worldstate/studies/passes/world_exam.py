@@ -47,7 +47,7 @@ def passed_stream(
         If the model has no sequence, as `commission` makes one.
     """
     heard, measured = stream_measurements(path, model, camera, seed)
-    context = known_context(str(heard.hops.about["site"])) if known_place else Context()
+    context = known_context(heard.site) if known_place else Context()
     world = WorldFilter(context, model.policies.for_alpha(alpha))
     return PassedStream(heard, stream_truth(heard), followed(world, measured))
 

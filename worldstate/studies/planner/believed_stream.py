@@ -80,7 +80,7 @@ def with_chances(heard: HeardStream, chances: HopTable) -> BelievedStream:
         time_s=chances.time_s,
         within=np.nan_to_num(chances.within, nan=1.0),
         heard=heard,
-        site=junction_named(str(heard.hops.about["site"])),
+        site=junction_named(heard.site),
         ways=tuple(_way(heard, i) for i in np.flatnonzero(heard.vehicles.hazard).tolist()),
         others=heard.vehicles.vehicle[~heard.vehicles.hazard],
     )
