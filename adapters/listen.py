@@ -41,6 +41,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.protocols import CoEvidenceChannel
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
 
@@ -142,8 +143,8 @@ class Source:
 
     Parameters
     ----------
-    sound : Path, tuple of Path or RawPcm
-        Multichannel sound file, a file a microphone, or a pipe.
+    sound : Path, tuple of Path, RawPcm or Audio
+        Multichannel sound file, a file a microphone, a pipe, or an open recording such as `LiveSound`.
     array : MicrophoneArray
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
@@ -182,6 +183,8 @@ class Source:
         Reads who comes into view and when; or why the model's cannot be used here.
     history : SequenceHistory or None
         What it has heard beforehand, from a checkpoint.
+    co_evidence : CoEvidenceChannel or None
+        Asked in place of the detections: a camera that runs.
 
     Examples
     --------
@@ -217,6 +220,7 @@ class Source:
     road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None
     history: SequenceHistory | None = None
+    co_evidence: CoEvidenceChannel | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -242,7 +246,7 @@ class Source:
         return SequenceReader(known, self.history) if isinstance(known, SequenceModel) else known
 
     def camera_channel(self) -> VisionQuery:
-        """Return the camera as the channel that is asked for co-evidence."""
+        """Return the camera's detections as the channel that is asked for co-evidence."""
         rates = self.miss_rates
         return VisionQuery(
             self.camera,
@@ -317,9 +321,9 @@ def open_source(
 
     Parameters
     ----------
-    path : path, sequence of paths or RawPcm
-        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order, or
-        raw samples from a pipe.
+    path : path, sequence of paths, RawPcm or Audio
+        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
+        raw samples from a pipe, or an open recording.
     array : path or MicrophoneArray, optional
         Acoular XML, CSV or JSON as `read_array` reads them; that of the data set where not given, OVAD's
         where it names none; the model's own for a sound file of as many channels.
@@ -510,9 +514,9 @@ def listen(
 
     Parameters
     ----------
-    path : path, sequence of paths or RawPcm
-        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order, or
-        raw samples from a pipe.
+    path : path, sequence of paths, RawPcm or Audio
+        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
+        raw samples from a pipe, or an open recording.
     array, detections, detector, camera, miss_rates, model, context, settings
         As `open_source` takes them: files, or the objects that they hold.
 
@@ -645,7 +649,7 @@ def measure_steps(
             audio.sample_rate_hz,
             signature or source.signature(),
             start_ns=source.start_ns,
-            vision=source.camera_channel(),
+            vision=source.co_evidence or source.camera_channel(),
             grounding=source.settings.grounding,
             guard=source.guard,
             road_users=source.road_users,

@@ -80,12 +80,13 @@ class RawPcm:
         return flat.astype(np.float32, copy=False).reshape(-1, self.channels)
 
 
-SoundInput: TypeAlias = Path | tuple[Path, ...] | RawPcm
+# An open recording is one whose samples come from elsewhere, such as microphones that run.
+SoundInput: TypeAlias = Path | tuple[Path, ...] | RawPcm | Audio
 
 
 def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
     """Return a path, several or a pipe as such; one path in a sequence is that file."""
-    if isinstance(given, Path | RawPcm):
+    if isinstance(given, Path | RawPcm | Audio):
         return given
     paths = (Path(given),) if isinstance(given, str) else tuple(map(Path, given))
     if not paths:
@@ -97,6 +98,8 @@ def path_of(sound: SoundInput) -> Path:
     """Return the name of a recording: its file, the first of several, that of a pipe."""
     if isinstance(sound, RawPcm):
         return Path(sound.name)
+    if isinstance(sound, Audio):
+        return sound.path
     return sound if isinstance(sound, Path) else sound[0]
 
 
@@ -168,8 +171,9 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
 
     Parameters
     ----------
-    sound : Path, tuple of Path or RawPcm
-        A multichannel file, files of one channel each in the order of the microphones, or a pipe.
+    sound : Path, tuple of Path, RawPcm or Audio
+        A multichannel file, files of one channel each in the order of the microphones, a pipe, or what is
+        open already.
     expect_channels : int, optional
         Number of microphones of the array that it shall fit.
     strict : bool
@@ -177,7 +181,7 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
 
     Returns
     -------
-    AudioSource, MonoFiles or RawAudio
+    Audio
         Open, at its start.
 
     Raises
@@ -197,6 +201,9 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
     """
     if isinstance(sound, Path):
         return open_audio(sound, expect_channels, strict=strict)
+    if isinstance(sound, Audio):
+        sound.check_size(expect_channels)
+        return sound
     with ExitStack() as opened:
         audio = (
             RawAudio(sound)

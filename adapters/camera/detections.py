@@ -210,8 +210,7 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int
     with refused_as_file(name):
         for number, row in enumerate(rows):
             read = decode(_OvadFrame, row, f"frame {number}")
-            boxes_px = np.array(read.boxes, dtype=np.float64).reshape(-1, 4)
-            frames.append(DetectionFrame(boxes_px, np.array(read.scores), read.classes_str))
+            frames.append(read.frame())
             stamps.append(read.stamp_ns)
         if all(stamp is None for stamp in stamps):
             return DetectionLog.at_rate(frames, frame_rate_hz, start_ns, str(name))
@@ -237,3 +236,12 @@ class _OvadFrame:
             if left > right or top > bottom:
                 got = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
                 raise InvalidArgumentError(f"boxes: expected x1 <= x2 and y1 <= y2, got {got}")
+
+    def frame(self) -> DetectionFrame:
+        boxes_px = np.array(self.boxes, dtype=np.float64).reshape(-1, 4)
+        return DetectionFrame(boxes_px, np.array(self.scores), self.classes_str)
+
+
+def frame_of(record: object, where: str) -> DetectionFrame:
+    """Return the boxes of one image from OVAD's record of it; `where` names it in messages."""
+    return decode(_OvadFrame, record, where).frame()

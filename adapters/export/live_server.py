@@ -11,10 +11,11 @@ from .log_message import LogMessage, LogSink
 
 
 @contextmanager
-def live_server(port: int) -> Iterator[tuple[LogSink, int]]:
+def live_server(port: int, *, paced: bool = True) -> Iterator[tuple[LogSink, int]]:
     """Lend a function that sends messages to whoever is connected, and the port; 0 takes a free one.
 
-    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound.
+    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
+    not so where `paced` is False: microphones that run set the pace themselves.
     """
     try:
         import foxglove
@@ -34,7 +35,8 @@ def live_server(port: int) -> Iterator[tuple[LogSink, int]]:
         nonlocal begun_s
         stamp_s = seconds(message.stamp_ns)
         begun_s = time.monotonic() - stamp_s if begun_s is None else begun_s
-        time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
+        if paced:
+            time.sleep(max(begun_s + stamp_s - time.monotonic(), 0.0))
         if message.topic not in channels:
             schema = foxglove.Schema(name=message.schema_name, encoding="jsonschema", data=message.schema)
             channels[message.topic] = foxglove.Channel(

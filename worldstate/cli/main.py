@@ -18,6 +18,7 @@ from worldstate.ground.version import __version__
 COMMANDS = (
     "users.demo",
     "users.run",
+    "vehicle.live",
     "logs.explain",
     "logs.replay",
     "logs.plot",

@@ -8,17 +8,25 @@ if TYPE_CHECKING:
     from worldstate.adapters.camera.detections import DetectionFilter
     from worldstate.adapters.listen import Source
 
-HELP = """\
---detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. --camera takes JSON:
+DETECTIONS_HELP = """\
+--detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text."""
+LENS_HELP = """\
+--camera takes JSON:
 {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
 the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "position_m": [x, y, z] in base_link."""
 
 
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
     """Declare --detections, --camera, --miss-rates and which boxes count."""
-    parser.description = f"{parser.description}\n\n{HELP}"
-    add = parser.add_argument_group("camera").add_argument
-    add("--detections", type=Path, metavar="PATH", help="what its detector reported")
+    parser.description = f"{parser.description}\n\n{DETECTIONS_HELP} {LENS_HELP}"
+    group = parser.add_argument_group("camera")
+    group.add_argument("--detections", type=Path, metavar="PATH", help="what its detector reported")
+    add_lens_options(group)
+
+
+def add_lens_options(group: "argparse._ArgumentGroup") -> None:
+    """Declare --camera, --miss-rates and which boxes count."""
+    add = group.add_argument
     add("--camera", type=Path, metavar="JSON", help="its lens (default: OVAD's camera)")
     add("--min-box-px", type=float, default=100.0, metavar="PX", help="boxes must be higher (100)")
     add("--min-score", type=float, default=0.75, metavar="P", help="lowest score (0.75)")

@@ -55,8 +55,8 @@ class StateLogs:
 
 
 @contextmanager
-def open_logs(arguments: argparse.Namespace) -> Iterator[StateLogs]:
-    """Open every log that was asked for."""
+def open_logs(arguments: argparse.Namespace, *, paced: bool = True) -> Iterator[StateLogs]:
+    """Open every log that was asked for; `paced` plays what comes too soon at the speed of its stamps."""
     with ExitStack() as opened:
         logs = StateLogs()
         _open_stacks(arguments, logs, opened)
@@ -67,7 +67,7 @@ def open_logs(arguments: argparse.Namespace) -> Iterator[StateLogs]:
         if arguments.live is not None:
             from worldstate.adapters.export.live_server import live_server
 
-            send, port = opened.enter_context(live_server(arguments.live))
+            send, port = opened.enter_context(live_server(arguments.live, paced=paced))
             print(f"Foxglove: open connection ws://127.0.0.1:{port}", file=sys.stderr)
             logs.viewers.append(send)
         yield logs
@@ -96,9 +96,11 @@ def _open_stacks(arguments: argparse.Namespace, logs: StateLogs, opened: ExitSta
 
 
 @contextmanager
-def log_hops(arguments: argparse.Namespace, source: "Source") -> "Iterator[Callable[[Step], None]]":
+def log_hops(
+    arguments: argparse.Namespace, source: "Source", *, paced: bool = True
+) -> "Iterator[Callable[[Step], None]]":
     """Lend a function that logs a hop of a recording: state, power over azimuth, and the camera's image."""
-    with open_logs(arguments) as logs:
+    with open_logs(arguments, paced=paced) as logs:
         if not logs.viewers:
             yield lambda step: logs.state(step.state)
             return

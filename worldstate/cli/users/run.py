@@ -25,10 +25,10 @@ from worldstate.cli.common.array_options import (
     add_array_options,
     add_search_options,
     given_array,
-    search_of,
     stance,
 )
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
+from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
@@ -54,40 +54,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_sound_options(parser)
     add_array_options(parser)
     add_search_options(parser)
-    _add_model_options(parser)
+    add_listen_options(parser)
+    _add_recording_options(parser)
     add_camera_options(parser)
     _add_output_options(parser)
     add_log_options(parser)
 
 
-def _add_model_options(parser: argparse.ArgumentParser) -> None:
+def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--model", type=Path, help="model file (default: the one that ships)")
-    add("--alpha", type=float, default=0.02, help="false-positive budget (default: %(default)s)")
     add(
         "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
     )
-    add(
-        "--site-adaptation", action=argparse.BooleanOptionalAction, default=True,
-        help="learn what the site is like while listening (default: on)",
-    )  # fmt: skip
-    add("--forgetting", type=float, metavar="S", help="time constant of that, seconds (default: 300)")
-    add(
-        "--uncalibrated", action="store_true",
-        help="go on where the model was made for another array or rate; no cue states an alpha then",
-    )  # fmt: skip
-    grounded = "weigh the signature with bearing and approach, eq. (5) (default: off)"
-    add("--grounded", action="store_true", help=grounded)
-    ego_noise = "learn the own vehicle's noise while nothing is there and hear past it (default: off)"
-    add("--ego-noise", action="store_true", help=ego_noise)
     rpm = "columns time_s, rpm of the own engine: cancel its lines, with --ego-noise"
     add("--engine-rpm", type=Path, metavar="CSV", help=rpm)
     firings = "firings a turn: half the cylinders (default: %(default)g)"
     add("--engine-lines", type=float, default=2.0, metavar="N", help=firings)
-    place = (
-        "corners, lanes and rates of this place, JSON (default: a usual blind junction, and states say so)"
-    )
-    add("--context", type=Path, metavar="FILE", help=place)
     add("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
     add("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
 
@@ -136,21 +118,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _source(arguments: argparse.Namespace) -> "Source":
     from dataclasses import replace
 
-    from worldstate.adapters.acoustic_grounding import Grounding
-    from worldstate.adapters.files.context_file import read_context
     from worldstate.adapters.listen import open_source
 
-    settings = replace(
-        search_of(arguments),
-        alpha=arguments.alpha,
-        mask_dead=arguments.mask_dead,
-        site_adaptation=arguments.site_adaptation,
-        forgetting_s=arguments.forgetting,
-        grounding=Grounding() if arguments.grounded else None,
-        ego_noise=arguments.ego_noise,
-        boxes=boxes_of(arguments),
-        uncalibrated=arguments.uncalibrated,
-    )
+    settings = replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes_of(arguments))
     return open_source(
         sound_of(arguments),
         array=given_array(arguments),
@@ -158,7 +128,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         camera=arguments.camera,
         miss_rates=arguments.miss_rates,
         model=arguments.model,
-        context=None if arguments.context is None else read_context(arguments.context),
+        context=given_context(arguments),
         resume=arguments.resume,
         start_s=arguments.start,
         engine=_engine(arguments),

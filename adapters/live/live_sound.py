@@ -1,0 +1,164 @@
+"""Sound as it comes: blocks with the time of their capture; what is lost is filled with zeros and counted."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from worldstate.adapters.audio.sound_file import Audio
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import Float32Array
+from worldstate.ground.values import nanoseconds
+
+from .bounded_channel import BoundedChannel
+
+# Blocks a second that a source gives. The state of a hop that ends within one waits for its end, 25 ms at most,
+# and not at all where hops are whole blocks, as at 48 kHz.
+BLOCKS_PER_SECOND = 40
+# Seconds of sound that wait at most. A short stall of the machine is made up for; a state that comes later
+# than this warns nobody, and what is older is dropped.
+LONGEST_WAIT_S = 2.0
+# A longer gap is no lost block but a device that slept: its zeros would take minutes to work off.
+LONGEST_GAP_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class SoundBlock:
+    """Samples that were captured together."""
+
+    samples: Float32Array  # Shape (n, M), full scale 1
+    first: int  # Number of the first of them since the start, lost ones counted
+    captured_s: float  # When the last of them was captured, on the clock of `time.monotonic`
+
+
+def block_samples(sample_rate_hz: int) -> int:
+    """Return the length of a block, rounded up: shorter ones would end just before the hops do.
+
+    Examples
+    --------
+    >>> block_samples(48_000), block_samples(47_998)
+    (1200, 1200)
+    """
+    return -(-sample_rate_hz // BLOCKS_PER_SECOND)
+
+
+class SoundFeed(Protocol):
+    """Microphones, or what stands for them: gives blocks from a thread of its own until it is stopped.
+
+    Examples
+    --------
+    >>> class OneBlock:
+    ...     name, sample_rate_hz, channels, speed, overflows = "one block", 8000, 2, 1.0, 0
+    ...     def start(self, into):
+    ...         into.put(SoundBlock(np.zeros((400, 2), np.float32), 0, time.monotonic()))
+    ...         into.close()
+    ...     def stop(self): pass
+    >>> feed: SoundFeed = OneBlock()
+    >>> [block.shape for block in LiveSound(feed).blocks()]
+    [(400, 2)]
+    """
+
+    name: str
+    sample_rate_hz: int
+    channels: int
+    speed: float  # Seconds of sound a second: 1 for microphones
+    overflows: int  # Times that the source lost samples before they were blocks
+
+    def start(self, into: BoundedChannel[SoundBlock], /) -> None:
+        """Begin to put blocks into the channel."""
+        ...
+
+    def stop(self) -> None:
+        """Put nothing more, and close what was opened."""
+        ...
+
+
+class LiveSound(Audio):
+    """A running source as a recording that has no end yet: what `open_source` and `listen_steps` take.
+
+    Parameters
+    ----------
+    feed : SoundFeed
+        Gives the blocks.
+    keep : callable, optional
+        Called with every block, lost ones as zeros. Without it no sound outlives the window it is heard in.
+
+    Attributes
+    ----------
+    lost_samples : int
+        Samples a channel that were lost on the way and are zeros in what `blocks` gave.
+    """
+
+    def __init__(self, feed: SoundFeed, keep: Callable[[Float32Array], None] | None = None) -> None:
+        self.path, self.frames = Path(feed.name), 0
+        self.sample_rate_hz, self.channels = feed.sample_rate_hz, feed.channels
+        # Known only after a second; the front-end leaves out a channel that is silent.
+        self.silent_channels = ()
+        self.lost_samples = 0
+        self._feed, self._keep = feed, keep
+        self._channel: BoundedChannel[SoundBlock] = BoundedChannel(int(LONGEST_WAIT_S * BLOCKS_PER_SECOND))
+        self._captured_s = time.monotonic()
+
+    @property
+    def overruns(self) -> int:
+        """Times that sound was lost: blocks that nobody took in time, and overflows of the device."""
+        return self._channel.dropped + self._feed.overflows
+
+    @property
+    def lost_s(self) -> float:
+        """Seconds of sound that were lost."""
+        return self.lost_samples / self.sample_rate_hz
+
+    def check_size(self, expect_channels: int | None) -> None:
+        """Refuse another number of channels than microphones; how long it will be is not known."""
+        if expect_channels is not None and self.channels != expect_channels:
+            expected = f"expected {expect_channels} channels, one per microphone"
+            raise InputFileError(self.path, f"{expected}, got {self.channels}")
+
+    def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
+        """Yield the sound from now until the source ends or is closed, in blocks of the source's length."""
+        self._feed.start(self._channel)
+        try:
+            while (block := self._channel.take()) is not None:
+                for samples in (*self._gap(block.first), block.samples):
+                    self.frames += len(samples)
+                    self._captured_s = block.captured_s
+                    if self._keep is not None:
+                        self._keep(samples)
+                    yield samples
+        finally:
+            self._feed.stop()
+
+    def close(self) -> None:
+        """Let `blocks` end after what waits; may be called from any thread and from a signal handler."""
+        self._channel.close()
+
+    def age_s(self, sample: int) -> float:
+        """Return how long ago a sample of the last block was captured, seconds of the clock."""
+        behind_s = (self.frames - sample) / (self.sample_rate_hz * self._feed.speed)
+        return time.monotonic() - self._captured_s + behind_s
+
+    def stamp_ns(self, captured_s: float) -> int:
+        """Return the time on the stream's clock of an instant of `time.monotonic`.
+
+        The last block ties the two clocks together: a converter that is wrong by 50 ppm would be four seconds
+        late after a day.
+        """
+        since_s = (captured_s - self._captured_s) * self._feed.speed
+        return nanoseconds(self.frames / self.sample_rate_hz + since_s)
+
+    def _gap(self, first: int) -> Iterator[Float32Array]:
+        """Yield zeros, at most a second at a time, in place of what was lost before a block."""
+        missing = first - self.frames
+        if missing > LONGEST_GAP_S * self.sample_rate_hz:
+            lost_s = missing / self.sample_rate_hz
+            problem = f"expected sound without long gaps, {lost_s:.0f} s are lost: start anew"
+            raise InputFileError(self.path, problem)
+        self.lost_samples += max(missing, 0)
+        while missing > 0:
+            some = min(missing, self.sample_rate_hz)
+            yield np.zeros((some, self.channels), np.float32)
+            missing -= some

@@ -1,0 +1,223 @@
+"""A camera and a detector that run, as the channel that is asked for co-evidence."""
+
+import json
+import socket
+import time
+import tracemalloc
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.listen import ListenSettings, Source, open_source
+from worldstate.adapters.live.bounded_channel import BoundedChannel
+from worldstate.adapters.live.detection_socket import DetectionSocket
+from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
+from worldstate.adapters.live.live_camera import REMEMBERED, LiveCamera
+from worldstate.adapters.live.live_sound import LiveSound
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.values import nanoseconds
+from worldstate.measurement.measurement import Bearing
+
+CAMERA = PinholeCamera(width_px=640, height_px=480, position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
+AHEAD = Bearing(0.0, 0.05)
+EMPTY = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+
+
+def box(left_px: float) -> DetectionFrame:
+    return DetectionFrame(np.array([[left_px, 100.0, left_px + 120.0, 300.0]]), np.array([0.9]), ("car",))
+
+
+def stamp(number: int) -> int:
+    return nanoseconds(0.1 * number)
+
+
+class Silent:
+    name, sample_rate_hz, channels, speed, overflows = "silent", 48_000, 56, 1.0, 0
+
+    def start(self, into: BoundedChannel, /) -> None:
+        into.close()
+
+    def stop(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def source() -> Source:
+    return open_source(LiveSound(Silent()), array=ovad_array(), camera=CAMERA, settings=ListenSettings())
+
+
+def test_it_answers_as_the_camera_of_a_recording(source):
+    # A car that crosses the image, stops, and is gone.
+    places = [None] * 10 + [30.0 * n for n in range(10)] + [300.0] * 15 + [None] * 5
+    frames = [EMPTY if place is None else box(place) for place in places]
+    log = DetectionLog.at_rate(frames, 10.0)
+    recorded = replace(source, detections=log).camera_channel()
+    looks: list[tuple[int, DetectionFrame]] = []
+    live = LiveCamera(source, lambda: looks[-1:])
+    for number, frame in enumerate(frames):
+        looks.append((stamp(number), frame))
+        assert live.ask(stamp(number), AHEAD) == recorded.ask(stamp(number), AHEAD)
+        assert live.sightings(stamp(number)) == recorded.sightings(stamp(number))
+        assert live.last_look(stamp(number)) == recorded.last_look(stamp(number))
+    assert any(seen.moving for seen in recorded.sightings(stamp(15)))
+    assert not any(seen.moving for seen in recorded.sightings(stamp(34)))
+
+
+def test_without_an_image_it_was_not_asked(source):
+    looks: list[tuple[int, DetectionFrame]] = []
+    camera = LiveCamera(source, lambda: looks)
+    assert isinstance(camera.ask(0, AHEAD), Unqueried)
+    looks.append((0, EMPTY))
+    assert isinstance(camera.ask(stamp(1), AHEAD), Absent)
+    # The camera hangs: its last image is no look at what is there now.
+    assert isinstance(camera.ask(stamp(5), AHEAD), Unqueried)
+    looks.append((stamp(5), box(260.0)))
+    assert isinstance(camera.ask(stamp(5), AHEAD), Present)
+
+
+def test_looks_out_of_order_are_left_out(source):
+    looks = [(stamp(5), EMPTY), (stamp(3), box(260.0)), (stamp(5), box(260.0))]
+    camera = LiveCamera(source, lambda: looks)
+    assert isinstance(camera.ask(stamp(5), AHEAD), Absent)
+
+
+class Counting:
+    """A detector that finds one box, and knows how many images it saw."""
+
+    def __init__(self) -> None:
+        self.seen = 0
+
+    def detect(self, frame: np.ndarray) -> DetectionFrame:
+        self.seen += 1
+        return box(float(frame[0, 0, 0]))
+
+
+def camera_day(source: Source, hops: int) -> tuple[LiveCamera, int, int]:
+    """Let three images pass at every hop, and ask at every tenth."""
+    images, detector = image_channel(), Counting()
+    looks = ImageLooks(images, detector, nanoseconds, (640, 480))
+    camera = LiveCamera(source, looks)
+    image = np.zeros((480, 640, 3), np.uint8)
+    for hop in range(hops):
+        for part in range(3):
+            images.put((0.1 * hop + 0.03 * part, image))
+        if hop % 10 == 9:
+            camera.ask(nanoseconds(0.1 * hop + 0.06), AHEAD)
+    return camera, detector.seen, images.dropped
+
+
+def test_it_remembers_no_more_than_it_needs(source):
+    camera, seen, dropped = camera_day(source, 300)
+    assert seen == 30 * 4
+    assert seen + dropped == 900
+    assert len(camera._looks) == REMEMBERED
+
+
+def test_images_of_another_camera_are_refused(source):
+    images = image_channel()
+    images.put((0.0, np.zeros((720, 1280, 3), np.uint8)))
+    camera = LiveCamera(source, ImageLooks(images, Counting(), nanoseconds, (640, 480)))
+    with pytest.raises(
+        InvalidArgumentError, match="expected images of 640 x 480 px as its lens, got 1280 x 720"
+    ):
+        camera.ask(0, AHEAD)
+
+
+def sent(detections: DetectionSocket, *datagrams: bytes) -> list[tuple[int, DetectionFrame]]:
+    looks = []
+    with detections, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as detector:
+        for datagram in datagrams:
+            detector.sendto(datagram, ("127.0.0.1", detections.port))
+        until_s = time.monotonic() + 5.0
+        while len(looks) + detections.refused < len(datagrams) and time.monotonic() < until_s:
+            looks += list(detections())
+            time.sleep(0.01)
+    return looks
+
+
+def test_detections_come_as_datagrams_with_their_age(source):
+    now_ns = time.monotonic_ns()
+    one = {"boxes": [[260, 100, 380, 300]], "scores": [0.9], "classes_str": ["car"], "age_s": 2.0}
+    none = {"boxes": [], "scores": [], "classes_str": []}
+    detections = DetectionSocket("127.0.0.1:0", nanoseconds)
+    looks = sent(detections, json.dumps(one).encode(), json.dumps(none).encode())
+    assert [frame.labels for _, frame in looks] == [("car",), ()]
+    assert looks[0][0] - now_ns == pytest.approx(-2e9, abs=1e9)
+    assert looks[1][0] > now_ns
+
+
+def test_datagrams_that_cannot_be_read_are_counted_and_named():
+    wrong = [b"\xff", b"[]", b'{"boxes": [[1, 2, 3, 4]], "scores": [], "classes_str": []}']
+    detections = DetectionSocket("127.0.0.1:0", nanoseconds)
+    assert sent(detections, *wrong) == []
+    assert detections.refused == 3
+    assert "1 boxes, 0 scores" in detections.problem
+
+
+@pytest.mark.parametrize("address", ["9100", "127.0.0.1:x", "127.0.0.1:70000"])
+def test_an_address_is_a_host_and_a_port(address):
+    with pytest.raises(InvalidArgumentError, match="expected HOST:PORT"):
+        DetectionSocket(address, nanoseconds)
+
+
+class Capture:
+    """What is used of OpenCV's VideoCapture: three images, then the plug is pulled."""
+
+    def __init__(self, device: int) -> None:
+        self._left = 3 if device == 0 else 0
+        self._there = device == 0
+
+    def isOpened(self) -> bool:  # noqa: N802 - its name there
+        return self._there
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        time.sleep(0.01)
+        self._left -= 1
+        return (True, np.zeros((480, 640, 3), np.uint8)) if self._left >= 0 else (False, None)
+
+    def release(self) -> None:
+        self._there = False
+
+
+@pytest.fixture
+def cameras(monkeypatch):
+    monkeypatch.setattr(
+        "worldstate.adapters.live.image_feed.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
+    )
+
+
+def test_a_camera_gives_its_images_and_an_error_when_it_gives_no_more(cameras):
+    images, taken = image_channel(), []
+    with CameraFeed(0, images), pytest.raises(InputFileError, match="camera 0: .* gives no more"):
+        while (image := images.take()) is not None:
+            taken.append(image)
+    stamps_s = [captured_s for captured_s, _ in taken]
+    assert len(stamps_s) == 3
+    assert stamps_s == sorted(stamps_s)
+    assert 0.0 < time.monotonic() - stamps_s[0] < 5.0
+
+
+def test_a_camera_that_is_not_there(cameras):
+    with pytest.raises(InputFileError, match="camera 7: .* cannot be opened"):
+        CameraFeed(7, image_channel())
+
+
+@pytest.mark.slow
+def test_a_day_of_looks_uses_no_memory(source):
+    camera_day(source, 600)
+    tracemalloc.start()
+    try:
+        # A day of hops, three images at each.
+        camera, seen, dropped = camera_day(source, 24 * 3600 * 10)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert seen + dropped == 3 * 24 * 3600 * 10
+    assert len(camera._looks) == REMEMBERED
+    assert held < 1 << 20

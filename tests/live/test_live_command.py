@@ -1,0 +1,106 @@
+"""`worldstate live` on a recording that is played."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import soundfile
+from rich.console import Console
+
+from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.listen import ListenSettings, open_source
+from worldstate.adapters.live.live_listening import live_steps
+from worldstate.adapters.live.live_sound import LiveSound
+from worldstate.adapters.live.playback import Playback
+from worldstate.cli.main import main
+from worldstate.cli.vehicle.live_view import view_of
+
+RATE = 8_000
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("street")
+    noise = np.random.default_rng(4).normal(0.0, 0.1, (2 * RATE, 4)).astype(np.float32)
+    soundfile.write(folder / "street.wav", noise, RATE, subtype="PCM_24")
+    (folder / "mics.csv").write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    return folder
+
+
+def command(street, *more):
+    play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
+    return ["live", *play, *map(str, more)]
+
+
+def test_states_are_those_of_run_and_no_sound_is_kept(street, tmp_path, capsys):
+    live, run = tmp_path / "live" / "states.jsonl", tmp_path / "run.jsonl"
+    live.parent.mkdir()
+    assert main(command(street, "--speed", 4, "--out", live, "--json")) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert main(["run", *command(street)[2:], "--out", str(run)]) == 0
+    assert live.read_text() == run.read_text()
+    assert [path.name for path in live.parent.iterdir()] == ["states.jsonl"]
+    assert report["states"] == 11
+    assert report["overruns"] == report["lost_s"] == 0
+    assert 0.0 < report["latency_median_s"] <= report["latency_p99_s"] <= report["latency_largest_s"]
+    assert report["cpu_s"] > 0.0
+
+
+def test_sound_is_kept_where_asked_for(street, tmp_path):
+    kept = tmp_path / "kept.wav"
+    assert main(command(street, "--speed", 20, "--keep-sound", kept)) == 0
+    heard, rate_hz = soundfile.read(kept)
+    assert rate_hz == RATE
+    np.testing.assert_array_equal(heard, soundfile.read(street / "street.wav")[0])
+
+
+def test_kept_sound_never_replaces_what_is_played(street, capsys):
+    assert main(command(street, "--keep-sound", street / "street.wav")) == 2
+    assert "this one is read" in capsys.readouterr().err
+
+
+def test_losses_are_said_when_they_happen(street, capsys, monkeypatch):
+    slow = "worldstate.cli.vehicle.live_view.view_of"
+    monkeypatch.setattr(slow, lambda live: time.sleep(0.05) or view_of(live))
+    assert main(command(street, "--speed", 100, "--duration", 8, "--view", "--json")) == 0
+    said = capsys.readouterr()
+    assert "overruns" in said.err
+    assert "s of sound lost" in said.err
+    assert json.loads(said.out)["overruns"] > 0
+
+
+def test_the_view_shows_bearing_risk_and_losses(street):
+    source = open_source(
+        LiveSound(Playback(open_sound(street / "street.wav"), speed=20.0)),
+        array=street / "mics.csv",
+        settings=ListenSettings(uncalibrated=True),
+    )
+    console = Console(record=True, width=100, file=io.StringIO())
+    console.print(view_of(replace(list(live_steps(source))[-1], overruns=3, lost_s=0.075)))
+    shown = console.export_text()
+    assert "2.0 s   latency" in shown
+    assert "3 overruns, 0.07 s lost" in shown or "3 overruns, 0.08 s lost" in shown
+    assert [line.split()[0] for line in shown.splitlines() if "risk" in line] == ["left", "right"]
+
+
+def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
+    out = tmp_path / "states.jsonl"
+    words = command(street, "--duration", 60, "--out", out, "--json")
+    script = [sys.executable, "-m", "worldstate", *words]
+    with subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ) as process:
+        until_s = time.monotonic() + 20.0
+        # The file has its name only at the end: a temporary one stands beside it.
+        while not list(tmp_path.iterdir()) and time.monotonic() < until_s:
+            time.sleep(0.05)
+        time.sleep(1.5)
+        process.send_signal(signal.SIGTERM)
+        printed, _ = process.communicate(timeout=20.0)
+    assert process.returncode == 0
+    assert json.loads(printed)["states"] == len(out.read_text().splitlines()) > 0

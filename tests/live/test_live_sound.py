@@ -1,0 +1,149 @@
+"""Sound as it comes: paced, complete, with its losses counted."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.listen import ListenSettings, listen_steps, open_source
+from worldstate.adapters.live.bounded_channel import BoundedChannel
+from worldstate.adapters.live.live_listening import live_steps
+from worldstate.adapters.live.live_sound import LiveSound, SoundBlock
+from worldstate.adapters.live.playback import Playback
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+RATE, SECONDS = 8_000, 2.0
+POSITIONS = [[0.0, 0.1, 0.0], [0.0, 0.02, 0.05], [0.0, -0.04, 0.0], [0.0, -0.1, 0.03]]
+SETTINGS = ListenSettings(uncalibrated=True)
+
+
+class Scripted:
+    """Blocks that are all there at once, with the number of the first sample of each."""
+
+    name, sample_rate_hz, channels, speed, overflows = "scripted", RATE, 4, 1.0, 0
+
+    def __init__(self, *blocks: SoundBlock) -> None:
+        self._blocks, self.stopped = blocks, False
+
+    def start(self, into: BoundedChannel[SoundBlock], /) -> None:
+        for block in self._blocks:
+            into.put(block)
+        into.close()
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+def block(first: int, n: int = 200, captured_s: float = 0.0) -> SoundBlock:
+    return SoundBlock(np.full((n, 4), 0.5, np.float32), first, captured_s)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("live") / "street.wav"
+    noise = np.random.default_rng(4).normal(0.0, 0.1, (int(SECONDS * RATE), 4))
+    soundfile.write(path, noise, RATE, subtype="PCM_16")
+    return path
+
+
+@pytest.fixture(scope="module")
+def source(recording):
+    return open_source(recording, array=MicrophoneArray(POSITIONS), settings=SETTINGS)
+
+
+def played(source, **options):
+    return replace(source, sound=LiveSound(Playback(open_sound(source.sound), **options)))
+
+
+def test_what_is_lost_is_silence_of_the_same_length():
+    sound = LiveSound(Scripted(block(0), block(500), block(700)))
+    heard = np.concatenate(list(sound.blocks()))
+    assert len(heard) == 900 == sound.frames
+    assert np.flatnonzero(~heard.any(axis=1)).tolist() == list(range(200, 500))
+    assert sound.lost_samples == 300
+    assert sound.lost_s == pytest.approx(300 / RATE)
+
+
+def test_a_device_that_slept_ends_the_run():
+    with pytest.raises(InputFileError, match="100 s are lost"):
+        list(LiveSound(Scripted(block(0), block(100 * RATE + 200))).blocks())
+
+
+def test_blocks_that_nobody_took_are_overruns():
+    feed = Scripted(*(block(200 * number) for number in range(100)))
+    sound = LiveSound(feed)
+    heard = np.concatenate(list(sound.blocks()))
+    # 80 blocks of 25 ms wait at most: twenty were dropped, and the time of the others is right.
+    assert sound.overruns == 20
+    assert len(heard) == 100 * 200
+    assert not heard[: 20 * 200].any()
+    assert heard[20 * 200 :].all()
+    assert feed.stopped
+
+
+def test_an_image_is_stamped_on_the_clock_of_the_sound():
+    now_s = time.monotonic()
+    sound = LiveSound(Scripted(block(0, RATE, now_s), block(RATE, RATE, now_s + 1.0)))
+    list(sound.blocks())
+    # The last sample, of second 2, was captured at now + 1: an image a quarter of a second before it.
+    assert sound.stamp_ns(now_s + 0.75) == pytest.approx(1.75e9, abs=1e3)
+
+
+def test_other_channels_than_microphones_are_refused(source):
+    three = replace(source, sound=LiveSound(Scripted()), array=MicrophoneArray(POSITIONS[:3]))
+    with pytest.raises(InputFileError, match="expected 3 channels, one per microphone, got 4"):
+        list(live_steps(three))
+
+
+def test_a_recording_has_no_latency(source):
+    with pytest.raises(InvalidArgumentError, match="LiveSound"):
+        next(live_steps(source))
+
+
+def test_played_it_is_the_same_to_the_last_bit_and_in_real_time(source):
+    begun_s = time.monotonic()
+    lives = list(live_steps(played(source, speed=2.0)))
+    took_s = time.monotonic() - begun_s
+    assert [one.step.state for one in lives] == [step.state for step in listen_steps(source)]
+    assert took_s >= SECONDS / 2.0
+    assert all(0.0 < one.latency_s < took_s for one in lives)
+    assert (lives[-1].overruns, lives[-1].lost_s) == (0, 0.0)
+
+
+def test_a_longer_run_plays_it_again_and_a_shorter_one_ends_before(source):
+    twice = list(live_steps(played(source, speed=50.0, duration_s=2 * SECONDS)))
+    assert twice[-1].step.state.stamp_ns == 4_000_000_000
+    short = list(live_steps(played(source, speed=50.0, duration_s=1.3)))
+    assert short[-1].step.state.stamp_ns == 1_300_000_000
+
+
+def test_whoever_is_too_slow_loses_sound_and_keeps_the_time(source):
+    sound = Playback(open_sound(source.sound), speed=100.0, duration_s=30.0)
+    slow = replace(source, sound=LiveSound(sound))
+    lives = []
+    for one in live_steps(slow):
+        lives.append(one)
+        if len(lives) == 1:
+            time.sleep(0.2)  # twenty seconds of sound go by, of which two wait
+    stamps_ns = [one.step.state.stamp_ns for one in lives]
+    assert np.diff(stamps_ns).tolist() == [100_000_000] * (len(stamps_ns) - 1)
+    assert stamps_ns[-1] == 30_000_000_000
+    assert lives[-1].overruns > 0
+    assert lives[-1].lost_s > 10.0
+    # What was silence is a fault of the transport, and the snapshot says so.
+    assert any(one.step.measurement.fault for one in lives)
+
+
+def test_a_damaged_recording_stops_the_run_with_its_error(source, tmp_path):
+    class Torn(Playback):
+        def _blocks(self):
+            yield np.zeros((200, 4), np.float32)
+            raise InputFileError("street.wav", "cut short")
+
+    torn = replace(source, sound=LiveSound(Torn(open_sound(source.sound), speed=50.0)))
+    with pytest.raises(InputFileError, match="cut short"):
+        list(live_steps(torn))

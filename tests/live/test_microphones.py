@@ -1,0 +1,163 @@
+"""Microphones through PortAudio, of which a stand-in plays the part."""
+
+import builtins
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from worldstate.adapters.live.live_sound import LiveSound
+from worldstate.adapters.live.microphones import Microphones
+from worldstate.adapters.live.portaudio import MissingPortAudioError, portaudio
+from worldstate.cli.main import main
+from worldstate.ground.errors import InvalidArgumentError, MissingExtraError
+
+RATE = 8_000
+LENGTH = RATE // 40
+
+
+class StandIn:
+    """What is used of sounddevice, with one device of four channels."""
+
+    class PortAudioError(Exception):
+        pass
+
+    def __init__(self) -> None:
+        self.stream = None
+
+    def query_devices(self, device=None, kind=None):
+        known = {"index": 3, "name": "roof array", "max_input_channels": 4}
+        speaker = {"index": 0, "name": "speaker", "max_input_channels": 0}
+        if kind is None:
+            return [speaker, known]
+        if device not in (None, 3, "roof"):
+            raise ValueError(f"No input device matching {device!r}")
+        return known
+
+    def check_input_settings(self, device, channels, dtype, samplerate):
+        if channels > 4:
+            raise self.PortAudioError("Invalid number of channels")
+
+    def InputStream(self, **settings):  # noqa: N802 - its name there
+        self.stream = SimpleNamespace(**settings, start=lambda: None, close=lambda: None)
+        return self.stream
+
+    def give(self, value: float, taken_s: float, *, overflow: bool = False) -> None:
+        block = np.full((LENGTH, 4), value, np.float32)
+        times = SimpleNamespace(inputBufferAdcTime=taken_s, currentTime=taken_s + LENGTH / RATE + 0.01)
+        self.stream.callback(block, LENGTH, times, SimpleNamespace(input_overflow=overflow))
+        block[:] = 99.0  # PortAudio writes the next one there
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    module = StandIn()
+    monkeypatch.setitem(sys.modules, "sounddevice", module)
+    return module
+
+
+def heard(module, feed, calls):
+    sound = LiveSound(feed)
+    blocks = sound.blocks()
+    original = feed.start
+
+    def start(into):
+        original(into)
+        for call in calls:
+            module.give(*call[:2], overflow=len(call) > 2)
+        module.stream.finished_callback()
+
+    feed.start = start
+    return sound, np.concatenate(list(blocks))
+
+
+def test_blocks_are_copied_in_order(stand_in):
+    feed = Microphones(4, RATE, "roof")
+    _, samples = heard(stand_in, feed, [(0.1, 5.0), (0.2, 5.025)])
+    assert samples[[0, LENGTH]].tolist() == [[pytest.approx(0.1)] * 4, [pytest.approx(0.2)] * 4]
+    assert (feed.name, stand_in.stream.channels, stand_in.stream.blocksize) == ("roof array", 4, LENGTH)
+
+
+def test_an_overflow_of_the_device_is_counted_and_its_length_filled(stand_in):
+    sound, samples = heard(
+        stand_in, Microphones(4, RATE), [(0.1, 5.0), (0.2, 5.025), (0.3, 5.125, "lost 75 ms")]
+    )
+    assert sound.overruns == 1
+    assert sound.lost_samples == 600
+    assert np.flatnonzero(samples[:, 0] == 0.0).tolist() == list(range(2 * LENGTH, 2 * LENGTH + 600))
+
+
+def test_an_overflow_without_capture_times_is_counted(stand_in):
+    sound, samples = heard(stand_in, Microphones(4, RATE), [(0.1, 0.0), (0.2, 0.0, "lost")])
+    assert (sound.overruns, sound.lost_samples, len(samples)) == (1, 0, 2 * LENGTH)
+
+
+def test_the_age_of_a_block_is_that_of_its_last_sample(stand_in):
+    sound, _ = heard(stand_in, Microphones(4, RATE), [(0.1, 5.0)])
+    # The stand-in calls 10 ms after the block's end.
+    assert 0.01 <= sound.age_s(LENGTH) < 0.5
+    assert sound.age_s(0) - sound.age_s(LENGTH) == pytest.approx(LENGTH / RATE, abs=5e-3)
+    assert sound.stamp_ns(time.monotonic()) >= 1e9 * (LENGTH / RATE + 0.01)
+
+
+@pytest.mark.parametrize(
+    ("channels", "device", "said"),
+    [(56, None, "56 channels at 8000 Hz"), (4, "cellar", "No input device matching 'cellar'")],
+)
+def test_a_device_that_does_not_fit_is_refused_with_those_that_there_are(stand_in, channels, device, said):
+    with pytest.raises(InvalidArgumentError, match=said) as refused:
+        Microphones(channels, RATE, device)
+    assert "3 roof array (4)" in str(refused.value)
+
+
+def test_no_microphones_at_all(stand_in, monkeypatch):
+    monkeypatch.setattr(stand_in, "query_devices", lambda *_: [])
+    with pytest.raises(InvalidArgumentError, match="PortAudio finds none"):
+        Microphones(4, RATE)
+
+
+@pytest.mark.parametrize(
+    ("failure", "error", "said"),
+    [
+        (ImportError("No module named 'sounddevice'"), MissingExtraError, r"worldstate\[live\]"),
+        (OSError("PortAudio library not found"), MissingPortAudioError, "apt-get install libportaudio2"),
+    ],
+)
+def test_what_is_missing_is_named(monkeypatch, failure, error, said):
+    real = builtins.__import__
+
+    def refusing(name, *rest):
+        if name == "sounddevice":
+            raise failure
+        return real(name, *rest)
+
+    monkeypatch.delitem(sys.modules, "sounddevice", raising=False)
+    monkeypatch.setattr(builtins, "__import__", refusing)
+    with pytest.raises(error, match=said):
+        portaudio()
+
+
+def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_path, capsys, monkeypatch):
+    array = tmp_path / "mics.csv"
+    array.write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
+    rng = np.random.default_rng(5)
+    original = Microphones.start
+
+    def start(feed, into):
+        original(feed, into)
+        for number in range(60):
+            block = rng.normal(0.0, 0.1, (LENGTH, 4)).astype(np.float32)
+            times = SimpleNamespace(inputBufferAdcTime=1.0 + number / 40, currentTime=1.0 + (number + 1) / 40)
+            stand_in.stream.callback(block, LENGTH, times, SimpleNamespace(input_overflow=False))
+
+    monkeypatch.setattr(Microphones, "start", start)
+    command = ["live", "--array", str(array), "--rate", str(RATE), "--uncalibrated", "--duration", "1.2"]
+    assert main([*command, "--json"]) == 0
+    assert '"states": 3' in capsys.readouterr().out
+
+
+def test_the_command_asks_for_the_array(stand_in, capsys):
+    assert main(["live"]) == 2
+    assert "--array: expected the positions of the microphones, or --play" in capsys.readouterr().err

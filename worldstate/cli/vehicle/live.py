@@ -1,0 +1,210 @@
+"""`worldstate live`: microphones that run in, one snapshot a hop out.
+
+Listen to the microphones of this machine, or to a recording played as if they heard it, and keep the
+world-state.
+
+States are kept where asked for. The sound is not, unless --keep-sound says so: microphones in public hear
+people. What the machine was too slow for is counted as an overrun, said when it happens, and heard as
+silence. Ctrl-C ends the run, and what it wrote is complete.
+
+--detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
+  {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
+with "age_s" from the capture of the image to the sending; an image without boxes is sent, too.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, add_search_options, given_array, stance
+from worldstate.cli.common.camera_options import LENS_HELP, add_lens_options, boxes_of
+from worldstate.cli.common.detector_options import add_detector_options, detector_filter, detector_maker
+from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
+from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+
+from .stopping import stopped_by_signals
+
+if TYPE_CHECKING:
+    from worldstate.adapters.listen import Source
+    from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
+
+    Losses = Callable[[], dict[str, object]]
+
+EXAMPLE = """\
+examples:
+  worldstate live --array mics.csv --device 2 --model mine.json --out states.jsonl
+  worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
+  worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
+  worldstate live --play ovad_dataset/SA1/left/1_00_0002
+  worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_array_options(parser)
+    parser.description = f"{parser.description}\n\n{LENS_HELP}"
+    _add_sound_options(parser)
+    add_search_options(parser)
+    add_listen_options(parser)
+    _add_camera_options(parser)
+    add = parser.add_argument_group("output").add_argument
+    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
+    view = "show bearing, risk and entities (default: where standard error is a terminal)"
+    add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
+    add_log_options(parser)
+
+
+def _add_sound_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("sound").add_argument
+    add("--device", metavar="NAME", help="number or name of the input device (default: the system's)")
+    add("--rate", type=int, default=48_000, metavar="HZ", help="samples a second (default: %(default)s)")
+    add("--play", type=Path, metavar="RECORDING", help="a sound file or recording folder instead")
+    add("--speed", type=float, default=1.0, metavar="X", help="play so many times as fast (default: 1)")
+    ends = "end after so many seconds of sound; a shorter recording is played again"
+    add("--duration", type=float, metavar="S", help=ends)
+
+
+def _add_camera_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("camera")
+    which = group.add_mutually_exclusive_group()
+    which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
+    which.add_argument("--detections", metavar="HOST:PORT", help="listen there to a detector of your own")
+    add_lens_options(group)
+    add_detector_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.live.live_sound import LiveSound
+    from worldstate.adapters.live.sound_keeping import kept_sound
+
+    check_outputs(arguments, "out", "keep_sound", *LOG_FILES)
+    with ExitStack() as opened:
+        recorded = None if arguments.play is None else _source(arguments, arguments.play)
+        feed = _microphones(arguments) if recorded is None else _played(arguments, recorded)
+        keep = opened.enter_context(kept_sound(arguments.keep_sound, feed.sample_rate_hz, feed.channels))
+        sound = LiveSound(feed, keep)
+        source = _source(arguments, sound) if recorded is None else replace(recorded, sound=sound)
+        source, camera_losses = _with_camera(arguments, source, sound, opened)
+        figures = _listen(arguments, source, sound)
+        return CommandResult(figures | camera_losses() | {"array": stance(source.array)})
+
+
+def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source":
+    from worldstate.adapters.listen import open_source
+
+    moving = arguments.camera_device is not None
+    boxes = detector_filter(arguments) if moving else boxes_of(arguments)
+    return open_source(
+        sound,
+        array=given_array(arguments),
+        camera=arguments.camera,
+        miss_rates=arguments.miss_rates,
+        model=arguments.model,
+        context=given_context(arguments),
+        # A channel that is silent is told by the front-end, which leaves it out.
+        settings=replace(listen_settings(arguments), mask_dead=True, boxes=boxes),
+    )
+
+
+def _microphones(arguments: argparse.Namespace) -> "SoundFeed":
+    from worldstate.adapters.live.microphones import Microphones
+    from worldstate.ground.checks import in_range
+    from worldstate.ground.errors import InvalidArgumentError
+
+    array = given_array(arguments)
+    if array is None:
+        raise InvalidArgumentError("--array: expected the positions of the microphones, or --play RECORDING")
+    device = arguments.device
+    number = int(device) if device is not None and device.isdecimal() else device
+    rate_hz = int(in_range("--rate", arguments.rate, 1000, 1_000_000))
+    return Microphones(array.n_microphones, rate_hz, number)
+
+
+def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.adapters.live.playback import Playback
+
+    audio = open_sound(recorded.sound, recorded.array.n_microphones, strict=False)
+    return Playback(audio, arguments.speed, arguments.duration)
+
+
+def _with_camera(
+    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
+    """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
+    from worldstate.adapters.live.detection_socket import DetectionSocket
+    from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
+    from worldstate.adapters.live.live_camera import LiveCamera
+
+    if arguments.detections is not None:
+        looks = opened.enter_context(DetectionSocket(arguments.detections, sound.stamp_ns))
+        camera = LiveCamera(source, looks)
+        return replace(source, co_evidence=camera), lambda: {
+            "detections_dropped": looks.dropped,
+            "detections_refused": looks.refused,
+            "last_refusal": looks.problem or None,
+        }
+    if arguments.camera_device is None:
+        return source, dict
+    images, detector = image_channel(), detector_maker(arguments)()
+    size = source.camera.width_px, source.camera.height_px
+    seen = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
+    opened.enter_context(CameraFeed(arguments.camera_device, images))
+    camera = LiveCamera(source, seen, seen.degradation)
+    return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
+
+
+def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound") -> dict[str, object]:
+    """Listen until the sound ends; return what came of it and what it cost."""
+    from worldstate.adapters.files.states_file import states_writer
+    from worldstate.adapters.live.latency import CostMeter, LatencyMeter
+    from worldstate.adapters.live.live_listening import live_steps
+    from worldstate.ground.values import seconds
+    from worldstate.operations.recordings.warning import WarningMeter
+
+    from .live_view import live_view, loss_notices
+
+    warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
+    states, peak_risk, notices = 0, 0.0, loss_notices()
+    shown = sys.stderr.isatty() if arguments.view is None else arguments.view
+    with (
+        states_writer(arguments.out) as write,
+        log_hops(arguments, source, paced=False) as log,
+        live_view(shown) as show,
+        stopped_by_signals(sound.close),
+    ):
+        for live in live_steps(source):
+            latency.add(live.latency_s)
+            state = live.step.state
+            write(state.to_json())
+            log(live.step)
+            show(live)
+            notices(live)
+            warnings.update(state)
+            states, peak_risk = states + 1, max(peak_risk, state.risk)
+            if arguments.duration is not None and seconds(state.stamp_ns) >= arguments.duration:
+                break
+    spent = cost.read()
+    return {
+        "states": states,
+        "sound_s": sound.frames / sound.sample_rate_hz,
+        "overruns": sound.overruns,
+        "lost_s": sound.lost_s,
+        "latency_median_s": latency.quantile_s(0.5),
+        "latency_p99_s": latency.quantile_s(0.99),
+        "latency_largest_s": latency.quantile_s(1.0),
+        "wall_s": spent.wall_s,
+        "cpu_s": spent.cpu_s,
+        "cpu_share": spent.cpu_share,
+        "load": spent.load,
+        "peak_risk": peak_risk,
+        "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
+    }

@@ -1,0 +1,102 @@
+"""What a terminal shows of a run: bearing, risk of each side, entities, and what was lost."""
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from worldstate.ground.values import seconds
+
+if TYPE_CHECKING:
+    from worldstate.adapters.live.live_listening import LiveStep
+    from worldstate.state import Entity, RiskCue, WorldState
+
+# Every second state: nobody reads ten a second, and drawing costs some milliseconds.
+_SHOWN_EVERY_NS = 200_000_000
+# Lost sound is said at most so often.
+_SAID_EVERY_NS = 1_000_000_000
+# Characters of the scale of azimuths from 90 degrees left to 90 degrees right: one for five degrees.
+_SCALE = 37
+_BAR = 20
+# More are not read at a glance.
+_MOST_ENTITIES = 6
+
+
+@contextmanager
+def live_view(shown: bool) -> "Iterator[Callable[[LiveStep], None]]":
+    """Lend a function that shows a hop on standard error; one that does nothing where it is not wanted."""
+    if not shown:
+        yield lambda live: None
+        return
+    console, last_ns = Console(stderr=True), -_SHOWN_EVERY_NS
+    with Live(console=console, auto_refresh=False, transient=True) as screen:
+
+        def show(live: "LiveStep") -> None:
+            nonlocal last_ns
+            stamp_ns = live.step.state.stamp_ns
+            if stamp_ns - last_ns >= _SHOWN_EVERY_NS:
+                last_ns = stamp_ns
+                screen.update(view_of(live), refresh=True)
+
+        yield show
+
+
+def loss_notices() -> "Callable[[LiveStep], None]":
+    """Return a function that says on standard error when sound was lost, at most once a second."""
+    said, said_ns = 0, -_SAID_EVERY_NS
+
+    def notice(live: "LiveStep") -> None:
+        nonlocal said, said_ns
+        stamp_ns = live.step.state.stamp_ns
+        if live.overruns > said and stamp_ns - said_ns >= _SAID_EVERY_NS:
+            said, said_ns = live.overruns, stamp_ns
+            lost = f"{live.overruns} overruns, {live.lost_s:.2f} s of sound lost"
+            print(f"worldstate: {seconds(stamp_ns):.1f} s: {lost}", file=sys.stderr)
+
+    return notice
+
+
+def view_of(live: "LiveStep") -> RenderableType:
+    """Return one screen."""
+    state = live.step.state
+    late = f"latency {1e3 * live.latency_s:.0f} ms"
+    lost = f"{live.overruns} overruns, {live.lost_s:.2f} s lost"
+    head = Text(f"{seconds(state.stamp_ns):9.1f} s   {late}   ")
+    head.append(lost, style="red" if live.overruns else "green")
+    return Group(head, _bearing(state), *map(_cue, state.cues), _entities(state.entities))
+
+
+def _bearing(state: "WorldState") -> Text:
+    if state.bearing is None:
+        return Text("left  " + "·" * _SCALE + "  right   no bearing", style="dim")
+    azimuth, std_deg = state.bearing.azimuth_rad, math.degrees(state.bearing.std_rad)
+    # Behind the vehicle there is no scale: the nearer end stands for it.
+    place = round((0.5 - max(min(azimuth / math.pi, 0.5), -0.5)) * (_SCALE - 1))
+    scale = "·" * place + "●" + "·" * (_SCALE - 1 - place)
+    return Text(f"left  {scale}  right   {math.degrees(azimuth):+.0f} ± {std_deg:.0f} deg")
+
+
+def _cue(cue: "RiskCue") -> Text:
+    filled = round(cue.risk * _BAR)
+    line = Text(f"{cue.direction:<6}", style="bold")
+    line.append("█" * filled + "─" * (_BAR - filled), style="red" if cue.advisory else "yellow")
+    line.append(f"  risk {cue.risk:.2f}", style="default")
+    if cue.advisory:
+        line.append("  ADVISORY", style="bold red")
+    return line
+
+
+def _entities(entities: "tuple[Entity, ...]") -> Table:
+    table = Table("entity", "status", "exists", "azimuth", "is", box=None, padding=(0, 2, 0, 0))
+    likeliest = sorted(entities, key=lambda one: -one.existence_probability)[:_MOST_ENTITIES]
+    for one in likeliest:
+        label = max(one.classification, key=lambda said: said.probability).label if one.classification else ""
+        azimuth = f"{math.degrees(one.azimuth_rad):+.0f} ± {math.degrees(one.azimuth_std_rad):.0f} deg"
+        table.add_row(one.id[:8], one.status, f"{one.existence_probability:.2f}", azimuth, label)
+    return table
