@@ -15,8 +15,8 @@ from worldstate.ground.values import nanoseconds
 
 from .bounded_channel import BoundedChannel
 
-# Blocks a second that a source gives. The state of a hop that ends within one waits for its end, 25 ms at most,
-# and not at all where hops are whole blocks, as at 48 kHz.
+# Blocks a second that a source gives. The state of a hop that ends within one waits for its end: at most
+# 25 ms, and not at all where hops are whole blocks, as at 48 kHz.
 BLOCKS_PER_SECOND = 40
 # Seconds of sound that wait at most. A short stall of the machine is made up for; a state that comes later
 # than this warns nobody, and what is older is dropped.

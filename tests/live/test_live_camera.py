@@ -194,7 +194,7 @@ def cameras(monkeypatch):
 
 def test_a_camera_gives_its_images_and_an_error_when_it_gives_no_more(cameras):
     images, taken = image_channel(), []
-    with CameraFeed(0, images), pytest.raises(InputFileError, match="camera 0: .* gives no more"):
+    with CameraFeed(0, images), pytest.raises(InputFileError, match=r"camera 0: .* gives no more"):
         while (image := images.take()) is not None:
             taken.append(image)
     stamps_s = [captured_s for captured_s, _ in taken]
@@ -204,7 +204,7 @@ def test_a_camera_gives_its_images_and_an_error_when_it_gives_no_more(cameras):
 
 
 def test_a_camera_that_is_not_there(cameras):
-    with pytest.raises(InputFileError, match="camera 7: .* cannot be opened"):
+    with pytest.raises(InputFileError, match=r"camera 7: .* cannot be opened"):
         CameraFeed(7, image_channel())
 
 

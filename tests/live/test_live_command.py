@@ -3,11 +3,14 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,12 +18,14 @@ import soundfile
 from rich.console import Console
 
 from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.listen import ListenSettings, open_source
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound
 from worldstate.adapters.live.playback import Playback
 from worldstate.cli.main import main
 from worldstate.cli.vehicle.live_view import view_of
+from worldstate.state import WorldState
 
 RATE = 8_000
 
@@ -104,3 +109,28 @@ def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
         printed, _ = process.communicate(timeout=20.0)
     assert process.returncode == 0
     assert json.loads(printed)["states"] == len(out.read_text().splitlines()) > 0
+
+
+def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch):
+    page = Path(__file__).resolve().parents[2] / "docs" / "live.md"
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (tmp_path / "mics.csv").write_text((street / "mics.csv").read_text())
+    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}
+    (tmp_path / "camera.json").write_text(json.dumps(lens))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "worldstate.adapters.live.microphones.Microphones",
+        lambda channels, sample_rate_hz: Playback(open_sound(street / "street.wav"), speed=10.0),
+    )
+    found = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))
+    published = []
+
+    def publish(line, latency_s):
+        published.append(WorldState.from_json(line))
+        given["on_image"](np.zeros((480, 640, 3), np.uint8))
+        assert latency_s > 0.0
+
+    given = {"publish": publish, "detector": SimpleNamespace(detect=lambda image: found)}
+    exec(compile(program, "live.md", "exec"), given)
+    assert len(published) == 11
+    assert [view.sensor for view in published[-1].searched] == ["camera"]
