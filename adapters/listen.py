@@ -14,7 +14,7 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_signature import SiteSignature
-from worldstate.adapters.audio.open_sound import SoundInput, as_sound, open_sound, path_of
+from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, open_sound, path_of
 from worldstate.adapters.camera.camera_channel import Watcher, video_degradation
 from worldstate.adapters.camera.detection_formats import read_any_detections
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
@@ -28,6 +28,7 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.acoustic_domain import array_of, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
+from worldstate.adapters.files.ego_speed import EgoSpeed
 from worldstate.adapters.files.engine_file import EngineSpeed, read_engine
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.core.filter import WorldFilter
@@ -38,7 +39,7 @@ from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.measurement.protocols import CoEvidenceChannel
@@ -143,8 +144,9 @@ class Source:
 
     Parameters
     ----------
-    sound : Path, tuple of Path, RawPcm or Audio
-        Multichannel sound file, a file a microphone, a pipe, or an open recording such as `LiveSound`.
+    sound : Path, tuple of Path, SoundStream or Audio
+        Multichannel sound file, a file a microphone, a stream such as a pipe, or an open recording such as
+        `LiveSound`.
     array : MicrophoneArray
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
@@ -185,6 +187,8 @@ class Source:
         What it has heard beforehand, from a checkpoint.
     co_evidence : CoEvidenceChannel or None
         Asked in place of the detections: a camera that runs.
+    ego : EgoSpeed or None
+        Speed of the ego vehicle over time, which then stands in the context.
 
     Examples
     --------
@@ -221,6 +225,7 @@ class Source:
     sequence: SequenceModel | NotUsable | None = None
     history: SequenceHistory | None = None
     co_evidence: CoEvidenceChannel | None = None
+    ego: EgoSpeed | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -315,15 +320,16 @@ def open_source(
     resume: Path | str | Checkpoint | None = None,
     start_s: float = 0.0,
     engine: Path | str | EngineSpeed | None = None,
+    ego: EgoSpeed | None = None,
     settings: ListenSettings | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
 
     Parameters
     ----------
-    path : path, sequence of paths, RawPcm or Audio
+    path : path, sequence of paths, SoundStream or Audio
         Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
-        raw samples from a pipe, or an open recording.
+        a stream (raw samples from a pipe, the sound of a bag), or an open recording.
     array : path or MicrophoneArray, optional
         Acoular XML, CSV or JSON as `read_array` reads them; that of the data set where not given, OVAD's
         where it names none; the model's own for a sound file of as many channels.
@@ -346,9 +352,12 @@ def open_source(
         Belief and site to go on from. Hops up to its time are heard, which fills the windows, and not
         measured: the same recording again goes on where the other run ended.
     start_s : float
-        Time of the first sample on the clock of that belief, for a recording that follows another.
+        Time of the first sample on the clock of that belief, for a recording that follows another; a stream
+        with a clock of its own brings it.
     engine : path or EngineSpeed, optional
         Speed of the own engine, as `read_engine` reads it; its lines are cancelled, with `ego_noise` only.
+    ego : EgoSpeed, optional
+        Speed of the ego vehicle over time, in place of the one speed of the context.
     settings : ListenSettings, optional
         How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
 
@@ -383,7 +392,8 @@ def open_source(
     settings, context = settings or ListenSettings(), context or Context()
     if engine is not None and not settings.ego_noise:
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
-    source, recording = _heard(as_sound(path), array, model, context, settings)
+    sound = as_sound(path)
+    source, recording = _heard(sound, array, model, context, settings, ego is not None and ego.moves)
     source = _with_camera(source, recording, detections, detector, camera, miss_rates)
     before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
     return replace(
@@ -391,7 +401,9 @@ def open_source(
         site=None if before is None else before.site,
         history=None if before is None else before.history,
         resume=None if before is None else before.world,
-        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10)),
+        start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
+        or (sound.start_ns if isinstance(sound, SoundStream) else 0),
+        ego=ego,
         engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
     )
 
@@ -402,10 +414,11 @@ def _heard(
     given: Path | str | Model | None,
     context: Context,
     settings: ListenSettings,
+    driven: bool,
 ) -> tuple[Source, Recording | None]:
     """Return what is heard and by which array and model, and the recording folder if it is one."""
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
-    moves = bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
+    moves = driven or bool(recording and recording.moving_ego) or bool(context.ego_speed_mps)
     model = given if isinstance(given, Model) else read_model(given, moving_ego=moves)
     settings = _as_trained(settings, model)
     policy = _policy(model, settings.alpha)
@@ -471,6 +484,8 @@ def _array(
 ) -> MicrophoneArray:
     """Return the array that the sound was recorded with: as given, the data set's or the model's."""
     microphones = read_array(given) if isinstance(given, Path | str) else given
+    if microphones is None and isinstance(sound, SoundStream):
+        raise InputFileError(sound.name, "expected --array with a stream, which names no microphones")
     assumed = None if model.domain is None else array_of(model.domain)
     return choose_array(path_of(sound), microphones, assumed=assumed, trust_given=settings.uncalibrated)
 
@@ -514,9 +529,9 @@ def listen(
 
     Parameters
     ----------
-    path : path, sequence of paths, RawPcm or Audio
+    path : path, sequence of paths, SoundStream or Audio
         Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
-        raw samples from a pipe, or an open recording.
+        a stream (raw samples from a pipe, the sound of a bag), or an open recording.
     array, detections, detector, camera, miss_rates, model, context, settings
         As `open_source` takes them: files, or the objects that they hold.
 
@@ -594,10 +609,19 @@ def listen_steps(source: Source) -> Iterator[Step]:
     world, signature, reader = source.world(), source.signature(), source.reader()
     measured = measure_steps(source, lambda: world.explanation.none, signature, reader)
     for frame, measurement in measured:
+        world = _driven(world, source.ego, frame.stamp_ns)
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         site = signature.estimate if isinstance(signature, SiteSignature) else None
         history = reader.history if isinstance(reader, SequenceReader) else None
         yield Step(frame, measurement, world, site, history)
+
+
+def _driven(world: WorldFilter, ego: EgoSpeed | None, stamp_ns: int) -> WorldFilter:
+    """Return the belief with the speed of the ego at a time, where it is reported."""
+    speed_mps = world.context.ego_speed_mps if ego is None else ego.at(stamp_ns)
+    if speed_mps == world.context.ego_speed_mps:
+        return world
+    return replace(world, context=replace(world.context, ego_speed_mps=speed_mps))
 
 
 def measure_steps(

@@ -1,5 +1,6 @@
-"""A recording as users have it: one file, a file a microphone, or raw samples from a pipe."""
+"""A recording as users have it: one file, a file a microphone, or a stream such as a pipe."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,8 +20,28 @@ BYTES: dict[Encoding, int] = {"s16": 2, "s24": 3, "s32": 4, "f32": 4}
 MAX_CHANNELS = 1024
 
 
+class SoundStream(ABC):
+    """Sound that is no file of its own: `open` gives its samples from the start on."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first sample on the clock of whoever recorded it; 0 where nothing tells."""
+        return 0
+
+    @abstractmethod
+    def open(self) -> Audio:
+        """Open it at its start, nothing checked."""
+
+
 @dataclass(frozen=True, slots=True)
-class RawPcm:
+class RawPcm(SoundStream):
     """Samples without a header, little-endian, one sample of every channel after the other.
 
     Parameters
@@ -60,6 +81,10 @@ class RawPcm:
         if self.encoding not in BYTES:
             raise InvalidArgumentError(f"encoding: expected one of {', '.join(BYTES)}, got {self.encoding!r}")
 
+    def open(self) -> "RawAudio":
+        """Read its first second."""
+        return RawAudio(self)
+
     @property
     def frame_bytes(self) -> int:
         """Bytes of one sample of all channels."""
@@ -81,12 +106,12 @@ class RawPcm:
 
 
 # An open recording is one whose samples come from elsewhere, such as microphones that run.
-SoundInput: TypeAlias = Path | tuple[Path, ...] | RawPcm | Audio
+SoundInput: TypeAlias = Path | tuple[Path, ...] | SoundStream | Audio
 
 
 def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
-    """Return a path, several or a pipe as such; one path in a sequence is that file."""
-    if isinstance(given, Path | RawPcm | Audio):
+    """Return a path, several or a stream as such; one path in a sequence is that file."""
+    if isinstance(given, Path | SoundStream | Audio):
         return given
     paths = (Path(given),) if isinstance(given, str) else tuple(map(Path, given))
     if not paths:
@@ -95,8 +120,8 @@ def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
 
 
 def path_of(sound: SoundInput) -> Path:
-    """Return the name of a recording: its file, the first of several, that of a pipe."""
-    if isinstance(sound, RawPcm):
+    """Return the name of a recording: its file, the first of several, that of a stream."""
+    if isinstance(sound, SoundStream):
         return Path(sound.name)
     if isinstance(sound, Audio):
         return sound.path
@@ -171,8 +196,8 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
 
     Parameters
     ----------
-    sound : Path, tuple of Path, RawPcm or Audio
-        A multichannel file, files of one channel each in the order of the microphones, a pipe, or what is
+    sound : Path, tuple of Path, SoundStream or Audio
+        A multichannel file, files of one channel each in the order of the microphones, a stream, or what is
         open already.
     expect_channels : int, optional
         Number of microphones of the array that it shall fit.
@@ -206,8 +231,8 @@ def open_sound(sound: SoundInput, expect_channels: int | None = None, *, strict:
         return sound
     with ExitStack() as opened:
         audio = (
-            RawAudio(sound)
-            if isinstance(sound, RawPcm)
+            sound.open()
+            if isinstance(sound, SoundStream)
             else MonoFiles([opened.enter_context(open_audio(path, 1, strict=False)) for path in sound])
         )
         audio.check_size(expect_channels)

@@ -26,6 +26,7 @@ COMMANDS = (
     "users.doctor",
     "users.bounds",
     "users.simulate",
+    "users.to_bag",
     "users.label",
     "users.train",
     "users.model",

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .sound_options import sound_of
+from .sound_options import bag_of, sound_of
 
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
@@ -64,11 +64,21 @@ def sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, Microph
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.ovad import Recording
 
+    bag = bag_of(arguments)
+    if bag is not None:
+        return _bag_and_array(arguments, bag)
     sound = sound_of(arguments)
     array = choose_array(path_of(sound), given_array(arguments))
     if isinstance(sound, Path) and sound.is_dir():
         sound = Recording.open(sound).audio_path
     return sound, array
+
+
+def _bag_and_array(arguments: argparse.Namespace, path: Path) -> "tuple[SoundInput, MicrophoneArray]":
+    from worldstate.adapters.ros.bag_input import needed_array, read_sound
+
+    sound, own = read_sound(path, arguments.audio_topic)
+    return sound, needed_array(path, given_array(arguments) or own)
 
 
 def stance(array: "MicrophoneArray") -> str:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .bag_options import add_storage_option
+
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_message import LogMessage, LogSink
     from worldstate.adapters.listen import Source, Step
@@ -20,7 +22,7 @@ LOG_FILES = ("mcap", "osi", "autoware")
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --mcap, --live, --osi, --autoware, --odas and --crossing."""
+    """Declare --mcap, --live, --osi, --autoware, --odas, --ros-bag, --ros-storage and --crossing."""
     add = parser.add_argument_group("viewers, logs and other stacks").add_argument
     add("--mcap", type=Path, metavar="FILE", help="write snapshots and scene for Foxglove")
     live = "serve the same on a Foxglove websocket, in real time (default port: 8765)"
@@ -28,7 +30,9 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     add("--osi", type=Path, metavar="FILE", help="write a trace of ASAM OSI SensorData")
     add("--autoware", type=Path, metavar="JSONL", help="write Autoware's PredictedObjects, one a line")
     add("--odas", metavar="HOST:PORT", help="send tracks as ODAS does; ODAS Studio listens at port 9000")
-    crossing = "metres ahead of the lane in which --osi and --autoware put who is only heard (default: 9)"
+    add("--ros-bag", type=Path, metavar="FOLDER", help="write advisories, objects and markers for ROS 2")
+    add_storage_option(parser)
+    crossing = "metres ahead of the lane where others than viewers find who is only heard (default: 9)"
     add("--crossing", type=float, default=9.0, metavar="M", help=crossing)
 
 
@@ -89,6 +93,11 @@ def _open_stacks(arguments: argparse.Namespace, logs: StateLogs, opened: ExitSta
         logs.stacks.append(
             lambda state: write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
         )
+    if arguments.ros_bag is not None:
+        from worldstate.adapters.ros.state_bag import state_bag
+
+        bag = state_bag(arguments.ros_bag, crossing_m, arguments.ros_storage)
+        logs.stacks.append(opened.enter_context(bag))
     if arguments.odas is not None:
         from worldstate.adapters.export.odas import odas_socket
 

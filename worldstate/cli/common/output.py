@@ -7,6 +7,8 @@ from pathlib import Path
 
 from worldstate.adapters.files.atomic import write_text
 
+_SINCE_1970_S = 1e9
+
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
@@ -47,7 +49,8 @@ def _readable(value: object) -> str:
     if value is None or value in ((), []):
         return "-"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        # Times since 1970 are told to the tenth of a second, as hops come.
+        return f"{value:.4g}" if abs(value) < _SINCE_1970_S else f"{value:.1f}"
     if isinstance(value, tuple | list):
         return ", ".join(_readable(item) for item in value)
     return str(value)

@@ -36,7 +36,7 @@ def progress_bar(description: str, total: float | None, *, quiet: bool = False) 
         yield Bar(progress, progress.add_task(description, total=total))
 
 
-def track(items: Iterable[Item], description: str, total: float) -> Iterator[Item]:
+def track(items: Iterable[Item], description: str, total: float | None = None) -> Iterator[Item]:
     """Yield the items, a step of a progress bar for each."""
     with progress_bar(description, total) as bar:
         for item in items:

@@ -27,17 +27,22 @@ from worldstate.cli.common.array_options import (
     given_array,
     stance,
 )
+from worldstate.cli.common.bag_options import add_topic_options, topics_of
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
 from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
-from worldstate.cli.common.sound_options import add_sound_options, sound_of
+from worldstate.cli.common.sound_options import add_sound_options, bag_of, sound_of
 from worldstate.ground.errors import InputFileError
 
 if TYPE_CHECKING:
+    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.camera.detections import DetectionLog
+    from worldstate.adapters.files.ego_speed import EgoSpeed
     from worldstate.adapters.files.engine_file import EngineSpeed
     from worldstate.adapters.listen import Source
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 EXAMPLE = """\
 examples:
@@ -46,7 +51,8 @@ examples:
   worldstate run ovad_dataset/SB1/left/2_00_0005 --context elm_street.json
   worldstate run second.wav --resume state.json --start 60 --save-state state2.json
   worldstate run drive.wav --ego-noise --engine-rpm rpm.csv
-  worldstate run ovad_dataset/SA1/left/1_00_0002 --mcap out.mcap"""
+  worldstate run ovad_dataset/SA1/left/1_00_0002 --mcap out.mcap
+  worldstate run street_bag --ros-bag states_bag"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_listen_options(parser)
     _add_recording_options(parser)
     add_camera_options(parser)
+    add_topic_options(parser)
     _add_output_options(parser)
     add_log_options(parser)
 
@@ -121,10 +128,12 @@ def _source(arguments: argparse.Namespace) -> "Source":
     from worldstate.adapters.listen import open_source
 
     settings = replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes_of(arguments))
+    sound, array, detections, ego = _input(arguments)
     return open_source(
-        sound_of(arguments),
-        array=given_array(arguments),
-        detections=arguments.detections,
+        sound,
+        array=array,
+        detections=detections,
+        ego=ego,
         camera=arguments.camera,
         miss_rates=arguments.miss_rates,
         model=arguments.model,
@@ -134,6 +143,23 @@ def _source(arguments: argparse.Namespace) -> "Source":
         engine=_engine(arguments),
         settings=settings,
     )
+
+
+def _input(
+    arguments: argparse.Namespace,
+) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, EgoSpeed | None]":
+    """Return sound, array, detections and speed of the ego: options, or what a bag holds."""
+    from worldstate.adapters.ros.bag_input import needed_array, read_bag
+    from worldstate.ground.errors import InvalidArgumentError
+
+    bag, array = bag_of(arguments), given_array(arguments)
+    if bag is None:
+        return sound_of(arguments), array, arguments.detections, None
+    if arguments.start:
+        raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
+    held = read_bag(bag, topics_of(arguments))
+    seen = arguments.detections or held.detections
+    return held.sound, needed_array(bag, array or held.array), seen, held.ego
 
 
 def _engine(arguments: argparse.Namespace) -> "EngineSpeed | None":

@@ -140,14 +140,14 @@ def run_recording(
             log.add(step)
             on_hop(step)
             end = Checkpoint(step.world, step.site, step.history)
-    elapsed_s = time.perf_counter() - started
+    elapsed_s, start_s = time.perf_counter() - started, seconds(source.start_ns)
     hops = HopTable.of_rows(_COLUMNS, log.rows)
     return RecordingReport(
         warning=log.meter.summary(),
         timeline=log.timeline(hops, source, title),
         hops=len(hops),
         peak_risk=float(hops.risk.max(initial=0.0)),
-        realtime_factor=float(hops.time_s.max(initial=0.0)) / elapsed_s,
+        realtime_factor=(float(hops.time_s.max(initial=start_s)) - start_s) / elapsed_s,
         health=log.health.summary(),
         bearings=check_bearings(hops, log.moving_rad),
         end=end,

@@ -1,0 +1,1 @@
+"""ROS 2 bags without ROS: sound, detections and odometry in, world-states out."""

@@ -1,0 +1,102 @@
+"""Message types of ROS 2: those that rosbags knows, and the definitions that ship here."""
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from worldstate.ground.errors import MissingExtraError
+
+AUDIO, ARRAY = "worldstate_msgs/msg/MultiChannelAudio", "worldstate_msgs/msg/MicrophoneArray"
+ADVISORIES = "worldstate_msgs/msg/RiskAdvisories"
+STAMPED_PCM, PCM = "audio_common_msgs/msg/AudioDataStamped", "audio_common_msgs/msg/AudioData"
+PCM_INFO = "audio_common_msgs/msg/AudioInfo"
+DETECTIONS, ODOMETRY = "vision_msgs/msg/Detection2DArray", "nav_msgs/msg/Odometry"
+OBJECTS = "autoware_perception_msgs/msg/PredictedObjects"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+
+_OURS = ("MultiChannelAudio", "MicrophoneArray", "RiskAdvisory", "RiskAdvisories")
+_OTHERS = ("audio_common_msgs", "autoware_perception_msgs", "vision_msgs")
+# What stands between the definitions of a file that holds several, as in bags.
+_SEPARATOR = "=" * 80 + "\nMSG: "
+_SPECIAL = {"string": "", "wstring": "", "bool": False}
+
+
+@cache
+def typestore() -> Any:
+    """Return rosbags' store of the types of ROS 2 Humble, with those that it lacks.
+
+    Raises
+    ------
+    MissingExtraError
+        Without rosbags.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise MissingExtraError("rosbags", "ros") from error
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in _definitions():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def message(name: str, values: Mapping[str, Any]) -> Any:
+    """Return a message of a type; fields that are not given are zero or empty."""
+    store = typestore()
+    fields = {
+        field: _value(kind, values.get(field))
+        for field, kind in store.fielddefs[name][1]
+        # The type has it, ROS has it not: of an empty message.
+        if field != "structure_needs_at_least_one_member"
+    }
+    return store.types[name](**fields)
+
+
+def header(stamp_ns: int, frame_id: str = "base_link") -> dict[str, Any]:
+    """Return the values of a header.
+
+    Examples
+    --------
+    >>> header(1_500_000_000)
+    {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'base_link'}
+    """
+    return {"stamp": time_of(stamp_ns), "frame_id": frame_id}
+
+
+def time_of(stamp_ns: int) -> dict[str, int]:
+    """Return the values of a time or a duration."""
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    return {"sec": sec, "nanosec": nanosec}
+
+
+def stamp_of(header: Any) -> int:
+    """Return the stamp of a header, ns."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _definitions() -> Iterator[tuple[str, str]]:
+    folder = files("worldstate") / "data"
+    for name in _OURS:
+        yield f"worldstate_msgs/msg/{name}", (folder / f"{name}.msg").read_text("utf-8")
+    for package in _OTHERS:
+        for part in (folder / f"{package}.msg").read_text("utf-8").split(_SEPARATOR)[1:]:
+            name, _, text = part.partition("\n")
+            yield f"{package}/msg/{name.rpartition('/')[2]}", text
+
+
+def _value(kind: tuple[Any, Any], value: Any) -> Any:
+    """Return a value in the form that its field wants: message, number, text, or a list of these."""
+    node, about = kind
+    if node.name == "NAME":
+        return message(about, value or {})
+    if node.name == "BASE":
+        return _SPECIAL.get(about[0], 0) if value is None else value
+    of_one, length = about
+    values = value if value is not None else [None] * (length if node.name == "ARRAY" else 0)
+    if of_one[0].name == "BASE" and of_one[1][0] not in _SPECIAL:
+        given = [] if values is None else [0 if one is None else one for one in values]
+        return np.asarray(values if isinstance(values, np.ndarray) else given, dtype=of_one[1][0])
+    return [_value(of_one, one) for one in values]

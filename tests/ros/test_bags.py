@@ -1,0 +1,388 @@
+"""Bags of ROS 2: what is written is read by other programs, what is read is a recording like any other."""
+
+import json
+import logging
+import math
+import re
+import shutil
+import sqlite3
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted_states import scripted_states
+
+from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.export.autoware import autoware_objects
+from worldstate.adapters.export.scene import scene_update
+from worldstate.adapters.files.ego_speed import EgoSpeed
+from worldstate.adapters.ros.bag_input import BagTopics, read_bag
+from worldstate.adapters.ros.bag_writer import bag_writer
+from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
+from worldstate.adapters.ros.state_bag import state_bag
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+RATE_HZ, CHANNELS = 8000, 4
+STATES = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in scripted_states()]
+
+
+def sound_of(n_samples: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-0.5, 0.5, (n_samples, CHANNELS)).astype(np.float32)
+
+
+def block(samples: np.ndarray, stamp_ns: int, **changed: object) -> dict[str, object]:
+    layout = {"sample_rate": RATE_HZ, "channels": samples.shape[1], "layout": "interleaved"}
+    return {"header": header(stamp_ns), "data": samples.ravel()} | layout | changed
+
+
+def write_blocks(path: Path, samples: np.ndarray, *, lost: tuple[int, ...] = (), **changed: object) -> Path:
+    """Write a second in blocks of .1 s, from 5 s on."""
+    with bag_writer(path) as write:
+        for k, start in enumerate(range(0, len(samples), RATE_HZ // 10)):
+            if k not in lost:
+                stamp_ns = 5_000_000_000 + k * 100_000_000
+                part = samples[start : start + RATE_HZ // 10]
+                write("/mics", AUDIO, stamp_ns, block(part, stamp_ns, **changed))
+    return path
+
+
+@pytest.fixture(scope="module", params=["mcap", "sqlite3"])
+def written(request, tmp_path_factory):
+    """States as a bag, in either storage."""
+    path = tmp_path_factory.mktemp("bag") / "states"
+    with state_bag(path, 7.0, request.param) as write:
+        for state in STATES:
+            write(state)
+    return path
+
+
+def read_by_others(path: Path) -> list[tuple[str, int, object]]:
+    """Return topic, time and message of a bag: MCAP by Foxglove's own reader, SQLite by rosbags'."""
+    (storage,) = (file for file in path.iterdir() if file.suffix != ".yaml")
+    if storage.suffix == ".mcap":
+        from mcap.reader import make_reader
+        from mcap_ros2.decoder import DecoderFactory
+
+        with storage.open("rb") as file:
+            found = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+            return [(channel.topic, said.log_time, message) for _, channel, said, message in found]
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([path]) as bag:
+        return [(one.topic, time, bag.deserialize(data, one.msgtype)) for one, time, data in bag.messages()]
+
+
+def test_other_readers_find_what_the_states_say(written):
+    read = read_by_others(written)
+    for topic in ("advisories", "objects", "markers"):
+        times = [time for name, time, _ in read if name == f"/worldstate/{topic}"]
+        assert times == [state.stamp_ns for state in STATES]
+    advisories = [message for name, _, message in read if name.endswith("advisories")]
+    for message, state in zip(advisories, STATES, strict=True):
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == state.stamp_ns
+        assert message.header.frame_id == "base_link"
+        assert [one.direction for one in message.advisories] == [cue.direction for cue in state.cues]
+        for told, cue in zip(message.advisories, state.cues, strict=True):
+            assert (told.risk, told.azimuth, told.raised) == (
+                cue.risk,
+                cue.azimuth_rad,
+                cue.advisory is not None,
+            )
+            assert dict(zip(told.horizon, told.within, strict=True)) == {
+                float(after): share for after, share in (cue.within or {}).items()
+            }
+            assert list(told.alpha) == ([] if cue.alpha is None else [cue.alpha]), "unknown is empty, not 0"
+    assert any(one.raised for message in advisories for one in message.advisories)
+
+
+def test_objects_in_the_bag_are_those_of_autoware(written):
+    found = [message for name, _, message in read_by_others(written) if name.endswith("objects")]
+    for message, state in zip(found, STATES, strict=True):
+        wanted = autoware_objects(state, 7.0)["objects"]
+        assert [bytes(one.object_id.uuid) for one in message.objects] == [
+            bytes(one["object_id"]["uuid"]) for one in wanted
+        ]
+        for one, said in zip(message.objects, wanted, strict=True):
+            assert one.existence_probability == pytest.approx(said["existence_probability"], rel=1e-6)
+            at = said["kinematics"]["initial_pose_with_covariance"]
+            pose = one.kinematics.initial_pose_with_covariance
+            assert pose.pose.position.y == at["pose"]["position"]["y"]
+            assert list(pose.covariance) == at["covariance"]
+            assert len(one.kinematics.predicted_paths[0].path) == 7
+
+
+def test_markers_draw_the_scene_and_nothing_of_the_one_before(written):
+    for _, _, message in (one for one in read_by_others(written) if one[0].endswith("markers")):
+        first, *drawn = message.markers
+        assert first.action == 3, "all that was there goes"
+        assert len({(one.ns, one.id) for one in drawn}) == len(drawn), "RViz would draw one of two"
+        assert all(max(one.scale.x, one.scale.y, one.scale.z) > 0.0 and one.color.a > 0.0 for one in drawn)
+    scene = scene_update(STATES[-1])
+    assert {one.ns for one in drawn} == {item.id for item in scene.entities}
+    areas = [one for one in drawn if one.type == 11]
+    assert sum(len(one.points) for one in areas) == sum(
+        len(area.points) for item in scene.entities for area in item.triangles
+    )
+
+
+def test_a_message_is_laid_out_as_cdr_says(tmp_path):
+    """Parsed by hand: a header of four bytes, little endian, each value at a multiple of its size."""
+    samples = sound_of(3)
+    with bag_writer(tmp_path / "one", "sqlite3") as write:
+        write("/mics", AUDIO, 1_500_000_000, block(samples, 1_500_000_000))
+    with sqlite3.connect(tmp_path / "one" / "one.db3") as database:
+        ((data,),) = database.execute("select data from messages").fetchall()
+    assert data[:4] == b"\x00\x01\x00\x00"
+    body = data[4:]
+    sec, nanosec, size = struct.unpack_from("<iII", body, 0)
+    assert (sec, nanosec, body[12 : 12 + size]) == (1, 500_000_000, b"base_link\x00")
+    at = (12 + size + 3) // 4 * 4
+    rate, channels = struct.unpack_from("<IH", body, at)
+    assert (rate, channels) == (RATE_HZ, CHANNELS)
+    at = (at + 6 + 3) // 4 * 4
+    (size,) = struct.unpack_from("<I", body, at)
+    assert body[at + 4 : at + 4 + size] == b"interleaved\x00"
+    at = (at + 4 + size + 3) // 4 * 4
+    (count,) = struct.unpack_from("<I", body, at)
+    assert body[at + 4 :] == samples.tobytes()
+    assert count == samples.size
+
+
+@pytest.fixture(scope="module")
+def bag_of_approach(approach, tmp_path_factory):
+    path = tmp_path_factory.mktemp("approach") / "street"
+    assert main(["to-bag", str(approach.folder), str(path), "--start", "1700000000"]) == 0
+    return path
+
+
+def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach, tmp_path):
+    out, again = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    assert main(["run", str(approach.folder), "--out", str(out)]) == 0
+    assert main(["run", str(bag_of_approach), "--out", str(again), "--ros-bag", str(tmp_path / "c")]) == 0
+    of_folder, of_bag = ([json.loads(line) for line in path.open()] for path in (out, again))
+    assert len(of_folder) == len(of_bag) > 50
+    for one, other in zip(of_folder, of_bag, strict=True):
+        assert other["stamp_ns"] - one["stamp_ns"] == 1_700_000_000 * 10**9
+        assert other["context"]["ego_speed_mps"] == 0.0, "the odometry of a standing ego"
+        assert [cue["advisory"] is None for cue in one["cues"]] == [
+            cue["advisory"] is None for cue in other["cues"]
+        ]
+        for cue, as_before in zip(one["cues"], other["cues"], strict=True):
+            assert cue["risk"] == pytest.approx(as_before["risk"], abs=1e-9)
+        assert [one["status"] for one in one["entities"]] == [one["status"] for one in other["entities"]]
+    assert len(read_by_others(tmp_path / "c")) == 3 * len(of_bag)
+
+
+def test_other_commands_hear_a_bag_by_its_own_array(bag_of_approach, tmp_path, capsys):
+    assert main(["bearings", str(bag_of_approach), "--out", str(tmp_path / "b.csv"), "--json"]) == 0
+    assert "56 microphones" in capsys.readouterr().out
+    assert len((tmp_path / "b.csv").read_text().splitlines()) > 50
+
+
+def test_sound_comes_back_sample_for_sample_in_either_layout(tmp_path):
+    samples = sound_of(9600)
+    write_blocks(tmp_path / "interleaved", samples)
+    with bag_writer(tmp_path / "planar", "sqlite3") as write:
+        for k in range(3):
+            part = samples[3200 * k : 3200 * (k + 1)].T
+            write("/mics", AUDIO, k, block(part, 1 + k * 400_000_000, layout="planar", channels=CHANNELS))
+    for name, start_ns in (("interleaved", 5_000_000_000), ("planar", 1)):
+        sound = read_bag(tmp_path / name).sound
+        assert sound.start_ns == start_ns
+        with open_sound(sound, CHANNELS) as audio:
+            blocks = list(audio.blocks(700))
+            assert audio.duration_s == pytest.approx(1.2)
+        assert {len(one) for one in blocks[:-1]} == {700}
+        np.testing.assert_array_equal(np.concatenate(blocks), samples)
+
+
+def test_bytes_of_audio_common_are_read_as_its_info_says(tmp_path):
+    whole = np.random.default_rng(1).integers(-(2**15), 2**15, (RATE_HZ * 2, 2), dtype=np.int16)
+    info = {"channels": 2, "sample_rate": RATE_HZ, "sample_format": "S16LE", "coding_format": "wave"}
+    for name, kind in (("stamped", "AudioDataStamped"), ("plain", "AudioData")):
+        with bag_writer(tmp_path / name) as write:
+            write("/audio_info", "audio_common_msgs/msg/AudioInfo", 0, info)
+            for k in range(4):
+                data = np.frombuffer(whole[4000 * k : 4000 * (k + 1)].tobytes(), np.uint8)
+                said = {"header": header(10**9 * 7 + k * 500_000_000), "audio": {"data": data}}
+                values = said if name == "stamped" else {"data": data}
+                write("/audio", f"audio_common_msgs/msg/{kind}", 10**9 * 7 + (k + 1) * 500_000_000, values)
+        sound = read_bag(tmp_path / name).sound
+        assert sound.start_ns == 7 * 10**9, "a block without a stamp ends when it is recorded"
+        with open_sound(sound, 2) as audio:
+            heard = np.concatenate(list(audio.blocks()))
+        np.testing.assert_array_equal(heard, whole.astype(np.float32) / 2**15)
+
+
+def test_a_lost_message_is_silence_that_is_said_and_a_long_gap_is_refused(tmp_path, caplog):
+    samples = sound_of(4 * RATE_HZ)
+    gone = write_blocks(tmp_path / "one_lost", samples, lost=(20,))
+    with caplog.at_level(logging.WARNING), open_sound(read_bag(gone).sound) as audio:
+        heard = np.concatenate(list(audio.blocks()))
+    assert not heard[16_000:16_800].any()
+    np.testing.assert_array_equal(heard[16_800:], samples[16_800:])
+    assert "0.100 s of /mics are missing at 2.000 s" in caplog.text
+    long = write_blocks(tmp_path / "many_lost", samples, lost=tuple(range(12, 34)))
+    with (
+        open_sound(read_bag(long).sound) as audio,
+        pytest.raises(InputFileError, match=r"at 1.200 s the next is 2.200 s off"),
+    ):
+        list(audio.blocks())
+
+
+def box(left: float, top: float, width: float, height: float, label: str, score: float) -> dict[str, object]:
+    centre = {"position": {"x": left + width / 2, "y": top + height / 2}}
+    return {
+        "bbox": {"center": centre, "size_x": width, "size_y": height},
+        "results": [
+            {"hypothesis": {"class_id": "person", "score": score / 2}},
+            {"hypothesis": {"class_id": label, "score": score}},
+        ],
+    }
+
+
+def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
+    with bag_writer(tmp_path / "bag") as write:
+        for k in range(3):
+            stamp_ns = 3_000_000_000 + k * 500_000_000
+            write("/mics", AUDIO, stamp_ns, block(sound_of(4000), stamp_ns))
+            found = [box(10, 20, 30, 40, "car", 0.8)] if k else []
+            write("/boxes", DETECTIONS, stamp_ns + 7, {"header": header(stamp_ns), "detections": found})
+            twist = {"twist": {"linear": {"x": 2.0 * k}}}
+            write("/odom", ODOMETRY, stamp_ns + 9, {"header": header(stamp_ns), "twist": twist})
+    held = read_bag(tmp_path / "bag")
+    assert held.detections.stamps_ns.tolist() == [3_000_000_000, 3_500_000_000, 4_000_000_000]
+    assert [len(frame) for frame in held.detections.frames] == [0, 1, 1], (
+        "an image without boxes was searched"
+    )
+    frame = held.detections.frames[1]
+    assert (frame.labels, frame.scores.tolist(), frame.boxes_px.tolist()) == (
+        ("car",),
+        [0.8],
+        [[10.0, 20.0, 40.0, 60.0]],
+    )
+    assert held.ego.at(3_750_000_000) == 3.0
+    assert held.ego.moves
+    assert held.array is None
+
+
+def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
+    from worldstate.adapters.listen import ListenSettings, listen_steps, open_source
+    from worldstate.frontend import MicrophoneArray
+
+    path = write_blocks(tmp_path / "bag", sound_of(2 * RATE_HZ))
+    stamps = np.array([5_000_000_000, 7_000_000_000])
+    source = open_source(
+        read_bag(path).sound,
+        array=MicrophoneArray([[0, y, 0] for y in (0.1, 0.05, -0.05, -0.1)]),
+        ego=EgoSpeed(stamps, np.array([0.0, 8.0])),
+        settings=ListenSettings(uncalibrated=True),
+    )
+    said = {step.state.stamp_ns: step.state.context.ego_speed_mps for step in listen_steps(source)}
+    assert list(said) == [6_000_000_000 + k * 100_000_000 for k in range(11)]
+    assert list(said.values()) == pytest.approx([4.0 + 0.4 * k for k in range(11)])
+
+
+def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
+    samples = sound_of(2 * RATE_HZ)
+    with bag_writer(tmp_path / "two") as write:
+        for topic in ("/front", "/rear"):
+            write(topic, AUDIO, 0, block(samples, 0))
+    with bag_writer(tmp_path / "blind") as write:
+        write("/odom", ODOMETRY, 0, {"header": header(0)})
+    write_blocks(tmp_path / "planes", samples, layout="spiral")
+    write_blocks(tmp_path / "three", samples, channels=3)
+    bad = samples.copy()
+    bad[900, 2] = math.nan
+    write_blocks(tmp_path / "nan", bad)
+    with bag_writer(tmp_path / "changing") as write:
+        write("/mics", AUDIO, 0, block(samples, 1))
+        write("/mics", AUDIO, 1, block(samples, 2 * 10**9 + 1, sample_rate=16_000))
+    array = tmp_path / "mics.csv"
+    array.write_text("".join(f"0,{y},0\n" for y in (0.1, 0.0, -0.1)))
+    four = tmp_path / "four.csv"
+    four.write_text("".join(f"0,{y},0\n" for y in (0.1, 0.05, -0.05, -0.1)))
+    write_blocks(tmp_path / "four", samples)
+    for name, options, said in (
+        ("two", [], "expected --audio-topic with one of /front, /rear"),
+        ("two", ["--audio-topic", "/left"], "on /left (--audio-topic), got /front (worldstate_msgs"),
+        ("two", ["--audio-topic", "/front"], "expected --array, or a message of worldstate_msgs"),
+        ("blind", [], "MultiChannelAudio or audio_common_msgs/msg/AudioDataStamped or"),
+        ("planes", [], "expected interleaved or planar, got 'spiral'"),
+        ("three", [], "expected samples of 3 channels, got 3200 numbers"),
+        ("nan", ["--array", str(array)], "expected finite samples, got nan in channel 3, sample 900"),
+        ("changing", ["--array", str(four)], "expected 8000 Hz and 4 channels as in the first message"),
+        ("four", ["--array", str(array), "--uncalibrated"], "expected 3 channels, one per microphone, got 4"),
+        ("four", ["--array", str(array), "--start", "3"], "--start: expected none with a bag"),
+        ("four", ["--array", str(array), "--detections-topic", "/x"], "on /x (--detections-topic), got"),
+        ("four", ["--array", str(array), "--ros-bag", str(tmp_path / "two")], "expected a name that is free"),
+    ):
+        options = [*options, *(["--uncalibrated"] if "--array" in options else [])]
+        assert main(["run", str(tmp_path / name), *options]) == 2, (name, options)
+        assert said in " ".join(capsys.readouterr().err.split()), (name, options)
+
+
+def test_an_ego_that_cannot_be_is_refused():
+    with pytest.raises(InvalidArgumentError, match="at most 100 m/s, got 250"):
+        EgoSpeed(np.array([0, 1]), np.array([0.0, -250.0]))
+    with pytest.raises(InvalidArgumentError, match="increasing"):
+        EgoSpeed(np.array([1, 1]), np.array([0.0, 1.0]))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
+    samples = sound_of(RATE_HZ)
+    with bag_writer(tmp_path / "whole", storage) as write:
+        for k in range(10):
+            write("/mics", AUDIO, k, block(samples[800 * k : 800 * (k + 1)], 1 + k * 100_000_000))
+    (good,) = (file for file in (tmp_path / "whole").iterdir() if file.suffix != ".yaml")
+    content, rng, refused = good.read_bytes(), np.random.default_rng(3), 0
+    damaged = tmp_path / f"damaged{good.suffix}"
+    for trial in range(40):
+        spoiled = bytearray(content)
+        if trial % 2:
+            spoiled = spoiled[: rng.integers(len(spoiled))]
+        else:
+            for place in rng.integers(0, len(spoiled), 8 if trial % 4 else 2000):
+                spoiled[place] = rng.integers(256)
+        damaged.write_bytes(spoiled)
+        try:
+            with open_sound(read_bag(damaged, BagTopics()).sound, strict=False) as audio:
+                list(audio.blocks())
+        except InputFileError as error:
+            refused += 1
+            assert str(error).startswith(str(damaged))
+    assert refused >= 20
+
+
+def test_a_run_that_fails_leaves_no_bag(tmp_path):
+    with pytest.raises(RuntimeError), state_bag(tmp_path / "out") as write:
+        write(STATES[0])
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, capsys):
+    from worldstate.adapters.ros import message_types
+
+    message_types.typestore.cache_clear()
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
+    states = tmp_path / "states.jsonl"
+    states.write_text("".join(state.to_json() + "\n" for state in STATES))
+    assert main(["replay", str(states), "--ros-bag", str(tmp_path / "out")]) == 2
+    assert "worldstate[ros]" in capsys.readouterr().err
+    shutil.copy(states, tmp_path / "a.mcap")
+    assert main(["run", str(tmp_path / "a.mcap")]) == 2
+    assert "worldstate[ros]" in capsys.readouterr().err
+
+
+def test_the_program_of_the_page_runs(bag_of_approach, tmp_path, monkeypatch):
+    page = Path(__file__).resolve().parents[2] / "docs" / "ros.md"
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (tmp_path / "street_bag").symlink_to(bag_of_approach)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(program, str(page), "exec"), {})
+    assert len(read_by_others(tmp_path / "states_bag")) > 150
