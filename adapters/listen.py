@@ -49,6 +49,7 @@ from worldstate.state import Context, WorldState
 from .acoustic import AcousticAdapter, Signature
 from .acoustic_grounding import Grounding
 from .acoustic_sequence import sequence_of
+from .own_parts import OtherModality, Waiting
 
 BLOCKS_PER_SECOND = 20
 
@@ -189,6 +190,8 @@ class Source:
         Asked in place of the detections: a camera that runs.
     ego : EgoSpeed or None
         Speed of the ego vehicle over time, which then stands in the context.
+    others : tuple of callables
+        What other sensors measured, each returning it in the order of stamps, on the clock of the sound.
 
     Examples
     --------
@@ -226,6 +229,7 @@ class Source:
     history: SequenceHistory | None = None
     co_evidence: CoEvidenceChannel | None = None
     ego: EgoSpeed | None = None
+    others: tuple[OtherModality, ...] = ()
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -321,6 +325,7 @@ def open_source(
     start_s: float = 0.0,
     engine: Path | str | EngineSpeed | None = None,
     ego: EgoSpeed | None = None,
+    others: Sequence[OtherModality] = (),
     settings: ListenSettings | None = None,
 ) -> Source:
     """Find everything that belongs to a sound file or to a recording folder.
@@ -358,6 +363,8 @@ def open_source(
         Speed of the own engine, as `read_engine` reads it; its lines are cancelled, with `ego_noise` only.
     ego : EgoSpeed, optional
         Speed of the ego vehicle over time, in place of the one speed of the context.
+    others : sequence of callables, optional
+        What other sensors measured: functions that return `Measurement` and `PositionScan` in their order.
     settings : ListenSettings, optional
         How it is listened to: budget, band, azimuths, site adaptation, ego-noise, boxes.
 
@@ -404,6 +411,7 @@ def open_source(
         start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
         or (sound.start_ns if isinstance(sound, SoundStream) else 0),
         ego=ego,
+        others=tuple(others),
         engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
     )
 
@@ -607,9 +615,13 @@ def listen_steps(source: Source) -> Iterator[Step]:
     [(60,), (60,), (60,)]
     """
     world, signature, reader = source.world(), source.signature(), source.reader()
+    # What the belief to go on from has taken in already is left out.
+    waiting = Waiting(source.others, -1 if source.resume is None else source.resume.stamp_ns)
     measured = measure_steps(source, lambda: world.explanation.none, signature, reader)
     for frame, measurement in measured:
         world = _driven(world, source.ego, frame.stamp_ns)
+        for other in waiting.until(measurement.stamp_ns):
+            world = world.update(other)
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         site = signature.estimate if isinstance(signature, SiteSignature) else None
         history = reader.history if isinstance(reader, SequenceReader) else None

@@ -5,18 +5,22 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .command import add_choice
-
 if TYPE_CHECKING:
     from worldstate.adapters.camera.detections import DetectionFilter
     from worldstate.adapters.camera.onnx_detector import OnnxDetector, OnnxSettings
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
 
-def add_detector_options(parser: argparse.ArgumentParser) -> None:
+# Background subtraction: its score is no confidence.
+MOVING = "motion", "knn"
+BUILT_IN = *MOVING, "onnx"
+
+
+def add_detector_options(parser: argparse.ArgumentParser, default: str | None = "motion") -> None:
     """Declare --detector, --onnx-model and --labels."""
-    kinds = "background subtraction by mixtures or neighbours, or a model"
-    add_choice(parser, "--detector", kinds, "motion", "knn", "onnx")
+    kinds = "motion, knn: background subtraction by mixtures or neighbours; onnx: a model; or the name of one"
+    told = f"{kinds} that an installed package brings (default: {default or 'none'})"
+    parser.add_argument("--detector", metavar="NAME", default=default, help=told)
     parser.add_argument("--onnx-model", type=Path, metavar="ONNX", help="model in YOLO's output form")
     parser.add_argument("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of the model")
 
@@ -27,10 +31,11 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
     Raises
     ------
     InvalidArgumentError
-        If a model is wanted and none given.
+        If a model is wanted and none given, or no package brings a detector of that name.
     """
     from worldstate.adapters.camera.motion_detector import MotionDetector, MotionSettings
     from worldstate.adapters.camera.onnx_detector import OnnxSettings
+    from worldstate.adapters.own_parts import load_part
     from worldstate.ground.errors import InvalidArgumentError
 
     if arguments.detector == "onnx":
@@ -39,6 +44,9 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
         make = partial(_opened, arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
         make()  # what is wrong with a model is said before the work begins
         return make
+    if arguments.detector not in MOVING:
+        make_own: MakeDetector = load_part("worldstate.detectors", arguments.detector, "--detector", BUILT_IN)
+        return make_own
     settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
     return partial(MotionDetector, settings)
 
@@ -56,7 +64,7 @@ def detector_filter(arguments: argparse.Namespace) -> "DetectionFilter":
     from worldstate.adapters.camera.camera_channel import any_motion
     from worldstate.adapters.camera.detections import DetectionFilter
 
-    return DetectionFilter() if arguments.detector == "onnx" else any_motion()
+    return any_motion() if arguments.detector in MOVING else DetectionFilter()
 
 
 def detector_name(arguments: argparse.Namespace) -> str:

@@ -22,7 +22,7 @@ LOG_FILES = ("mcap", "osi", "autoware")
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --mcap, --live, --osi, --autoware, --odas, --ros-bag, --ros-storage and --crossing."""
+    """Declare --mcap, --live, --osi, --autoware, --odas, --ros-bag, --export and --crossing."""
     add = parser.add_argument_group("viewers, logs and other stacks").add_argument
     add("--mcap", type=Path, metavar="FILE", help="write snapshots and scene for Foxglove")
     live = "serve the same on a Foxglove websocket, in real time (default port: 8765)"
@@ -32,6 +32,8 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     add("--odas", metavar="HOST:PORT", help="send tracks as ODAS does; ODAS Studio listens at port 9000")
     add("--ros-bag", type=Path, metavar="FOLDER", help="write advisories, objects and markers for ROS 2")
     add_storage_option(parser)
+    other = "pass states to an exporter that an installed package brings; may be given several times"
+    add("--export", action="append", default=[], metavar="NAME=TARGET", help=other)
     crossing = "metres ahead of the lane where others than viewers find who is only heard (default: 9)"
     add("--crossing", type=float, default=9.0, metavar="M", help=crossing)
 
@@ -102,6 +104,12 @@ def _open_stacks(arguments: argparse.Namespace, logs: StateLogs, opened: ExitSta
         from worldstate.adapters.export.odas import odas_socket
 
         logs.stacks.append(opened.enter_context(odas_socket(arguments.odas)))
+    for text in arguments.export:
+        from worldstate.adapters.own_parts import load_part, part_and_target
+
+        name, target = part_and_target("--export", text)
+        export = load_part("worldstate.exporters", name, "--export")
+        logs.stacks.append(opened.enter_context(export(target)))
 
 
 @contextmanager

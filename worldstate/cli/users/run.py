@@ -29,6 +29,12 @@ from worldstate.cli.common.array_options import (
 )
 from worldstate.cli.common.bag_options import add_topic_options, topics_of
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
+from worldstate.cli.common.detector_options import (
+    MOVING,
+    add_detector_options,
+    detector_filter,
+    detector_maker,
+)
 from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
@@ -63,6 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_listen_options(parser)
     _add_recording_options(parser)
     add_camera_options(parser)
+    add_detector_options(parser, default=None)
     add_topic_options(parser)
     _add_output_options(parser)
     add_log_options(parser)
@@ -77,6 +84,8 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--engine-rpm", type=Path, metavar="CSV", help=rpm)
     firings = "firings a turn: half the cylinders (default: %(default)g)"
     add("--engine-lines", type=float, default=2.0, metavar="N", help=firings)
+    other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"
+    add("--measurements", action="append", default=[], metavar="NAME=FILE", help=other)
     add("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
     add("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
 
@@ -126,8 +135,11 @@ def _source(arguments: argparse.Namespace) -> "Source":
     from dataclasses import replace
 
     from worldstate.adapters.listen import open_source
+    from worldstate.adapters.own_parts import other_modality
 
-    settings = replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes_of(arguments))
+    boxes = detector_filter(arguments) if arguments.detector in MOVING else boxes_of(arguments)
+    settings = replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes)
+    detector = None if arguments.detector is None else detector_maker(arguments)()
     sound, array, detections, ego = _input(arguments)
     return open_source(
         sound,
@@ -140,6 +152,8 @@ def _source(arguments: argparse.Namespace) -> "Source":
         context=given_context(arguments),
         resume=arguments.resume,
         start_s=arguments.start,
+        detector=detector,
+        others=[other_modality("--measurements", text) for text in arguments.measurements],
         engine=_engine(arguments),
         settings=settings,
     )

@@ -1,0 +1,169 @@
+"""Parts that installed packages bring, each by its entry point: detectors, exporters, other modalities.
+
+A package names them in its pyproject.toml, and the command line names one of them:
+
+| group of entry points | what stands there | option |
+|---|---|---|
+| `worldstate.detectors` | `DetectorPart` | ``--detector NAME`` |
+| `worldstate.exporters` | `ExporterPart` | ``--export NAME=TARGET`` |
+| `worldstate.measurements` | `MeasurementsPart` | ``--measurements NAME=FILE`` |
+"""
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
+from functools import partial
+from importlib.metadata import entry_points
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeAlias
+
+from worldstate.adapters.camera.detector import Detector
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.position import PositionScan
+from worldstate.state import WorldState
+
+Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
+# What other modalities say, each time it is asked for anew.
+OtherModality: TypeAlias = Callable[[], Iterable[Measurement | PositionScan]]
+
+
+class DetectorPart(Protocol):
+    """Makes a detector, a new one for every video; a class without arguments does.
+
+    Examples
+    --------
+    >>> from worldstate.adapters.camera.motion_detector import MotionDetector
+    >>> part: DetectorPart = MotionDetector
+    """
+
+    def __call__(self) -> Detector:
+        """Return a detector that has seen no image."""
+        ...
+
+
+class ExporterPart(Protocol):
+    """Opens what states go to: a file, a socket, another stack.
+
+    Examples
+    --------
+    >>> from contextlib import contextmanager
+    >>> @contextmanager
+    ... def printed(target):
+    ...     yield lambda state: print(target, state.seq)
+    >>> part: ExporterPart = printed
+    >>> with part("out") as export:
+    ...     export(WorldState(0, 7))
+    out 7
+    """
+
+    def __call__(self, target: str, /) -> AbstractContextManager[Callable[[WorldState], object]]:
+        """Return a context manager that lends a function of one state, called once a hop."""
+        ...
+
+
+class MeasurementsPart(Protocol):
+    """Reads what another sensor recorded, as measurements on the clock of the sound.
+
+    Examples
+    --------
+    >>> def silent(path): return iter(())
+    >>> part: MeasurementsPart = silent
+    >>> list(part(Path("radar.log")))
+    []
+    """
+
+    def __call__(self, path: Path, /) -> Iterable[Measurement | PositionScan]:
+        """Return measurements in the order of their stamps; what wraps a `MeasurementAdapter` does."""
+        ...
+
+
+def installed(group: Group) -> list[str]:
+    """Return the names that installed packages bring.
+
+    Examples
+    --------
+    >>> installed("worldstate.exporters")
+    []
+    """
+    return sorted({one.name for one in entry_points(group=group)})
+
+
+def load_part(group: Group, name: str, option: str, built_in: Iterable[str] = ()) -> Any:
+    """Import what a package brings under a name; nothing of it was imported before.
+
+    Parameters
+    ----------
+    group : str
+        Group of entry points.
+    name : str
+        As the package calls it.
+    option : str
+        That named it, for messages.
+    built_in : iterable of str
+        Other names that the option takes, for messages.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If no package brings it, two do, or its module cannot be imported.
+    """
+    found = list(entry_points(group=group, name=name))
+    if len({one.value for one in found}) != 1:
+        known = ", ".join([*built_in, *installed(group)]) or "none is installed"
+        several = f", which {len(found)} packages bring" if found else ""
+        raise InvalidArgumentError(f"{option}: expected one of {group} ({known}), got {name!r:.60}{several}")
+    try:
+        part = found[0].load()
+    # A module of somebody else's may fail in any way while it is imported.
+    except Exception as error:
+        where = f"{option}: expected {found[0].value} to be importable"
+        raise InvalidArgumentError(f"{where} ({type(error).__name__}: {error})") from error
+    if not callable(part):
+        raise InvalidArgumentError(f"{option}: expected {found[0].value} to be callable, got {part!r:.60}")
+    return part
+
+
+def part_and_target(option: str, text: str) -> tuple[str, str]:
+    """Split NAME=TARGET.
+
+    Examples
+    --------
+    >>> part_and_target("--export", "table=out.csv")
+    ('table', 'out.csv')
+    """
+    name, equals, target = text.partition("=")
+    if not (name and equals and target):
+        raise InvalidArgumentError(f"{option}: expected NAME=TARGET, got {text!r:.60}")
+    return name, target
+
+
+def other_modality(option: str, text: str) -> OtherModality:
+    """Return what NAME=FILE reads, by the package that brings NAME."""
+    name, path = part_and_target(option, text)
+    return partial(_checked, load_part("worldstate.measurements", name, option), Path(path), name)
+
+
+class Waiting:
+    """Measurements of other modalities that wait for their time, oldest first."""
+
+    def __init__(self, others: Iterable[OtherModality], after_ns: int) -> None:
+        merged = heapq.merge(*(one() for one in others), key=attrgetter("stamp_ns"))
+        self._rest = (one for one in merged if one.stamp_ns > after_ns)
+        self._next = next(self._rest, None)
+
+    def until(self, stamp_ns: int) -> Iterator[Measurement | PositionScan]:
+        """Yield what was measured up to a time and has not been yielded before."""
+        while self._next is not None and self._next.stamp_ns <= stamp_ns:
+            yield self._next
+            self._next = next(self._rest, None)
+
+
+def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Measurement | PositionScan]:
+    for one in part(path):
+        if not isinstance(one, Measurement | PositionScan):
+            raise InvalidArgumentError(
+                f"{name}: expected measurements of Measurement or PositionScan, got {one!r:.60}"
+            )
+        yield one

@@ -1,0 +1,164 @@
+"""Parts of one's own: the example package is installed, and its parts are named on the command line."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scripted_states import scripted_states
+
+from worldstate import AcousticAdapter
+from worldstate.adapters import write_array_xml
+from worldstate.adapters.own_parts import installed
+from worldstate.cli.main import main
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_parts"
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """The example, installed where nothing else is."""
+    target, tree = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("tree") / "own_parts"
+    shutil.copytree(EXAMPLE, tree)
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(target)]
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "install", *options, str(tree)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return target
+
+
+@pytest.fixture
+def own_parts(package, monkeypatch):
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.delitem(sys.modules, "own_parts", raising=False)
+    import own_parts
+
+    return own_parts
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "states.jsonl"
+    path.write_text("".join(state.to_json() + "\n" for state in scripted_states()))
+    return path
+
+
+def test_an_exporter_gets_every_state(own_parts, log, tmp_path):
+    assert main(["replay", str(log), "--export", f"table={tmp_path / 'risk.csv'}"]) == 0
+    with (tmp_path / "risk.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cues = [(state, cue) for state in scripted_states() for cue in state.cues]
+    assert [(row["side"], row["risk"], row["advisory"]) for row in rows] == [
+        (cue.direction, str(round(cue.risk, 4)), str(cue.advisory is not None)) for _, cue in cues
+    ]
+
+
+def test_a_sensor_of_ones_own_places_who_is_only_heard(own_parts, approach, tmp_path):
+    """It announces itself on the left, 20 m away, from 2 s on; what sounds comes from the right."""
+    messages = [
+        {"stamp_ns": round(time_s * 1e9), "x_m": 9.0, "y_m": 30.0 - 5.0 * time_s}
+        for time_s in np.arange(2.0, 4.0, 0.1)
+    ]
+    beacons, out = tmp_path / "v2x.jsonl", tmp_path / "states.jsonl"
+    beacons.write_text("".join(json.dumps(one) + "\n" for one in messages))
+    heard = tmp_path / "heard.jsonl"
+    assert main(["run", str(approach.folder), "--out", str(heard)]) == 0
+    measured = ["--measurements", f"v2x={beacons}", "--out", str(out)]
+    assert main(["run", str(approach.folder), *measured]) == 0
+    before, after = ([json.loads(line) for line in path.open()] for path in (heard, out))
+    assert [one["stamp_ns"] for one in before] == [one["stamp_ns"] for one in after]
+    assert all(one["position_m"] is None for state in before for one in state["entities"])
+    at_3 = next(state for state in after if state["stamp_ns"] == 3_000_000_000)
+    (placed,) = (one for one in at_3["entities"] if one["position_m"] is not None)
+    assert placed["position_m"][:2] == pytest.approx([9.0, 15.0], abs=2.0)
+    assert placed["existence_probability"] > 0.9
+    told = [state["stamp_ns"] for state in after for one in state["entities"] if one["position_m"]]
+    assert min(told) >= 2_000_000_000, "a message counts when its time has come"
+
+
+def test_a_detector_of_ones_own_looks_at_the_video(own_parts, approach, tmp_path):
+    folder = tmp_path / "SB1" / "right" / "3_02_0000"
+    folder.mkdir(parents=True)
+    (folder / "out_multi.wav").symlink_to(approach.folder / "out_multi.wav")
+    write_video(folder / "ueye_stereo_vid.mp4")
+    options = ["run", str(folder), "--detector", "moving-columns", "--out", str(tmp_path / "s.jsonl")]
+    assert main(options) == 0
+    states = [json.loads(line) for line in (tmp_path / "s.jsonl").open()]
+    found = {state["stamp_ns"]: one["found"] for state in states for one in state["searched"]}
+    assert not any(seen for stamp_ns, seen in found.items() if stamp_ns < 5_000_000_000)
+    assert sum(seen for stamp_ns, seen in found.items() if stamp_ns >= 5_200_000_000) > 20
+
+
+def write_video(path, frames=100):
+    """Write a grey street through which a bright block of 300 pixels moves from frame 50 on."""
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (968, 304))
+    for number in range(frames):
+        image = np.full((304, 968, 3), 90, np.uint8)
+        if number >= 50:
+            left = 12 * (number - 50)
+            image[:, left : left + 300] = 220
+        video.write(image)
+    video.release()
+
+
+def test_array_and_signature_of_ones_own_measure(own_parts, tmp_path):
+    array = own_parts.my_array()
+    write_array_xml(tmp_path / "roof.xml", array)
+    adapter = AcousticAdapter(array, 16_000, own_parts.LoudSide())
+    rng = np.random.default_rng(0)
+    # A plane wave from 60 degrees to the left, in noise.
+    wave = rng.normal(size=32_000 + 64)
+    spectrum, frequency_hz = np.fft.rfft(wave), np.fft.rfftfreq(len(wave), 1 / 16_000)
+    delays_s = array.delays_s(np.pi / 3).ravel()[:, None]
+    late = np.fft.irfft(spectrum * np.exp(-2j * np.pi * frequency_hz * delays_s), len(wave)).T[:32_000]
+    block = (late + 0.05 * rng.normal(size=late.shape)).astype(np.float32)
+    measured = adapter.measure(block)
+    assert len(measured) == 11
+    left, right = measured[-1].signature.hidden
+    assert left > right + 1.0
+    assert measured[-1].bearing.azimuth_rad == pytest.approx(np.pi / 3, abs=0.1)
+
+
+def test_nothing_is_imported_that_was_not_named(package, log, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.delitem(sys.modules, "own_parts", raising=False)
+    assert main(["replay", str(log), "--autoware", str(tmp_path / "a.jsonl")]) == 0
+    assert "own_parts" not in sys.modules
+    assert installed("worldstate.exporters") == ["table"]
+
+
+def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
+    own_parts, log, approach, tmp_path, capsys
+):
+    replay, run = ["replay", str(log)], ["run", str(approach.folder)]
+    for options, said in (
+        ([*replay, "--export", "sheet=a.csv"], "worldstate.exporters (table), got 'sheet'"),
+        ([*replay, "--export", "table"], "--export: expected NAME=TARGET, got 'table'"),
+        ([*run, "--measurements", "radar=a"], "worldstate.measurements (v2x), got 'radar'"),
+        ([*run, "--measurements", f"v2x={tmp_path / 'none.jsonl'}"], "none.jsonl: No such file"),
+        ([*run, "--detector", "yolo"], "worldstate.detectors (motion, knn, onnx, moving-columns), got"),
+    ):
+        assert main(options) == 2, options
+        assert said in " ".join(capsys.readouterr().err.split()), options
+
+
+def test_a_part_that_cannot_be_used_is_told_from_one_that_is_not_there(log, tmp_path, monkeypatch, capsys):
+    for name, text in (("broken", "raise RuntimeError('no licence')"), ("number", "export = 7")):
+        (tmp_path / f"{name}.py").write_text(text)
+        info = tmp_path / f"{name}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{name} = {name}:export\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, said in (("broken", "(RuntimeError: no licence)"), ("number", "to be callable, got 7")):
+        assert main(["replay", str(log), "--export", f"{name}=x"]) == 2
+        assert said in capsys.readouterr().err
