@@ -1,6 +1,7 @@
 """The command line as a user meets it."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -92,3 +93,24 @@ def test_own_array_and_sound_give_the_same_as_the_folder(approach, tmp_path, cap
     parts = ["--array", str(approach.array_path), "--detections", str(approach.detections_path)]
     assert main(["run", str(approach.audio_path), *parts, "--out", str(by_parts)]) == 0
     assert by_folder.read_text() == by_parts.read_text()
+
+
+def test_the_help_names_every_exit_code(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out.partition("exit codes:")[2]
+    page = (Path(__file__).resolve().parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
+    for code in ("0", "1", "2", "130", "143"):
+        assert f" {code} " in text
+        assert re.search(rf"^\|.*\b{code}\b.*\|", page, flags=re.MULTILINE)
+
+
+def test_bearings_and_doctor_say_how_far_they_are(approach, tmp_path, monkeypatch):
+    from worldstate.cli.common import progress
+
+    steps = []
+    monkeypatch.setattr(progress.Bar, "advance", lambda bar, amount=1.0: steps.append(amount))
+    main(["bearings", str(approach.folder), "--out", str(tmp_path / "b.csv")])
+    heard_s = len(steps)
+    main(["doctor", str(approach.folder)])
+    assert heard_s == len(steps) - heard_s == 10

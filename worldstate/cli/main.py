@@ -48,13 +48,20 @@ COMMANDS = (
     "users.bench",
 )
 
+EPILOG = """\
+example: worldstate demo --out out/demo
+
+exit codes: 0 done, 1 doctor found a fault, 2 bad input (one line on standard error says what came and what
+was expected), 130 after Ctrl-C, 143 after SIGTERM; unfinished files are removed in each of these cases"""
+
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     parser = argparse.ArgumentParser(
         prog="worldstate",
         description="Keep a structured world-state alive from sound when vision fails.",
-        epilog="example: worldstate demo --out out/demo",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"worldstate {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -2,10 +2,13 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from worldstate.adapters.audio.sound_file import Audio
 
 Item = TypeVar("Item")
 
@@ -34,6 +37,14 @@ def progress_bar(description: str, total: float | None, *, quiet: bool = False) 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
         yield Bar(progress, progress.add_task(description, total=total))
+
+
+@contextmanager
+def sound_bar(audio: "Audio") -> Iterator[Bar]:
+    """Show a bar that counts the seconds of an open recording; of a pipe nobody knows how many there are."""
+    known = audio.duration_s > 1.0
+    with progress_bar(f"listening to {audio.path.name}", audio.duration_s if known else None) as bar:
+        yield bar
 
 
 def track(items: Iterable[Item], description: str, total: float | None = None) -> Iterator[Item]:

@@ -44,9 +44,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from dataclasses import asdict
 
+    from worldstate.cli.common.progress import progress_bar
     from worldstate.studies.places.place_exam import place_exam
 
-    exam = place_exam(arguments.trials, arguments.passes, arguments.seed)
+    with progress_bar("following", len(arguments.trials) + arguments.passes) as bar:
+        exam = place_exam(arguments.trials, arguments.passes, arguments.seed, bar.advance)
     lines = [f"{'':24}" + "".join(f"{name:>8}" for name in _COLUMNS.values())]
     for title, figures in (("trials", exam.trials), ("simulated", exam.passes)):
         rows = [asdict(one) for one in figures]

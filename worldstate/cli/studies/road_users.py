@@ -43,6 +43,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     import numpy as np
 
     from worldstate.cli.common.outputs import check_outputs
+    from worldstate.cli.common.progress import progress_bar
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.ground.checks import in_range
     from worldstate.operations.commissioning.heard_stream import HeardStream
@@ -57,7 +58,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     rng = np.random.default_rng(arguments.seed)
     rate_hz = plan[0].sample_rate_hz
     # One microphone is heard: that of another array would hear the same, and no level is read.
-    rows = road_user_rows(ovad_array(), sites, rate_hz, rng, passes=arguments.passes, jobs=arguments.jobs)
+    passes, jobs = arguments.passes, arguments.jobs
+    with progress_bar("rendering", passes * len(sites)) as bar:
+        rows = road_user_rows(
+            ovad_array(), sites, rate_hz, rng, passes=passes, jobs=jobs, on_pass=bar.advance
+        )
     streams = [HeardStream.load(path) for path in arguments.streams]
     found = stream_exam(rows, streams) if streams else road_user_exam(rows)
     report = {name: np.asarray(one).tolist() for name, one in asdict(found).items()}

@@ -42,6 +42,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.audio.open_sound import open_sound, path_of
     from worldstate.adapters.files.atomic import write_text
+    from worldstate.cli.common.progress import sound_bar
     from worldstate.frontend.stream import FrontEnd
     from worldstate.operations.recordings.bearing_track import track_bearings, write_bearings_figure
 
@@ -50,7 +51,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
         settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
         front_end = FrontEnd(array, audio.sample_rate_hz, settings)
-        track = track_bearings(audio, front_end, count=arguments.sources)
+        with sound_bar(audio) as bar:
+            track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
     write_text(arguments.out, track.csv())
     if arguments.figure is not None:

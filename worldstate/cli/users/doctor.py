@@ -74,10 +74,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 def examine(audio: "Audio", front_end: "FrontEnd") -> "RecordingHealth":
     """Listen to an open recording to its end."""
+    from worldstate.cli.common.progress import sound_bar
     from worldstate.operations.recordings.channel_report import HealthLog
 
     log = HealthLog()
-    for block in audio.blocks(audio.sample_rate_hz):
-        for frame in front_end.process(block):
-            log.add(frame)
+    with sound_bar(audio) as bar:
+        for block in audio.blocks(audio.sample_rate_hz):
+            for frame in front_end.process(block):
+                log.add(frame)
+            bar.advance()
     return log.summary()

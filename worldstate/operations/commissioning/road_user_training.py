@@ -4,7 +4,7 @@ Streams of a town hardly hold a tram or a motorcycle, and two vehicles at once h
 out of the left arm of every junction instead, over the ambience of the place.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -102,12 +102,17 @@ def road_user_rows(
     *,
     passes: int = 1,
     jobs: int = 1,
+    on_pass: Callable[[], None] = lambda: None,
 ) -> RoadUserRows:
     """Render so many passes of every kind at every site, as the middle microphone hears them."""
     position = standing_m(array)[array.middle]
     seeds = rng.integers(2**63, size=(passes, len(sites)))
     plan = [(name, int(seed)) for row in seeds for name, seed in zip(sites, row, strict=True)]
-    return RoadUserRows.joined(list(in_processes(partial(_rows_at, position, sample_rate_hz), plan, jobs)))
+    rows = []
+    for heard in in_processes(partial(_rows_at, position, sample_rate_hz), plan, jobs):
+        rows.append(heard)
+        on_pass()
+    return RoadUserRows.joined(rows)
 
 
 def _rows_at(position_m: FloatArray, sample_rate_hz: float, drawn: tuple[str, int]) -> RoadUserRows:

@@ -1,6 +1,6 @@
 """The bearing of every hop of a recording, without a model."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,12 +48,19 @@ class BearingTrack:
         return "\n".join([head, *(form.format(*row) for row in zip(*columns, strict=True)), ""])
 
 
-def track_bearings(audio: Audio, front_end: FrontEnd, *, count: bool = False) -> BearingTrack:
+def track_bearings(
+    audio: Audio,
+    front_end: FrontEnd,
+    *,
+    count: bool = False,
+    on_second: Callable[[], None] = lambda: None,
+) -> BearingTrack:
     """Read the bearing of every hop of an open recording, and count the sources of every second."""
     rows: list[tuple[float, ...]] = []
     for block in audio.blocks(audio.sample_rate_hz):
         sources = _sources_in(block, front_end) if count else 0
         rows += [(*_row(frame), float(sources)) for frame in front_end.process(block)]
+        on_second()
     time_s, azimuth, std, prominence, sources_of = np.array(rows, dtype=np.float64).reshape(-1, 5).T
     return BearingTrack(
         time_s, np.degrees(azimuth), np.degrees(std), prominence, sources_of if count else None

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,7 +51,9 @@ class PlaceExam:
     ms_a_hop: float
 
 
-def place_exam(trials: Sequence[Path], passes: int, seed: int) -> PlaceExam:
+def place_exam(
+    trials: Sequence[Path], passes: int, seed: int, on_pass: Callable[[], None] = lambda: None
+) -> PlaceExam:
     """Score the place on recorded trials, and on passes simulated before the same junctions.
 
     The name of a trial tells its junction to the method, and its side and speed to the scoring alone.
@@ -72,6 +74,7 @@ def place_exam(trials: Sequence[Path], passes: int, seed: int) -> PlaceExam:
         else:
             right = _sides(table, side, speed, WALLS[site])
             real.append(_figures(path.stem, said, right))
+        on_pass()
     for one in range(passes):
         site = sorted(SIMULATED)[one % len(SIMULATED)]
         side, table = simulated_pass(site, np.random.default_rng([seed, one]))
@@ -79,6 +82,7 @@ def place_exam(trials: Sequence[Path], passes: int, seed: int) -> PlaceExam:
         spent_s, hops = spent_s + cost_s, hops + len(said)
         beside = followed_places(plain[site], table)
         simulated.append(_with_truth(f"{site} {side}", table, said, beside, WALLS[site]))
+        on_pass()
     return PlaceExam(tuple(real), tuple(simulated), 1e3 * spent_s / max(hops, 1))
 
 
