@@ -493,7 +493,7 @@ def _array(
     """Return the array that the sound was recorded with: as given, the data set's or the model's."""
     microphones = read_array(given) if isinstance(given, Path | str) else given
     if microphones is None and isinstance(sound, SoundStream):
-        raise InputFileError(sound.name, "expected --array with a stream, which names no microphones")
+        raise InputFileError(sound.name, "expected --array: such a stream names no microphones")
     assumed = None if model.domain is None else array_of(model.domain)
     return choose_array(path_of(sound), microphones, assumed=assumed, trust_given=settings.uncalibrated)
 

@@ -95,8 +95,7 @@ def _value(kind: tuple[Any, Any], value: Any) -> Any:
     if node.name == "BASE":
         return _SPECIAL.get(about[0], 0) if value is None else value
     of_one, length = about
-    values = value if value is not None else [None] * (length if node.name == "ARRAY" else 0)
+    length = length if node.name == "ARRAY" else 0
     if of_one[0].name == "BASE" and of_one[1][0] not in _SPECIAL:
-        given = [] if values is None else [0 if one is None else one for one in values]
-        return np.asarray(values if isinstance(values, np.ndarray) else given, dtype=of_one[1][0])
-    return [_value(of_one, one) for one in values]
+        return np.asarray(np.zeros(length) if value is None else value, dtype=of_one[1][0])
+    return [_value(of_one, one) for one in ([None] * length if value is None else value)]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from scripted_states import scripted_states
 
 from worldstate.adapters.audio.open_sound import open_sound
@@ -323,6 +324,30 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
         options = [*options, *(["--uncalibrated"] if "--array" in options else [])]
         assert main(["run", str(tmp_path / name), *options]) == 2, (name, options)
         assert said in " ".join(capsys.readouterr().err.split()), (name, options)
+
+
+def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
+    folder = tmp_path / "DA1" / "left" / "1_00_0001"
+    folder.mkdir(parents=True)
+    noise = np.random.default_rng(0).uniform(-0.1, 0.1, (RATE_HZ, 56))
+    soundfile.write(folder / "out_multi.wav", noise, RATE_HZ)
+    bag = [str(folder), str(tmp_path / "unknown")]
+    assert main(["to-bag", *bag, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["odometry"] is False, "OVAD says that it moves, not how fast"
+    assert read_bag(tmp_path / "unknown").ego is None
+    (folder / "truth.json").write_text(json.dumps({"ego": {"speed_mps": [4.0] * 5 + [2.0] * 6}}))
+    assert main(["to-bag", str(folder), str(tmp_path / "driven"), "--start", "3"]) == 0
+    ego = read_bag(tmp_path / "driven").ego
+    assert [ego.at(3_000_000_000 + k * 100_000_000) for k in (0, 4, 5, 10)] == [4.0, 4.0, 2.0, 2.0]
+
+
+def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
+    states, log = tmp_path / "states.jsonl", tmp_path / "out.mcap"
+    states.write_text("".join(state.to_json() + "\n" for state in STATES))
+    assert main(["replay", str(states), "--mcap", str(log)]) == 0
+    capsys.readouterr()
+    assert main(["run", str(log)]) == 2
+    assert "`worldstate replay` reads" in capsys.readouterr().err
 
 
 def test_an_ego_that_cannot_be_is_refused():
