@@ -21,8 +21,25 @@ _MOST_NATS = 20.0
 _Times = tuple[dict[str, float], tuple[float, float, float] | None]
 
 
+def hidden_risks(memory: Memory, model: FilterModel) -> tuple[float, ...]:
+    r"""Return the risk of every side.
+
+    .. math:: r_k = P(hid_k \mid y_{1:t}), \qquad r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
+
+    with a sequence model, whose probabilities are calibrated and whose sides do not exclude each other, and
+    without one, by the map g of the policy. Whom messages announce is hidden at least as surely as they say.
+    """
+    told = announced(memory.tracks, model.site)
+    if memory.sequence is not None:
+        return tuple(map(max, memory.sides.hidden, told))
+    total = memory.explanation.hidden_total
+    risk = float(model.policy.risk_map(min(total, 1.0)))
+    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
+    return tuple(risk * hidden / max(total, 1e-300) for hidden in memory.explanation.hidden)
+
+
 def cues_of(
-    memory: Memory, model: FilterModel, hazard_risk: float, sensors: tuple[SensorHealth, ...]
+    memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]
 ) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
     instant, explanation = memory.instant, memory.explanation
@@ -45,18 +62,18 @@ def cues_of(
         log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
         hypotheses=priors_of(explanation),
     )
-    # The floor only matters where P(hidden) has underflowed; then no direction has a share.
-    shares = np.array(explanation.hidden) / max(explanation.hidden_total, 1e-300)
-    build = partial(_cue, memory, model, shared, hazard_risk)
-    return tuple(map(build, range(len(ends_ns)), shares.tolist(), advisories, times, evidence))
+    risks = hidden_risks(memory, model)
+    shares = np.array(risks) / max(sum(risks), 1e-300)
+    build = partial(_cue, memory, model, shared)
+    return tuple(map(build, range(len(ends_ns)), risks, shares.tolist(), advisories, times, evidence))
 
 
 def _cue(
     memory: Memory,
     model: FilterModel,
     shared: Callable[..., RiskCue],
-    hazard_risk: float,
     k: int,
+    risk: float,
     share: float,
     advisory: Advisory | None,
     times: _Times | None,
@@ -76,7 +93,7 @@ def _cue(
         direction=model.site.sides[k].label,
         azimuth_rad=azimuth_rad,
         azimuth_std_rad=std_rad,
-        risk=hazard_risk * share,
+        risk=risk,
         confidence=share,
         advisory=advisory,
         alpha=model.policy.alpha or None if evidence.hypothesis == "hidden" else None,

@@ -26,7 +26,7 @@ from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
 
 from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
-from .cue_builder import cues_of
+from .cue_builder import cues_of, hidden_risks
 from .entity_events import published, relations_at
 from .fixed_lag import FixedLag, restored
 from .memory import Memory, first_memory, priors_of
@@ -173,7 +173,8 @@ class WorldFilter:
     @property
     def risk(self) -> float:
         """Calibrated risk of a road user hidden in any direction."""
-        return float(self.policy.risk_map(min(self.explanation.hidden_total, 1.0)))
+        risks = hidden_risks(self._memory, self._model)
+        return sum(risks) if self._memory.sequence is None else 1.0 - math.prod(1.0 - one for one in risks)
 
     @cached_property
     def state(self) -> WorldState:
@@ -186,7 +187,7 @@ class WorldFilter:
             entities=entities_of(tracks, memory, self._model.site),
             relations=relations_at(memory, tracks, context),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
-            cues=cues_of(memory, self._model, self.risk, sensors),
+            cues=cues_of(memory, self._model, sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=memory.bearing,
             domain=memory.domain,

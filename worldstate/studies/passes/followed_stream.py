@@ -19,6 +19,7 @@ class FollowedStream:
 
     time_s: FloatArray  # shape (n,)
     advisory: BoolArray  # shape (n, 2)
+    risk: FloatArray  # shape (n, 2)
     within: FloatArray  # shape (n, 2, horizons); NaN where nothing is said
     time_to_visible_s: FloatArray  # shape (n, 2, 3): Low, best, high; NaN where none is stated
     entities: tuple[tuple[Entity, ...], ...]  # Of every hop
@@ -44,6 +45,7 @@ def followed(world: WorldFilter, measurements: Iterable[Measurement]) -> Followe
     return FollowedStream(
         time_s=np.array([state.stamp_ns for state in states]) * 1e-9,
         advisory=np.array([[cue.advisory is not None for cue in hop] for hop in cues]),
+        risk=np.array([[cue.risk for cue in hop] for hop in cues]),
         within=np.array([[list((cue.within or {}).values()) or nothing for cue in hop] for hop in cues]),
         time_to_visible_s=np.array([[cue.time_to_visible_s or never for cue in hop] for hop in cues]),
         entities=tuple(state.entities for state in states),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
-from worldstate.abduction.sequence.sequence_model import HORIZONS_S, LONGEST_S
+from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_exam import (
@@ -183,11 +183,15 @@ def _kept(streams: Sequence[PassedStream]) -> dict[str, float | None]:
 def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
     within = np.concatenate([one.followed.within[:, :, HORIZONS_S.index(2.0)].ravel() for one in streams])
     coming_s = np.concatenate([one.truth.coming_s.ravel() for one in streams])
+    risk = np.concatenate([one.followed.risk.ravel() for one in streams])
     said = np.isfinite(within)
     stated = np.concatenate([one.followed.time_to_visible_s.reshape(-1, 3) for one in streams])
     return {
         "skill_2s": brier_skill(within[said], coming_s[said] <= 2.0),
         "ece_2s": expected_calibration_error(within[said], coming_s[said] <= 2.0),
+        # The risk is that of somebody hidden, who comes into view within the time that the sequence foresees.
+        "risk_skill": brier_skill(risk, coming_s <= COMING_S[-1]),
+        "risk_ece": expected_calibration_error(risk, coming_s <= COMING_S[-1]),
         **time_figures(stated, coming_s),
         "times_stated": mean_of(np.isfinite(stated[coming_s <= LONGEST_S][:, 1])),
     }
