@@ -37,7 +37,7 @@ lint: $(VENV)/.test
 
 # After a change of the snapshot's types.
 schema: $(VENV)/.core
-	$(BIN)/python -c 'import json; from worldstate.state import snapshot_schema as s; print(json.dumps(s(), indent=1))' > worldstate/data/snapshot.schema.json
+	$(BIN)/python -c 'import json; from worldstate.adapters.files.json_schema import json_schema as s; from worldstate.state import WorldState; print(json.dumps(s(WorldState), indent=1))' > worldstate/data/snapshot.schema.json
 
 # Warnings are errors, and a page that would load something from the network is one too.
 $(VENV)/.docs: $(VENV)/bin/python pyproject.toml

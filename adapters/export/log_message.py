@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TypeAlias
 
-from worldstate.ground.json_schema import json_schema
+from worldstate.adapters.files.json_schema import json_schema
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
 from worldstate.state import WorldState

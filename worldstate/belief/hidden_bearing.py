@@ -15,6 +15,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import wrap_angle
 
 from .kinematics.motion import MotionBelief
 from .kinematics.polar import AZIMUTH, AZIMUTH_RATE
@@ -48,14 +49,15 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     >>> [round(math.degrees(value)) for value in (*hidden_bearing(near, side), *hidden_bearing(far, side))]
     [37, 5, 63, 6]
     """
-    sign, edge_rad = math.copysign(1.0, side.edge_azimuth_rad), abs(side.edge_azimuth_rad)
+    along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
+    sign, edge_rad = math.copysign(1.0, along_rad), abs(along_rad)
     slope = math.tan(min(edge_rad, _FARTHEST_RAD)) + side.pace_hz * _PASSED
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
     weight = coming[:, None] * _PACE_WEIGHTS + _SMALLEST
     weight = weight / weight.sum()
     mean = float((weight * azimuth).sum())
     variance = float((weight * (azimuth - mean) ** 2).sum()) + side.edge_std_rad**2
-    return sign * mean, math.sqrt(variance)
+    return wrap_angle(sign * mean - side.yaw_rad), math.sqrt(variance)
 
 
 def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: MotionBelief) -> MotionBelief:
@@ -72,7 +74,8 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
     # Mean and variance of the two together.
     apart = share * (1.0 - share) * (hidden_rad - in_view_rad) ** 2
     variance = share * hidden_std**2 + (1.0 - share) * _IN_VIEW_STD**2 + apart
-    rate = -math.copysign(side.pace_hz * math.cos(azimuth_rad) ** 2, side.edge_azimuth_rad)
+    along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
+    rate = -math.copysign(side.pace_hz * math.cos(azimuth_rad + side.yaw_rad) ** 2, along_rad)
     mean, covariance = before.mean.copy(), before.covariance.copy()
     mean[[AZIMUTH, AZIMUTH_RATE]] = azimuth_rad, rate
     # Both are read anew from the sequence, whatever else was believed of them.

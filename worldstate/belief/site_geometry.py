@@ -28,6 +28,7 @@ class SideGeometry:
     std_rad: float
     edge_std_rad: float = math.radians(5.0)
     pace_hz: float = 0.5  # Speed over the distance of the crossing lane
+    yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
 
     def behind(self, azimuth_rad: float, std_rad: float) -> float:
         """Return the probability that what stands at an azimuth is behind this side's occluder."""
@@ -56,6 +57,7 @@ class SiteGeometry:
     view_half_angle_rad: float  # Half the field of view of the co-evidence channel, centred on the x axis
     settings: FilterSettings  # Noise levels, gates, births and deaths
     ego_speed_mps: float = 0.0  # Along the x axis
+    ego_yaw_rate_rad_s: float = 0.0
 
     def prior(self, side: int) -> MotionBelief:
         """Return the prior motion of a vehicle hidden on a side."""

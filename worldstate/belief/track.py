@@ -15,6 +15,7 @@ from worldstate.ground.values import Answer
 from .existence import after_time
 from .kinematics.cartesian import CartesianBelief, polar_motion, predict_place
 from .kinematics.motion import MotionBelief, predict, relax
+from .kinematics.polar import AZIMUTH_RATE
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 
@@ -93,13 +94,23 @@ def predict_tracks(
     return tuple(moved)
 
 
+def turned(track: Track, faster_rad_s: float) -> Track:
+    """Return a track in the axes of an ego vehicle that now turns so much faster to the left."""
+    if not track.seen or track.place is not None:
+        return track
+    mean = track.motion.mean.copy()
+    mean[AZIMUTH_RATE] -= faster_rad_s
+    return replace(track, motion=replace(track.motion, mean=mean))
+
+
 def _driven_on(tracks: Sequence[Track], step_s: float, site: SiteGeometry) -> tuple[Track, ...]:
     """Return the tracks with their places a step later, or without those that are lost."""
     placed = [(i, one.place, _acceleration(one, site.settings)) for i, one in enumerate(tracks) if one.place]
     if not placed:
         return tuple(tracks)
     stacked = CartesianBelief.stacked([place for _, place, _ in placed])
-    after = predict_place(stacked, step_s, np.array([one for _, _, one in placed]), site.ego_speed_mps)
+    accelerations = np.array([one for _, _, one in placed])
+    after = predict_place(stacked, step_s, accelerations, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
     moved = list(tracks)
     for (i, _, _), place in zip(placed, after.each(), strict=True):
         track = tracks[i]
@@ -142,7 +153,8 @@ def follow_places(tracks: Sequence[Track], site: SiteGeometry) -> tuple[Track, .
     places = [track.place for track in tracks if track.place is not None]
     if not places:
         return tuple(tracks)
-    motions = iter(polar_motion(CartesianBelief.stacked(places), site.ego_speed_mps).each())
+    polar = polar_motion(CartesianBelief.stacked(places), site.ego_speed_mps, site.ego_yaw_rate_rad_s)
+    motions = iter(polar.each())
     return tuple(track if track.place is None else _followed(track, next(motions), site) for track in tracks)
 
 

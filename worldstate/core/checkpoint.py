@@ -10,6 +10,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag, SourceEvidence
+from worldstate.belief.ego_motion import EgoMotion
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
@@ -17,6 +18,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Count, Keys, Layout
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing, Measurement
+from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, Delivery, Event, Priors, Relation
 
@@ -66,6 +68,7 @@ class _Memory:
     advised_ns: tuple[Annotated[int | None, Keys("stamp_ns")], ...] = field(default=(), metadata=ADDED)
     events: tuple[Event, ...] = field(default=(), metadata=ADDED)
     relations: tuple[Relation, ...] = field(default=(), metadata=ADDED)
+    ego: EgoMotion | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +77,7 @@ class LagRecord:
 
     stamp_ns: int  # Of the belief, predicted since the last measurement
     base: _Memory
-    measurements: tuple[Measurement | PositionScan, ...]
+    measurements: tuple[Measurement | PositionScan | Odometry, ...]
     delivery: Delivery
     late_since_ns: int | None
 
@@ -83,7 +86,7 @@ class LagRecord:
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.2.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.3.0")
 
     context: Context
     policy: CueingPolicy

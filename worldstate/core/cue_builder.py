@@ -38,9 +38,7 @@ def hidden_risks(memory: Memory, model: FilterModel) -> tuple[float, ...]:
     return tuple(risk * hidden / max(total, 1e-300) for hidden in memory.explanation.hidden)
 
 
-def cues_of(
-    memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]
-) -> tuple[RiskCue, ...]:
+def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...]) -> tuple[RiskCue, ...]:
     """Return one risk cue per side, none before the first measurement."""
     instant, explanation = memory.instant, memory.explanation
     if instant is None:

@@ -22,30 +22,18 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, Look, Measurement
+from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
 
+from . import step
 from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
 from .cue_builder import cues_of, hidden_risks
-from .entity_events import published, relations_at
-from .fixed_lag import FixedLag, restored
+from .entity_events import published
+from .fixed_lag import FixedLag, Timed, restored
 from .memory import Memory, first_memory, priors_of
-from .snapshot_builder import entities_of, searched_views, sensors_of
-from .step import (
-    NEWS_HOLDS_NS,
-    FilterModel,
-    advance,
-    chronicled,
-    counted_once,
-    site_geometry_of,
-    update_advisories,
-    update_entities,
-    update_evidence,
-    update_positions,
-    update_sequence,
-    update_sightings,
-    weights_of,
-)
+from .relations import relations_at
+from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
@@ -179,24 +167,27 @@ class WorldFilter:
     @cached_property
     def state(self) -> WorldState:
         """The snapshot S_t."""
-        memory, context, settings = self._memory, self.context, self.settings
+        memory, settings = self._memory, self.settings
+        model = step.from_here(self._model, memory.ego)
+        context = model.context
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings)
         return WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.seq,
-            entities=entities_of(tracks, memory, self._model.site),
+            entities=entities_of(tracks, memory, model.site),
             relations=relations_at(memory, tracks, context),
             context=replace(context, priors=memory.predicted or priors_of(memory.explanation)),
-            cues=cues_of(memory, self._model, sensors),
+            cues=cues_of(memory, model, sensors),
             calibrated=self.policy.alpha > 0.0,
             bearing=memory.bearing,
             domain=memory.domain,
             no_sequence=memory.no_sequence,
             delivery=self._lag.delivery,
-            valid_until_ns=max((one.stamp_ns + NEWS_HOLDS_NS for one in sensors), default=None),
+            valid_until_ns=max((one.stamp_ns + step.NEWS_HOLDS_NS for one in sensors), default=None),
             sensors=sensors,
             searched=searched_views(memory, context),
             events=memory.events,
+            ego=None if memory.ego is None else ego_of(memory.ego),
         )
 
     def predict(self, dt_s: float) -> "WorldFilter":
@@ -225,9 +216,9 @@ class WorldFilter:
         if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
             return self
         # From the last measurement on, so that many small steps are one step to the bit.
-        return replace(self, memory=advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
+        return replace(self, memory=step.advance(self._lag.latest, stamp_ns, self._model), lag=self._lag)
 
-    def update(self, measurement: Measurement | PositionScan) -> "WorldFilter":
+    def update(self, measurement: Timed) -> "WorldFilter":
         """Return the filter after a measurement or a scan, at its stamp or, if that has passed, the belief's.
 
         A measurement that is up to two seconds late is put where it belongs, as if it had come in time. One
@@ -248,28 +239,31 @@ class WorldFilter:
         world = replace(self, memory=lag.latest, lag=lag)
         return world if self.stamp_ns <= world.stamp_ns + STAMP_SLACK_NS else world.predict_to(self.stamp_ns)
 
-    def _step(self, memory: Memory, measurement: Measurement | PositionScan) -> Memory:
+    def _step(self, memory: Memory, measurement: Timed) -> Memory:
         """Return the memory after one more measurement, not earlier than the last one."""
-        model, before = self._model, memory
+        before = memory
         if memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns:
             memory = self._memory  # It was predicted there before
         # Within the slack the belief is not moved back.
         elif measurement.stamp_ns > memory.stamp_ns:
-            memory = advance(memory, measurement.stamp_ns, model)
-        carried = memory
+            memory = step.advance(memory, measurement.stamp_ns, self._model)
+        carried, model = memory, step.from_here(self._model, memory.ego)
+        if isinstance(measurement, Odometry):
+            return step.chronicled(before, carried, step.update_odometry(memory, measurement), model)
         if isinstance(measurement, PositionScan):
-            return chronicled(before, carried, update_positions(memory, measurement, model), model)
-        weights = weights_of(memory, measurement, self.start_ns, self.settings)
-        memory, measurement, looked = counted_once(memory, measurement)
+            return step.chronicled(before, carried, step.update_positions(memory, measurement, model), model)
+        measurement = step.where_nobody_hides(measurement, model.context)
+        weights = step.weights_of(memory, measurement, self.start_ns, self.settings)
+        memory, measurement, looked = step.counted_once(memory, measurement)
         # Evidence first: association and births need the explanations of this very window.
-        memory = update_evidence(memory, measurement, weights, model)
+        memory = step.update_evidence(memory, measurement, weights, model)
         if looked:
-            memory = update_sightings(memory, measurement, weights, model)
-        memory = update_advisories(memory, measurement, model)
-        memory = update_sequence(memory, measurement, looked, model)
-        return chronicled(before, carried, update_entities(memory, measurement, model), model)
+            memory = step.update_sightings(memory, measurement, weights, model)
+        memory = step.update_advisories(memory, measurement, model)
+        memory = step.update_sequence(memory, measurement, looked, model)
+        return step.chronicled(before, carried, step.update_entities(memory, measurement, model), model)
 
-    def _begun_anew(self, measurement: Measurement | PositionScan) -> "WorldFilter":
+    def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery
         fresh = first_memory(self.context, self.policy, measurement.stamp_ns)
         counted = replace(delivery, reanchored=delivery.reanchored + 1)
@@ -327,8 +321,8 @@ class WorldFilter:
         return self.lag or FixedLag(self._memory)
 
     @cached_property
-    def _model(self) -> FilterModel:
-        return FilterModel(self.context, self.policy, site_geometry_of(self.context, self.settings))
+    def _model(self) -> step.FilterModel:
+        return step.FilterModel(self.context, self.policy, step.site_geometry_of(self.context, self.settings))
 
 
 def _integer_ns(name: str, value: object) -> int:
@@ -339,8 +333,10 @@ def _integer_ns(name: str, value: object) -> int:
     return int(value)
 
 
-def _checked(measurement: Measurement | PositionScan, context: Context) -> Measurement | PositionScan:
+def _checked(measurement: Timed, context: Context) -> Timed:
     """Return the measurement in plain numbers; refuse what would poison the belief: it takes NaN as it is."""
+    if isinstance(measurement, Odometry):
+        return measurement
     if isinstance(measurement, PositionScan):
         return replace(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0)
     for name, kind in _KINDS.items():

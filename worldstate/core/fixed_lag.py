@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement
+from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Delivery
 
@@ -22,7 +23,7 @@ LAG_NS = nanoseconds(2.0)
 # before. The filter begins anew at the time that is told now.
 REANCHOR_NS = nanoseconds(1.0)
 
-Timed: TypeAlias = Measurement | PositionScan
+Timed: TypeAlias = Measurement | PositionScan | Odometry
 Step: TypeAlias = Callable[[Memory, Timed], Memory]
 
 

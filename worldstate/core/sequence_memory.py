@@ -9,6 +9,16 @@ from operator import attrgetter
 import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.sequence.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
+from worldstate.abduction.sequence.sequence_chain import (
+    COMES,
+    STATES,
+    context_prior,
+    groups_of,
+    look_log_likelihoods,
+    state_transition,
+    states_of,
+)
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
     COMING_S,
@@ -18,17 +28,8 @@ from worldstate.abduction.sequence.sequence_model import (
     soon_log_odds,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.belief.hidden_belief import HiddenBelief
-from worldstate.belief.ratio_recursion import SequenceBelief, at_prior, first_belief, next_belief
-from worldstate.belief.sequence_chain import (
-    COMES,
-    STATES,
-    context_prior,
-    groups_of,
-    look_log_likelihoods,
-    state_transition,
-    states_of,
-)
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Probability
@@ -69,6 +70,8 @@ class SequenceMemory:
     emerged_ns: tuple[int | None, ...] = (None,) * len(SIDES)  # When somebody last came into view from a side
     # P(somebody has come into view from a side and no look has told), where no camera looks or none sees.
     unseen: tuple[Probability, ...] = field(default=(0.0,) * len(SIDES), metadata=ADDED)
+    # How often somebody has come into view past the edge of each side, while a camera looked.
+    arrivals: tuple[ArrivalRate, ...] = field(default=(ArrivalRate(),) * len(SIDES), metadata=ADDED)
     stamp_ns: int = 0
 
     def check(self) -> None:
@@ -82,10 +85,8 @@ class SequenceMemory:
             finite_array(f"memory.sequence.{name}", array, shape)
             if (array < 0.0).any() or not np.allclose(array.sum(axis=-1), 1.0, atol=1e-3):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected probabilities")
-        by_side = (("over_ns", self.over_ns), ("emerged_ns", self.emerged_ns), ("unseen", self.unseen))
-        for name, values in by_side:
-            if len(values) != len(SIDES):
-                got = len(values)
+        for name in ("over_ns", "emerged_ns", "unseen", "arrivals"):
+            if (got := len(getattr(self, name))) != len(SIDES):
                 raise InvalidArgumentError(f"memory.sequence.{name}: expected {len(SIDES)}, got {got}")
 
     @cached_property
@@ -111,7 +112,17 @@ class SequenceMemory:
         """Return the memory after somebody came into view past the edge of some sides."""
         known = (stamp_ns if side in sides else ns for side, ns in enumerate(self.emerged_ns))
         unseen = (0.0 if side in sides else chance for side, chance in enumerate(self.unseen))
-        return replace(self, emerged_ns=tuple(known), unseen=tuple(unseen))
+        arrivals = tuple(
+            replace(rate, count=rate.count + (side in sides)) for side, rate in enumerate(self.arrivals)
+        )
+        return replace(self, emerged_ns=tuple(known), unseen=tuple(unseen), arrivals=arrivals)
+
+    def prior(self, context: Context) -> FloatArray:
+        """Return the distribution of the groups that is expected of each side, shape (2, groups)."""
+        hidden = None if context.priors is None else context.priors.hidden / len(SIDES)
+        usual_hz = float(self.share[: len(COMING_S)].sum() / self.share.sum()) / COMING_S[-1]
+        learned = (one.shift_nats(usual_hz) for one in self.arrivals)
+        return np.array([context_prior(self.share, hidden, nats) for nats in learned])
 
     def _explained(self) -> FloatArray:
         """Return log p(sound | one comes) of each side, given who has just come into view there, shape (2,).
@@ -148,9 +159,8 @@ class SequenceMemory:
         with L of both sides after the prior, the sequence, every look, and who has just come into view.
         """
         told = np.cumsum([np.zeros_like(self.sides.belief), *self._told.values()], axis=0)
-        prior = _prior(self.share, context)
         # States and groups count alike: those who come soon behind somebody come soon.
-        before = np.broadcast_to(states_of(prior, prior), self.sides.belief.shape)
+        before = states_of(self.prior(context), self.share)
         weights = np.concatenate([before[None], self.sides.belief * np.exp(told)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
         log_odds = np.log(soon) - np.log(later)
@@ -165,10 +175,12 @@ class SequenceMemory:
 
 def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
     """Return the belief at a later time, with nothing heard."""
-    chain = state_transition(_prior(kept.share, context), step_ns)
+    chain = np.array([state_transition(one, step_ns) for one in kept.prior(context)])
     looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
     sides, unseen = next_belief(kept.sides, None, chain), _unseen(kept, step_ns)
-    return replace(kept, sides=sides, looks=looks, unseen=unseen, stamp_ns=stamp_ns)
+    watched = any(not isinstance(look.answer, Unqueried) for look in looks)
+    arrivals = tuple(rate.later(seconds(step_ns), watched) for rate in kept.arrivals)
+    return replace(kept, sides=sides, looks=looks, unseen=unseen, arrivals=arrivals, stamp_ns=stamp_ns)
 
 
 def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
@@ -191,11 +203,11 @@ def informed(
     reading = measurement.sequence
     said = None
     if isinstance(reading, SequenceReading):
-        prior = _prior(reading.share, context)
-        said = states_of(at_prior(reading.groups, reading.share, prior), prior)
         if kept is None:
-            kept = SequenceMemory(first_belief(said), reading.share, reading.margin_s, reading.alarm)
+            first = first_belief(states_of(reading.groups, reading.share))
+            kept = SequenceMemory(first, reading.share, reading.margin_s, reading.alarm)
         kept = replace(kept, share=reading.share, margin_s=reading.margin_s, alarm=reading.alarm)
+        said = states_of(at_prior(reading.groups, reading.share, kept.prior(context)), reading.share)
     if kept is None:
         return None
     # The chain of the hops since then was taken when the belief was carried here.
@@ -208,11 +220,6 @@ def informed(
             kept = replace(kept, unseen=tuple(chance * look.answer.miss_rate for chance in kept.unseen))
     looks = tuple(sorted(looks, key=attrgetter("sensor")))
     return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=measurement.stamp_ns))
-
-
-def _prior(share: FloatArray, context: Context) -> FloatArray:
-    priors = context.priors
-    return context_prior(share, None if priors is None else priors.hidden / len(SIDES))
 
 
 def _alerted(kept: SequenceMemory) -> SequenceMemory:

@@ -10,6 +10,7 @@ from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.announced import time_to_visible
+from worldstate.belief.ego_motion import EgoMotion
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.kinematics.motion import MotionBelief
@@ -25,6 +26,7 @@ from worldstate.state import (
     SensorHealth,
     Visibility,
 )
+from worldstate.state.ego import Ego
 
 from .forecast import Forecast, forecasts
 from .memory import CountedLook, Memory
@@ -181,6 +183,13 @@ def visible_in(track: Track, site: SiteGeometry) -> tuple[float, float, float] |
         return None
     mean_s, std_s = expected
     return max(mean_s - NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + NINE_OF_TEN * std_s
+
+
+def ego_of(ego: EgoMotion) -> Ego:
+    """Return the ego vehicle as it is published."""
+    x, y, yaw = ego.pose.round(_DIGITS).tolist()
+    covariance = tuple(map(tuple, ego.covariance.round(_DIGITS).tolist()))
+    return Ego((x, y), yaw, covariance, ego.speed_mps, ego.yaw_rate_rad_s)
 
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:

@@ -13,25 +13,31 @@ from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
+from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death, merged_tracks
+from worldstate.belief.ego_motion import EgoMotion, corrected, driven
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.position_update import position_update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.track import Track, predict_tracks
+from worldstate.belief.track import Track, predict_tracks, turned
 from worldstate.belief.vision_update import VisionUpdate, log_co_evidence, surviving, vision_update
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Look, Measurement
+from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context
+from worldstate.state.context import seen_from
 
-from .entity_events import HIDDEN, events_between, halves_of_one, published, relations_at
+from .entity_events import HIDDEN, events_between, halves_of_one, published
 from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
+from .relations import relations_at
 from .sequence_memory import carried, informed
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
@@ -59,8 +65,11 @@ class Weights:
     look: float
 
 
-def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry:
-    """Return the site geometry of a context."""
+def site_geometry_of(
+    context: Context, settings: FilterSettings, ego: EgoMotion | None = None
+) -> SiteGeometry:
+    """Return the site geometry of a context, as the ego vehicle has it."""
+    yaw_rad = 0.0 if ego is None else float(ego.pose[2])
     sides = (
         SideGeometry(
             one.direction,
@@ -69,10 +78,49 @@ def site_geometry_of(context: Context, settings: FilterSettings) -> SiteGeometry
             one.hidden_std_rad,
             one.edge_std_rad,
             one.pace_hz,
+            0.0 if one.corner_m is None else yaw_rad,
         )
         for one in context.occluders
     )
-    return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, context.ego_speed_mps or 0.0)
+    twist = (context.ego_speed_mps or 0.0, 0.0) if ego is None else (ego.speed_mps, ego.yaw_rate_rad_s)
+    return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, *twist)
+
+
+def from_here(model: FilterModel, ego: EgoMotion | None) -> FilterModel:
+    """Return the model as the ego vehicle has it where it is now; without odometry, as the context says."""
+    if ego is None:
+        return model
+    x_var, y_var, yaw_var = ego.covariance.diagonal().tolist()
+    stds = math.sqrt(0.5 * (x_var + y_var)), math.sqrt(yaw_var)
+    x, y, yaw = ego.pose.tolist()
+    occluders = tuple(seen_from(one, (x, y, yaw), *stds) for one in model.context.occluders)
+    context = replace(model.context, occluders=occluders, ego_speed_mps=ego.speed_mps)
+    return replace(model, context=context, site=site_geometry_of(context, model.site.settings, ego))
+
+
+def update_odometry(memory: Memory, told: Odometry) -> Memory:
+    """Return the memory after odometry: azimuth rates are those of axes that turn with the ego vehicle."""
+    before, ego = memory.ego, corrected(memory.ego, told)
+    faster = ego.yaw_rate_rad_s - (0.0 if before is None else before.yaw_rate_rad_s)
+    tracks = memory.tracks if not faster else tuple(turned(one, faster) for one in memory.tracks)
+    looks = _with_look(memory, CountedLook(told.source, told.stamp_ns, told.source))
+    return replace(memory, ego=ego, tracks=tracks, looks=looks, seq=memory.seq + 1)
+
+
+def where_nobody_hides(measurement: Measurement, context: Context) -> Measurement:
+    """Return a measurement of which nothing says that somebody is hidden where nothing hides anybody."""
+    is_open = np.array([not one.hides for one in context.occluders])
+    if not is_open.any():
+        return measurement
+    said, reading = measurement.signature, measurement.sequence
+    hidden = np.where(is_open, LOG_FLOOR, said.hidden).tolist()
+    measurement = replace(measurement, signature=replace(said, hidden=tuple(hidden)))
+    if not isinstance(reading, SequenceReading):
+        return measurement
+    groups = reading.groups.copy()
+    groups[is_open, : len(COMING_S)] = 0.0
+    groups /= groups.sum(axis=1, keepdims=True)
+    return replace(measurement, sequence=replace(reading, groups=groups))
 
 
 def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
@@ -127,6 +175,7 @@ def _last_look(memory: Memory, sensor: str) -> CountedLook | None:
 def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     """Return the memory predicted to a later time."""
     step_ns, explanation, sides = stamp_ns - memory.stamp_ns, memory.explanation, memory.sides
+    model = from_here(model, memory.ego)
     shares = [hidden_share(track, sides) for track in memory.tracks]
     tracks = predict_tracks(memory.tracks, shares, seconds(step_ns), model.site)
     predicted = replace(
@@ -135,6 +184,7 @@ def advance(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
         explanation=explanation.predict(model.context.rates.values_hz, step_ns),
         tracks=surviving(tracks, model.site.settings),
         sequence=memory.sequence and carried(memory.sequence, stamp_ns, step_ns, model.context),
+        ego=memory.ego and driven(memory.ego, seconds(step_ns)),
     )
     announced_before = [track for track in memory.tracks if not track.seen and track.place is not None]
     return _places_passed(announced_before, predicted, model) if announced_before else predicted

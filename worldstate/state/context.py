@@ -1,12 +1,14 @@
 """Context: rates, occluders, priors and the field of view, given before any measurement."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Layout, Probability
+from worldstate.ground.serialisation import ADDED, Layout, Probability
+
+_PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: who comes past it is in view
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +52,8 @@ class Rates:
     visible_departure_hz: float = 0.3  # In view for 3 s
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            in_range(field.name, getattr(self, field.name), 0.0, 1e3)
+        for one in fields(self):
+            in_range(one.name, getattr(self, one.name), 0.0, 1e3)
 
     @property
     def values_hz(self) -> tuple[float, ...]:
@@ -110,6 +112,13 @@ class Occluder:
         azimuth falls.
     assumed : bool
         Whether this is the corner of a usual junction, since nobody said what stands here.
+    hides : bool
+        Whether it hides anybody: not on an open road, and no longer once the ego vehicle is past it. Who is
+        heard from this side is then in view, or outside of the camera's view, never hidden.
+    corner_m : (float, float) or None
+        Its corner in the map frame, metres; with it the edge moves as the ego vehicle does.
+    crossing_m : float or None
+        Where the lane behind it crosses the x axis of the map, metres.
 
     Examples
     --------
@@ -126,6 +135,9 @@ class Occluder:
     edge_std_rad: float = math.radians(5.0)
     pace_hz: float = 0.5  # Real vehicles of OVAD pass T0 at 4 to 5 m/s, some 9 m ahead
     assumed: bool = False
+    hides: bool = field(default=True, metadata=ADDED)
+    corner_m: tuple[float, float] | None = field(default=None, metadata=ADDED)
+    crossing_m: float | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         in_range("edge_azimuth_rad", self.edge_azimuth_rad, -math.pi, math.pi)
@@ -222,6 +234,58 @@ def corner_at(
         # Across the line of sight, the same for every direction of the error.
         edge_std_rad=min(corner_std_m / math.hypot(x_m, y_m), math.pi),
         pace_hz=pace_hz,
+        corner_m=(x_m, y_m),
+        crossing_m=crossing_m,
+    )
+
+
+def open_road(direction: str, side: int) -> Occluder:
+    """Return an approach side on which nothing hides anybody: an open road; `side` is 1 left, -1 right.
+
+    Examples
+    --------
+    >>> open_road("left", 1).hides
+    False
+    """
+    return replace(blind_corner(direction, side), id=f"open_{direction}", assumed=False, hides=False)
+
+
+def seen_from(
+    occluder: Occluder, pose: tuple[float, float, float], position_std_m: float, yaw_std_rad: float
+) -> Occluder:
+    r"""Return an occluder as the ego vehicle has it at a pose (x, y, yaw) in the map frame, m and rad.
+
+    .. math:: a' = \operatorname{atan2}(y_c - y, x_c - x) - \psi, \qquad
+              \sigma_{a'}^2 = \sigma_a^2 + \sigma_{xy}^2 / r^2 + \sigma_\psi^2
+
+    One whose corner nobody told in metres stands wherever the ego vehicle is. One that it has passed hides
+    nobody any more.
+
+    Examples
+    --------
+    >>> corner = corner_at("left", (5.0, 3.0), 9.0)
+    >>> nearer = seen_from(corner, (2.0, 0.0, 0.1), 0.1, 0.01)
+    >>> round(math.degrees(nearer.edge_azimuth_rad), 1), seen_from(corner, (5.0, 0.0, 0.0), 0.1, 0.01).hides
+    (39.3, False)
+    """
+    if occluder.corner_m is None or occluder.crossing_m is None:
+        return occluder
+    (corner_x, corner_y), (x, y, yaw) = occluder.corner_m, pose
+    ahead_m, beside_m = corner_x - x, corner_y - y
+    if ahead_m < _PASSED_M or beside_m * corner_y <= 0.0:
+        return replace(occluder, hides=False)
+    before_m, now_m = math.hypot(corner_x, corner_y), math.hypot(ahead_m, beside_m)
+    std_m = math.hypot(occluder.edge_std_rad * before_m, position_std_m)
+    speed_mps, crossing_m = occluder.pace_hz * occluder.crossing_m, occluder.crossing_m - x
+    corner = (ahead_m, beside_m)
+    now = corner_at(occluder.direction, corner, crossing_m, speed_mps=speed_mps, corner_std_m=std_m)
+    return replace(
+        occluder,
+        edge_azimuth_rad=math.remainder(now.edge_azimuth_rad - yaw, math.tau),
+        hidden_azimuth_rad=math.remainder(now.hidden_azimuth_rad - yaw, math.tau),
+        hidden_std_rad=now.hidden_std_rad,
+        edge_std_rad=min(math.hypot(std_m / now_m, yaw_std_rad), math.pi),
+        pace_hz=now.pace_hz,
     )
 
 

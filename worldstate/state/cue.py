@@ -70,7 +70,8 @@ class EvidenceTerms:
 class RiskCue:
     r"""Risk that a road user is hidden in one direction: an advisory, never a control command.
 
-    .. math:: r_k = P(hid_k \mid y_{1:t}) \quad\text{or}\quad r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
+    .. math:: r_k = P(hid_k \mid y_{1:t}) \quad\text{or}\quad
+              r_k = g(P(hid \mid y_{1:t}))\, P(k \mid hid, y_{1:t})
 
     With a sequence model r_k is the calibrated probability that somebody comes into view from there within
     eight seconds; sides do not exclude each other. Without one g is the calibrated monotone map of the

@@ -2,17 +2,18 @@
 
 import json
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.json_schema import Schema, json_schema
-from worldstate.ground.serialisation import Count, Layout, decode, decode_json, encode
+from worldstate.ground.serialisation import ADDED, Count, Layout, decode, decode_json, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
 from .cue import RiskCue
+from .ego import Ego
 from .entity import Entity
 from .event import Event
 from .graph import scene_graph
@@ -91,6 +92,9 @@ class WorldState:
         How every sensor is, in order of their names.
     searched : tuple of SearchedView
         The last look of every sensor that looks, in order of their names.
+    ego : Ego or None
+        Pose and twist of the ego vehicle; None without odometry. With it the context's occluders, too, are
+        as they are seen from there.
     events : tuple of Event
         What became of entities with the last measurement, at most 64.
 
@@ -101,7 +105,7 @@ class WorldState:
     (0.0, True)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "2.0.0", order="stamp_ns clock seq frame_id")
+    LAYOUT: ClassVar = Layout("worldstate.Snapshot", "2.1.0", order="stamp_ns clock seq frame_id")
 
     stamp_ns: int
     seq: int
@@ -120,6 +124,7 @@ class WorldState:
     sensors: tuple[SensorHealth, ...] = ()
     searched: tuple[SearchedView, ...] = ()
     events: tuple[Event, ...] = ()
+    ego: Ego | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
         # Order carries no meaning, so it must not make two equal states differ.
@@ -181,7 +186,7 @@ class WorldState:
         return cls.from_dict(decode_json(text, "snapshot"))
 
 
-def snapshot_schema() -> Schema:
+def snapshot_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of a snapshot, which ships as ``data/snapshot.schema.json``.
 
     Returns
@@ -195,4 +200,6 @@ def snapshot_schema() -> Schema:
     >>> sorted(schema["$defs"])[:3], schema["properties"]["stamp_ns"]["type"]
     (['Advisory', 'Bearing', 'Classification'], 'integer')
     """
-    return json_schema(WorldState)
+    shipped = files("worldstate") / "data" / "snapshot.schema.json"
+    schema: dict[str, Any] = json.loads(shipped.read_text(encoding="utf-8"))
+    return schema

@@ -23,6 +23,7 @@ from worldstate.adapters.datasets.ovad_layout import (
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import deferred_signals, write_text
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.camera.simulated_detector import to_json
 from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
 from worldstate.adapters.simulation.scene.junction import MOVING_SITES, SITES
@@ -33,7 +34,6 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import ImageArray
 
 from .plan import DatasetSettings, Plan

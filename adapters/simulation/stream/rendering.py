@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.scene.ambience import Ambience
 from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.adapters.simulation.sound.ego_sound import add_ego_echo, ego_noise
 from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .ambience import ambience_piece, overlap_samples

@@ -3,8 +3,8 @@ r"""Constant velocity in Cartesian coordinates, for entities whose position a se
 .. math:: x = (p_x,\; p_y,\; v_x,\; v_y)
 
 The position is that in `base_link`, the velocity that over ground along the same axes: with an ego speed u
-ahead, p moves by :math:`(v_x - u,\; v_y)\,dt`. The acceleration is white noise of density q, as in
-filterpy's `Q_continuous_white_noise`.
+ahead, p moves by :math:`(v_x - u,\; v_y)\,dt`; where the ego turns, both turn the other way. The acceleration
+is white noise of density q, as in filterpy's `Q_continuous_white_noise`.
 """
 
 import math
@@ -79,18 +79,32 @@ def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArr
 
 
 def predict_place(
-    belief: CartesianBelief, step_s: float, acceleration_psd: float | FloatArray, ego_speed_mps: float
+    belief: CartesianBelief,
+    step_s: float,
+    acceleration_psd: float | FloatArray,
+    ego_speed_mps: float,
+    ego_yaw_rate_rad_s: float = 0.0,
 ) -> CartesianBelief:
     r"""Return the belief after `step_s` of constant velocity and white acceleration (m^2/s^3).
 
-    .. math:: m \leftarrow F m - (u\,dt, 0, 0, 0), \quad P \leftarrow F P F^T + Q
+    .. math:: m \leftarrow R(F m - u), \quad P \leftarrow R (F P F^T + Q) R^T
+
+    with u the chord that the ego vehicle drives, and R the turn of its axes the other way.
     """
     t, flow = step_s, np.eye(4) + step_s * np.eye(4, k=2)
     noise = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
     mean = belief.mean @ flow.T
-    mean[..., 0] -= ego_speed_mps * step_s
+    turned = ego_yaw_rate_rad_s * step_s
+    # numpy's sinc has a factor of pi.
+    chord = ego_speed_mps * step_s * np.sinc(0.5 * turned / math.pi)
+    mean[..., :2] -= chord * np.array([math.cos(0.5 * turned), math.sin(0.5 * turned)])
     strength = np.asarray(acceleration_psd)[..., None, None]
-    return _belief(mean, flow @ belief.covariance @ flow.T + strength * noise)
+    covariance = flow @ belief.covariance @ flow.T + strength * noise
+    if not turned:
+        return _belief(mean, covariance)
+    cosine, sine = math.cos(turned), math.sin(turned)
+    turn = np.kron(np.eye(2), [[cosine, sine], [-sine, cosine]])
+    return _belief(mean @ turn.T, turn @ covariance @ turn.T)
 
 
 def update_position(belief: CartesianBelief, position: Position) -> CartesianBelief:
@@ -112,7 +126,9 @@ def update_bearing(belief: CartesianBelief, azimuth_rad: float, std_rad: float) 
     return _update(belief, np.array([residual]), slope, np.array([[max(std_rad, _LEAST_STD) ** 2]]))
 
 
-def polar_motion(belief: CartesianBelief, ego_speed_mps: float) -> MotionBelief:
+def polar_motion(
+    belief: CartesianBelief, ego_speed_mps: float, ego_yaw_rate_rad_s: float = 0.0
+) -> MotionBelief:
     """Return the belief in modified polar coordinates, to first order."""
     x, y, vx, vy = np.moveaxis(belief.mean, -1, 0)
     vx, r = vx - ego_speed_mps, np.hypot(x, y)
@@ -133,7 +149,9 @@ def polar_motion(belief: CartesianBelief, ego_speed_mps: float) -> MotionBelief:
     slope[..., RADIAL_RATE, 2] = slope[..., LOG_RANGE, 0] = cosine
     slope[..., RADIAL_RATE, 3] = slope[..., LOG_RANGE, 1] = sine
     covariance = slope @ belief.covariance @ slope.mT + _LEAST_STD**2 * _IDENTITY
-    mean = np.stack([np.arctan2(y, x), turning, closing, 0.5 * np.log(square)], axis=-1)
+    # Axes that turn with the ego vehicle see everything turn the other way.
+    seen_turning = turning - ego_yaw_rate_rad_s
+    mean = np.stack([np.arctan2(y, x), seen_turning, closing, 0.5 * np.log(square)], axis=-1)
     return MotionBelief(mean, 0.5 * (covariance + covariance.mT))
 
 

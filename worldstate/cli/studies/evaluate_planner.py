@@ -97,7 +97,7 @@ def _believed(arguments: argparse.Namespace, paths: list[Path]) -> "list[Believe
     from functools import partial
 
     from worldstate.adapters.files.model_file import read_model
-    from worldstate.ground.parallel import in_processes
+    from worldstate.adapters.parallel import in_processes
     from worldstate.studies.planner.believed_stream import believed_stream
 
     follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)

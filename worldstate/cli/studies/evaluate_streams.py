@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from functools import partial
 
     from worldstate.adapters.files.model_file import read_model
-    from worldstate.ground.parallel import in_processes
+    from worldstate.adapters.parallel import in_processes
     from worldstate.studies.passes.pass_outcomes import PassedStream, pass_figures
     from worldstate.studies.passes.world_exam import passed_stream
 

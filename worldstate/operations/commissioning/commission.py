@@ -20,10 +20,10 @@ from worldstate.abduction.signature.window_classes import side_ratios, visible_r
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of
 from worldstate.adapters.files.model_file import Model
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.parallel import in_processes
 from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model

@@ -7,9 +7,9 @@ import numpy as np
 
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.standardisation import standardisation
+from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND, MEASURES
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import significant
 

@@ -13,6 +13,7 @@ from worldstate.abduction.signature.ensemble_training import OPEN_FIELD, Simulat
 from worldstate.abduction.signature.site_reference import KINDS
 from worldstate.abduction.signature.window_classes import DIRECT
 from worldstate.adapters.datasets.feature_table import N_FEATURES
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.scene.places import open_road
 from worldstate.adapters.simulation.scene.presets import preset
 from worldstate.adapters.simulation.scene.settings import EGO_SPEEDS_MPS
@@ -25,11 +26,10 @@ from worldstate.adapters.simulation.sound.receiver import Receiver, standing_m
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.blas_threads import one_blas_thread
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
 # 180 windows at a weight of .1 took the other side, named with p > .5, from .39 of the windows to .03

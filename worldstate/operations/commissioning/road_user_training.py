@@ -12,6 +12,7 @@ import numpy as np
 
 from worldstate.abduction.road_users import UNKNOWN, RoadUserModel
 from worldstate.abduction.signature.standardisation import standardisation
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
 from worldstate.adapters.simulation.sound.receiver import standing_m
 from worldstate.adapters.simulation.stream.arrivals import VehicleEvent
@@ -21,7 +22,6 @@ from worldstate.adapters.simulation.stream.sight import visible_s
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 from worldstate.ground.values import significant
 

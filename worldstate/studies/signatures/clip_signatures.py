@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
+from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.levels import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
 from worldstate.operations.recordings.hop_table import HopTable
 

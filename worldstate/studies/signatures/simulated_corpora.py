@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, CLIP_S, ClipLabels
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.adapters.simulation.scene.junction import site
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
@@ -22,7 +23,6 @@ from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES, add_delayed
 from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.adapters.simulation.sound.emission import Emission
 from worldstate.adapters.simulation.sound.receiver import NEAREST_M, Receiver
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .clip_signatures import ClipSignatures, signature

@@ -17,6 +17,7 @@ from worldstate.adapters.datasets.feature_extraction import WINDOW_S
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
 from worldstate.adapters.datasets.sample_windows import window_ends_s
+from worldstate.adapters.parallel import in_processes
 from worldstate.adapters.simulation.dataset.recording import simulate_recording
 from worldstate.adapters.simulation.scene.junction import SITES
 from worldstate.adapters.simulation.scene.presets import Preset, preset
@@ -24,6 +25,7 @@ from worldstate.adapters.simulation.scene.settings import SimulationSettings, dr
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.array.steering import cross_spectra
+from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_RATE_HZ,
@@ -35,9 +37,7 @@ from worldstate.frontend.direction.feature import (
 )
 from worldstate.frontend.spectra.bins import band_bins
 from worldstate.frontend.spectra.phat import whiten
-from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 
 DECIMATION = 4

@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.adapters.parallel import in_processes
+from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
-from worldstate.ground.parallel import in_processes
 from worldstate.ground.version import __version__
 
 Item = TypeVar("Item")

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.belief.ratio_recursion import at_prior, balanced, first_belief, next_belief
+from worldstate.abduction.sequence.ratio_recursion import at_prior, balanced, first_belief, next_belief
 
 SEEDS = st.integers(0, 2**32 - 1)
 

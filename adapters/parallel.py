@@ -12,7 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import TypeVar
 
-from .errors import WorldstateError
+from worldstate.ground.errors import WorldstateError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -57,6 +57,8 @@ def next_belief(
 ) -> SequenceBelief:
     """Return the belief one step on; without sound (None) the sequence is carried on by its chain.
 
+    Shapes: chain (groups, groups), or with a leading axis of the sides.
+
     Examples
     --------
     >>> q = np.array([[0.3, 0.7]])
@@ -64,7 +66,7 @@ def next_belief(
     >>> next_belief(first_belief(q), np.array([[0.6, 0.4]]), chain).belief
     array([[0.6, 0.4]])
     """
-    predicted, carried = last.belief @ chain, last.alone @ chain
+    predicted, carried = ((row[:, None] @ chain)[:, 0] for row in (last.belief, last.alone))
     alone = carried if posterior is None else posterior
     log_ratio = np.log(np.maximum(predicted, _SMALLEST)) - np.log(np.maximum(carried, _SMALLEST))
     # The largest exponent is taken off first: likelihoods of many nats would overflow.

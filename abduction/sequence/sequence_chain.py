@@ -15,12 +15,11 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
-from .markov_chain import LONGEST_STEP_S
 from .ratio_recursion import balanced
+from .sequence_model import COMING_S, GROUPS
 
 HOP_S = 0.1
 _LEAK = 0.004  # Of the hops: what the sequence of groups does not foresee
@@ -28,6 +27,8 @@ _LEAK = 0.004  # Of the hops: what the sequence of groups does not foresee
 # of .73 in place of .94.
 _LEAST_SHIFT, _LARGEST_SHIFT = -0.5, 2.0
 _SMALLEST = 1e-12
+# The slowest rate is .04/s: by then the chain has settled; a larger exponent of expm only costs digits.
+_LONGEST_STEP_S = 1000.0
 _ROUNDS = 1000  # After 200 the prior still drifts by a percent, after these by 1e-9
 
 _COMING = len(COMING_S)
@@ -82,10 +83,10 @@ def groups_of(states: FloatArray) -> FloatArray:
     return np.concatenate([coming, states[..., 2 * _COMING :]], axis=-1)
 
 
-def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
+def context_prior(share: FloatArray, hidden: float | None, learned_nats: float = 0.0) -> FloatArray:
     """Return the distribution of one side's groups in a context that expects a hidden vehicle on it.
 
-    Without one it is the model's share; the shift of the log-odds is bounded.
+    Without one it is the model's share, moved by what was learned of the side; the shift is bounded.
 
     Examples
     --------
@@ -93,12 +94,11 @@ def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
     >>> round(float(context_prior(share, 0.99)[:9].sum()), 3)
     0.917
     """
-    coming = float(share[:_COMING].sum() / share.sum())
-    if hidden is None:
-        return np.asarray(share / share.sum())
-    # Certainty of a prior has no end, the shift has.
-    expected = min(max(hidden, 1e-9), 1.0 - 1e-9)
-    shift = math.log(expected / (1.0 - expected)) - math.log(coming / (1.0 - coming))
+    coming, shift = float(share[:_COMING].sum() / share.sum()), learned_nats
+    if hidden is not None:
+        # Certainty of a prior has no end, the shift has.
+        expected = min(max(hidden, 1e-9), 1.0 - 1e-9)
+        shift = math.log(expected / (1.0 - expected)) - math.log(coming / (1.0 - coming))
     factor = math.exp(min(max(shift, _LEAST_SHIFT), _LARGEST_SHIFT))
     moved = np.concatenate([share[:_COMING] * factor, share[_COMING:]])
     return np.asarray(moved / moved.sum())
@@ -116,19 +116,19 @@ def state_transition(prior: FloatArray, step_ns: int) -> FloatArray:
     return _transition(tuple(prior.tolist()), step_ns)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _transition(prior: tuple[float, ...], step_ns: int) -> FloatArray:
     # Imported where it is needed: scipy.linalg takes as long to import as numpy.
     from scipy.linalg import expm
 
-    step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
+    step_s = min(step_ns / NANOSECONDS_PER_SECOND, _LONGEST_STEP_S)
     matrix: FloatArray = np.maximum(expm(_rates_hz(prior) * step_s), 0.0)
     matrix /= matrix.sum(axis=1, keepdims=True)
     matrix.flags.writeable = False
     return matrix
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _rates_hz(prior: tuple[float, ...]) -> FloatArray:
     """Return Q, 1/s, from the chain of one hop that is nearest to the countdown."""
     hop, share = np.eye(len(STATES)), states_of(np.array(prior), np.array(prior))

@@ -1,0 +1,128 @@
+"""The ego vehicle moves: what stands moves in its axes, and a corner that it has passed hides nobody."""
+
+import math
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
+from worldstate.abduction.co_evidence import Absent
+from worldstate.belief.ego_motion import EgoMotion, driven
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement import Position, PositionScan
+from worldstate.measurement.odometry import EgoPose, Odometry
+from worldstate.state.context import corner_at, open_road
+
+CORNERS = Context(occluders=(corner_at("left", (8.0, 3.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
+OPEN = Context(occluders=(open_road("left", 1), open_road("right", -1)))
+_TWISTS = st.lists(st.tuples(st.floats(-5.0, 15.0), st.floats(-1.0, 1.0)), min_size=1, max_size=8)
+
+
+def heard(time_s: float, left: float = 4.0) -> Measurement:
+    """Sound of a vehicle hidden on the left, and a camera that sees nobody."""
+    said = SignatureEvidence(("left", "right"), (left, 0.0), 2.0 if left else 0.0, 0.0)
+    nothing = NotUsable("not measured")
+    return Measurement(round(time_s * 1e9), said, Absent(0.04), nothing, nothing)
+
+
+def odometry(time_s: float, speed_mps: float, yaw_rate: float = 0.0, pose: EgoPose | None = None) -> Odometry:
+    return Odometry("wheels", round(time_s * 1e9), speed_mps, yaw_rate, pose=pose)
+
+
+@given(_TWISTS)
+def test_what_stands_is_where_the_pose_says(twists: list[tuple[float, float]]) -> None:
+    stands = Position((20.0, 5.0), tuple(map(tuple, np.diag([1e-3] * 4).tolist())), (0.0, 0.0), 0.99)
+    world = WorldFilter().update(PositionScan("v2x", 0, (stands,)))
+    pose = gtsam.Pose2(0.0, 0.0, 0.0)
+    for hop, (speed, rate) in enumerate(twists):
+        world = world.update(odometry(0.1 * hop, speed, rate)).predict(0.1)
+        pose = pose.compose(gtsam.Pose2.Expmap(np.array([speed * 0.1, 0.0, rate * 0.1])))
+    ego, place = world.state.ego, world.memory.tracks[0].place
+    assert ego is not None and place is not None
+    assert [*ego.position_m, ego.yaw_rad] == pytest.approx([pose.x(), pose.y(), pose.theta()], abs=1e-7)
+    assert place.mean[:2] == pytest.approx(pose.transformTo(np.array([20.0, 5.0])), abs=1e-6)
+    assert place.mean[2:] == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_the_pose_is_as_uncertain_as_noisy_odometry_leaves_it() -> None:
+    rng = np.random.default_rng(1)
+    ego = EgoMotion(np.zeros(3), np.zeros((3, 3)), 6.0, 0.3, 0.2, 0.02)
+    ends = []
+    for _ in range(2000):
+        one = EgoMotion(np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0)
+        for _ in range(20):
+            twist = 6.0 + 0.2 * rng.standard_normal(), 0.3 + 0.02 * rng.standard_normal()
+            one = driven(EgoMotion(one.pose, one.covariance, *twist, 0.0, 0.0), 0.1)
+        ends.append(one.pose)
+    for _ in range(20):
+        ego = driven(ego, 0.1)
+    scale = np.sqrt(ego.covariance.diagonal())
+    # Of 2000 draws a correlation is known to .02.
+    assert np.cov(np.array(ends).T) / np.outer(scale, scale) == pytest.approx(
+        ego.covariance / np.outer(scale, scale), abs=0.1
+    )
+
+
+def test_an_edge_moves_as_the_ego_vehicle_does_and_is_less_sure_with_its_pose() -> None:
+    at = EgoPose((3.0, 0.5), 0.1, position_std_m=0.3, yaw_std_rad=0.02)
+    near, far = (
+        WorldFilter(CORNERS).update(odometry(0.0, 5.0, pose=pose)).state.context.occluders
+        for pose in (at, EgoPose((0.0, 0.0), 0.0, 1e-3, 1e-3))
+    )
+    assert near[0].edge_azimuth_rad == pytest.approx(math.atan2(2.5, 5.0) - 0.1)
+    assert near[1].edge_azimuth_rad == pytest.approx(math.atan2(-4.5, 5.0) - 0.1)
+    assert far[0].edge_azimuth_rad == pytest.approx(math.atan2(3.0, 8.0))
+    spread = math.sqrt(0.5**2 + 0.3**2) / math.hypot(5.0, 2.5)
+    assert near[0].edge_std_rad == pytest.approx(math.hypot(spread, 0.02), rel=1e-3)
+    assert near[0].hides and WorldFilter(CORNERS).state.context.occluders == CORNERS.occluders
+
+
+@pytest.mark.parametrize("context", [CORNERS, OPEN])
+def test_nobody_is_hidden_where_nothing_hides_anybody(context: Context) -> None:
+    # Past both corners, or on an open road: the same sound that raises an advisory behind a corner.
+    world = WorldFilter(context)
+    if context is CORNERS:
+        behind = world
+        for hop in range(1, 15):
+            behind = behind.update(heard(0.1 * hop))
+        assert behind.state.entities and behind.state.cues[0].advisory is not None
+        world = world.update(odometry(0.0, 0.0, pose=EgoPose((9.0, 0.0))))
+    for hop in range(1, 15):
+        world = world.update(heard(0.1 * hop))
+    assert not world.state.entities
+    assert all(cue.advisory is None and cue.risk < 1e-6 for cue in world.state.cues)
+    assert not any(one.hides for one in world.state.context.occluders)
+
+
+def test_late_odometry_and_a_checkpoint_change_nothing() -> None:
+    told = [heard(0.1 * hop) for hop in range(1, 12)]
+    told += [odometry(0.1 * hop + 0.02, 4.0, 0.05 * hop) for hop in range(11)]
+    in_order, late = WorldFilter(CORNERS), WorldFilter(CORNERS)
+    for one in sorted(told, key=lambda one: one.stamp_ns):
+        in_order = in_order.update(one)
+    for one in told:
+        late = late.update(one)
+    late = late.predict_to(in_order.stamp_ns)
+    assert late.state.entities == in_order.state.entities and late.state.ego == in_order.state.ego
+    kept = WorldFilter.from_dict(in_order.to_dict())
+    assert kept.state == in_order.state
+    more = odometry(1.3, 5.0)
+    assert kept.update(more).state == in_order.update(more).state
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"speed_mps": math.nan}, "speed_mps"),
+        ({"yaw_rate_rad_s": 11.0}, "yaw_rate_rad_s"),
+        ({"stamp_ns": 0.5}, "stamp_ns: expected integer"),
+        ({"source": ""}, "source: expected a name"),
+        ({"pose": (0.0, 0.0)}, "pose: expected an EgoPose"),
+    ],
+)
+def test_what_is_no_odometry_is_refused_by_name(wrong: dict[str, object], words: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=words):
+        Odometry(**({"source": "wheels", "stamp_ns": 0, "speed_mps": 1.0} | wrong))

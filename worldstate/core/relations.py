@@ -1,0 +1,139 @@
+"""Relations of entities to occluders, to the ego vehicle and to one another, and since when they hold."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from worldstate.abduction.sequence.sequence_model import COMING_S, LONGEST_S
+from worldstate.belief.acoustic_update import hidden_share
+from worldstate.belief.site_geometry import normal_share
+from worldstate.belief.track import Track
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import nanoseconds
+from worldstate.state import Context, Relation
+from worldstate.state.relation import EGO
+
+from .memory import Memory
+
+_HOLDS = 0.5  # The probability from which on a relation is said to hold
+_KEPT_NS = nanoseconds(5.0)  # Of a relation that has ended
+# Half the width of a lane in town; whoever is slower than a walk has no heading that tells its lane.
+_HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
+_ALIKE = math.cos(math.radians(30.0))  # Of headings in one lane
+_LEAST_CROSSING_MPS = 0.3
+_CONFLICT_S = 5.0  # Beyond, vehicles have turned or braked
+_KNOWN_M = 5.0  # Standard deviation of a position from which on it is published
+_LEAST = 0.05  # Less likely pairs are not named: of twenty entities there are 380
+
+
+def relations_at(memory: Memory, tracks: Sequence[Track], context: Context) -> tuple[Relation, ...]:
+    """Return the relations of some tracks, with the interval in which each has held."""
+    before = {(one.src, one.dst, one.kind): one for one in memory.relations}
+    edges = [one for track in tracks for one in _edges(track, memory, context)]
+    placed = [one for one in tracks if one.place and one.place.position_std_m < _KNOWN_M]
+    edges += _between(placed, memory.stamp_ns, context)
+    now = {(one.src, one.dst, one.kind): one for one in edges}
+    names = {track.id for track in tracks}
+    for key, edge in before.items():
+        if key not in now and edge.src in names:
+            now[key] = Relation(*key, 0.0, memory.stamp_ns)
+    held = (_held(edge, before.get(key)) for key, edge in now.items())
+    return tuple(edge for edge in held if edge.probability or edge.until_ns is not None)
+
+
+def _held(edge: Relation, before: Relation | None) -> Relation:
+    """Return a relation with the interval in which it has held; the last one is kept for five seconds."""
+    since_ns, until_ns = (None, None) if before is None else (before.since_ns, before.until_ns)
+    if edge.probability >= _HOLDS:
+        begins = since_ns is None or until_ns is not None
+        return replace(edge, since_ns=edge.stamp_ns if begins else since_ns)
+    until_ns = edge.stamp_ns if until_ns is None else until_ns
+    if since_ns is None or edge.stamp_ns - until_ns > _KEPT_NS:
+        return edge
+    return replace(edge, since_ns=since_ns, until_ns=until_ns)
+
+
+def _edges(track: Track, memory: Memory, context: Context) -> Iterator[Relation]:
+    """Yield the relations of one entity to its occluder and to the ego vehicle."""
+    occluder, stamp_ns = context.occluders[track.side].id, memory.stamp_ns
+    if not track.seen:
+        share = hidden_share(track, memory.sides)
+        yield Relation(track.id, occluder, "occluded_by", share, stamp_ns)
+        yield Relation(track.id, occluder, "approaching_from", share * _comes(track, memory), stamp_ns)
+    elif track.was_hidden:
+        yield Relation(track.id, occluder, "emerged_from", 1.0, stamp_ns)
+    if track.approach_heard:
+        deviations = track.motion.inverse_tta_hz / track.motion.inverse_tta_std_hz
+        yield Relation(track.id, EGO, "approaching", normal_share(deviations), stamp_ns)
+
+
+def _comes(track: Track, memory: Memory) -> float:
+    """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
+    if track.place is not None:
+        y, vy = track.place.mean[[1, 3]].tolist()
+        return normal_share(-math.copysign(vy, y * vy) / math.sqrt(track.place.covariance[3, 3]))
+    if memory.sequence is None:
+        return 1.0
+    coming = memory.sequence.coming[track.side]
+    return float(coming[: COMING_S.index(LONGEST_S) + 1].sum() / max(coming.sum(), 1e-12))
+
+
+def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterator[Relation]:
+    r"""Yield who is in one lane with whom, in front of whom, and who will cross the path of the ego vehicle.
+
+    With the heading u of b, its normal n and the offset d from b to a,
+
+    .. math:: P(\text{one lane}) = P(|n \cdot d| \le w / 2), \qquad
+              P(\text{in front}) = P(\text{one lane})\, P(u \cdot d > 0)
+    """
+    ids = [*(one.id for one in tracks), EGO]
+    mean = np.array([*(one.place.mean for one in tracks if one.place), (0.0, 0.0, 0.0, 0.0)])
+    covariance = np.array([*(one.place.covariance for one in tracks if one.place), np.zeros((4, 4))])
+    speed = np.hypot(*mean[:, 2:].T)
+    heading = mean[:, 2:] / np.maximum(speed, _LEAST_SPEED_MPS)[:, None]
+    heading[-1] = 1.0, 0.0
+    moves = np.append(speed[:-1] >= _LEAST_SPEED_MPS, True)
+    normal = heading @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    offset = mean[:, None, :2] - mean[None, :, :2]
+    spread = covariance[:, None, :2, :2] + covariance[None, :, :2, :2]
+    along, across = (np.einsum("abi,bi->ab", offset, axis) for axis in (heading, normal))
+    along_var, across_var = (np.einsum("bi,abij,bj->ab", axis, spread, axis) for axis in (heading, normal))
+    alike = moves[None] & ((heading @ heading.T >= _ALIKE) | ~moves[:, None])
+    near = alike & (np.abs(across) <= _HALF_LANE_M + 2.0 * np.sqrt(across_var))
+    np.fill_diagonal(near, False)
+    for a, b in np.argwhere(near[:-1]).tolist():
+        lane = _within(float(across[a, b]), _HALF_LANE_M, math.sqrt(across_var[a, b]))
+        ahead = lane * normal_share(float(along[a, b]) / math.sqrt(along_var[a, b]))
+        for kind, chance in (("same_lane", lane), ("in_front_of", ahead)):
+            if chance >= _LEAST:
+                yield Relation(ids[a], ids[b], kind, chance, stamp_ns)
+    for track in tracks:
+        chance = _crosses(track, context.ego_speed_mps or 0.0)
+        if chance >= _LEAST:
+            yield Relation(track.id, EGO, "conflicts_with_ego_path", chance, stamp_ns)
+
+
+def _within(mean: float, half: float, std: float) -> float:
+    return normal_share((half - mean) / std) - normal_share((-half - mean) / std)
+
+
+def _crosses(track: Track, ego_speed_mps: float) -> float:
+    r"""Return the probability that an entity is on the path ahead of the ego vehicle within five seconds.
+
+    It crosses y = 0 after :math:`t = -y / v_y` at :math:`x + (v_x - u) t`, each to first order normal.
+    """
+    assert track.place is not None
+    (x, y, vx, vy), covariance = track.place.mean.tolist(), track.place.covariance
+    if y * vy >= 0.0 or abs(vy) < _LEAST_CROSSING_MPS:
+        return 0.0
+    time_s, closing = -y / vy, vx - ego_speed_mps
+    slopes: FloatArray = np.array(
+        [[0.0, -1.0 / vy, 0.0, y / vy**2], [1.0, -closing / vy, time_s, closing * y / vy**2]]
+    )
+    (time_var, _), (_, ahead_var) = (slopes @ covariance @ slopes.T).tolist()
+    soon = normal_share((_CONFLICT_S - time_s) / math.sqrt(time_var))
+    # Whoever may as well stand still or turn away has a deviation of its speed as large as that.
+    comes = normal_share(abs(vy) / math.sqrt(covariance[3, 3]))
+    return soon * comes * normal_share((x + closing * time_s) / math.sqrt(ahead_var))

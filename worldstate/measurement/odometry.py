@@ -1,0 +1,100 @@
+"""Odometry: how the ego vehicle moves, and where it is, as wheels, an inertial unit or a localiser say it."""
+
+import math
+from dataclasses import dataclass
+from numbers import Integral
+
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+
+_FASTEST_MPS, _FASTEST_TURN_HZ, _FARTHEST_M = 100.0, 10.0, 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class EgoPose:
+    """Where the ego vehicle is in the map frame: that in which the corners of the context stand.
+
+    Parameters
+    ----------
+    position_m : (float, float)
+        Of `base_link`, m.
+    yaw_rad : float
+        Its x axis, counter-clockwise from that of the map.
+    position_std_m, yaw_std_rad : float
+        Standard deviations, of the position along either axis.
+
+    Examples
+    --------
+    >>> EgoPose((12.0, 0.0)).yaw_rad
+    0.0
+    """
+
+    position_m: tuple[float, float]
+    yaw_rad: float = 0.0
+    position_std_m: float = 0.1
+    yaw_std_rad: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, value in zip(("x", "y"), self.position_m, strict=True):
+            in_range(f"position_m {name}", value, -_FARTHEST_M, _FARTHEST_M)
+        in_range("yaw_rad", self.yaw_rad, -math.pi, math.pi)
+        in_range("position_std_m", self.position_std_m, 0.0, 1e3, open_low=True)
+        in_range("yaw_std_rad", self.yaw_std_rad, 0.0, math.pi, open_low=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Twist of the ego vehicle, and its pose where a localiser tells it.
+
+    It holds until the next one: between two the ego vehicle drives an arc. Without a pose the arcs are added
+    up from where the first one found it, which is the origin of the map.
+
+    Parameters
+    ----------
+    source : str
+        Name of the sensor.
+    stamp_ns : int
+        When it moved so, ns on the stream's clock.
+    speed_mps, yaw_rate_rad_s : float
+        Along the x axis of `base_link`, and about its z axis, left positive.
+    speed_std_mps, yaw_rate_std_rad_s : float
+        Standard deviations.
+    pose : EgoPose or None
+        In place of what was added up.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a part has the wrong type or range.
+
+    Examples
+    --------
+    >>> Odometry("wheels", 100_000_000, 5.0, yaw_rate_rad_s=0.1).pose is None
+    True
+    """
+
+    source: str
+    stamp_ns: int
+    speed_mps: float
+    yaw_rate_rad_s: float = 0.0
+    speed_std_mps: float = 0.1  # Of wheel encoders at town speeds
+    yaw_rate_std_rad_s: float = 0.01  # Of an automotive gyroscope with its bias
+    pose: EgoPose | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.source, str) or not self.source:
+            raise InvalidArgumentError(f"source: expected a name, got {self.source!r:.40}")
+        if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, Integral):
+            raise InvalidArgumentError(f"stamp_ns: expected integer nanoseconds, got {self.stamp_ns!r:.40}")
+        if not isinstance(self.pose, EgoPose | None):
+            raise InvalidArgumentError(f"pose: expected an EgoPose, got {self.pose!r:.40}")
+        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
+        fastest, turn = _FASTEST_MPS, _FASTEST_TURN_HZ
+        numbers = {
+            "speed_mps": in_range("speed_mps", self.speed_mps, -fastest, fastest),
+            "yaw_rate_rad_s": in_range("yaw_rate_rad_s", self.yaw_rate_rad_s, -turn, turn),
+            "speed_std_mps": in_range("speed_std_mps", self.speed_std_mps, 0.0, fastest),
+            "yaw_rate_std_rad_s": in_range("yaw_rate_std_rad_s", self.yaw_rate_std_rad_s, 0.0, turn),
+        }
+        for name, number in numbers.items():
+            object.__setattr__(self, name, number)
