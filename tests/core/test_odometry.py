@@ -126,3 +126,10 @@ def test_late_odometry_and_a_checkpoint_change_nothing() -> None:
 def test_what_is_no_odometry_is_refused_by_name(wrong: dict[str, object], words: str) -> None:
     with pytest.raises(InvalidArgumentError, match=words):
         Odometry(**({"source": "wheels", "stamp_ns": 0, "speed_mps": 1.0} | wrong))
+
+
+def test_a_claim_from_an_open_road_is_in_view() -> None:
+    far = Position((10.0, 14.0), ((1.0, 0.0), (0.0, 1.0)), existence_probability=0.95)
+    for context, status in ((OPEN, "emerged"), (Context(), "hidden")):
+        entity = WorldFilter(context).update(PositionScan("v2x", 0, (far,))).state.entities[0]
+        assert entity.status == status

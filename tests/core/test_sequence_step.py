@@ -1,6 +1,7 @@
 """The reading of a sequence in the filter: its laws, its alarm, and what the snapshot says of it."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
@@ -8,12 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import gamma
 
 from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Look
@@ -296,3 +299,29 @@ def test_who_came_into_view_unseen_is_there_as_long_as_it_sounds() -> None:
     np.testing.assert_allclose(belief(dead[-1]), said[-1].groups, rtol=1e-6, atol=1e-9)
     again = WorldFilter.from_dict(dead[40].to_dict())
     assert again.update(heard(42, said[41])).state == dead[41].state
+
+
+@settings(max_examples=20)
+@given(SEEDS, st.floats(0.001, 0.1), st.floats(0.0, 2000.0), st.integers(0, 50))
+def test_arrivals_are_learned_as_a_gamma_posterior_and_move_the_prior_by_half_a_nat_at_most(
+    seed: int, usual_hz: float, watched_s: float, count: int
+) -> None:
+    # Oracle: the mean of scipy's gamma distribution, its prior worth two arrivals at the usual rate.
+    posterior = gamma(2.0 + count, scale=1.0 / (2.0 / usual_hz + watched_s))
+    expected = float(np.clip(math.log(posterior.mean() / usual_hz), -0.5, 0.5))
+    assert ArrivalRate(float(count), watched_s).shift_nats(usual_hz) == pytest.approx(expected, abs=0.05001)
+
+
+def test_a_street_on_which_nobody_comes_is_watched_and_expected_to_stay_so() -> None:
+    readings = drawn(np.random.default_rng(3), 1)
+    world = WorldFilter()
+    for hop in range(0, 6000, 4):
+        nobody = Look("camera", hop * 10**8, Absent(0.04))
+        world = world.update(replace(heard(hop, readings[0]), look=nobody))
+        if hop == 0:
+            first = world.memory.sequence.prior(Context())
+    watched = world.memory.sequence
+    moved = np.log(watched.prior(Context()) / first)
+    assert [one.watched_s for one in watched.arrivals] == pytest.approx([553.0] * 2, abs=5.0)
+    assert moved[:, 0] - moved[:, -1] == pytest.approx([-0.5, -0.5], abs=1e-9)
+    assert WorldFilter.from_dict(world.to_dict()).state == world.state

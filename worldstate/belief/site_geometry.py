@@ -28,10 +28,13 @@ class SideGeometry:
     std_rad: float
     edge_std_rad: float = math.radians(5.0)
     pace_hz: float = 0.5  # Speed over the distance of the crossing lane
+    hides: bool = True
     yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
 
     def behind(self, azimuth_rad: float, std_rad: float) -> float:
         """Return the probability that what stands at an azimuth is behind this side's occluder."""
+        if not self.hides:
+            return 0.0
         outwards = math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
         past = outwards * wrap_angle(azimuth_rad - self.edge_azimuth_rad) / std_rad
         return normal_share(past) - normal_share(past - _WIDEST_RAD / std_rad)

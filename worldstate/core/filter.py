@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.ground.values import NotUsable, integer_ns, nanoseconds
 from worldstate.measurement.measurement import Approach, Bearing, Look, Measurement
 from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
@@ -119,7 +118,7 @@ class WorldFilter:
     lag: FixedLag | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "start_ns", _integer_ns("start_ns", self.start_ns))
+        object.__setattr__(self, "start_ns", integer_ns("start_ns", self.start_ns))
         speed_mps = self.context.ego_speed_mps or 0.0
         if not abs(speed_mps) <= _FASTEST_EGO_MPS:  # NaN compares false
             wanted = f"expected a number within +-{_FASTEST_EGO_MPS}"
@@ -208,7 +207,7 @@ class WorldFilter:
         InvalidArgumentError
             If that time is no integer or is earlier than the belief's.
         """
-        stamp_ns = _integer_ns("stamp_ns", stamp_ns)
+        stamp_ns = integer_ns("stamp_ns", stamp_ns)
         if stamp_ns < self.stamp_ns - STAMP_SLACK_NS:
             raise InvalidArgumentError(
                 f"stamp_ns: expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
@@ -325,14 +324,6 @@ class WorldFilter:
         return step.FilterModel(self.context, self.policy, step.site_geometry_of(self.context, self.settings))
 
 
-def _integer_ns(name: str, value: object) -> int:
-    """Return a time stamp as a Python integer."""
-    # NaN and infinity would pass the comparisons of `predict_to` and stay in the belief.
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise InvalidArgumentError(f"{name}: expected integer nanoseconds, got {value!r}")
-    return int(value)
-
-
 def _checked(measurement: Timed, context: Context) -> Timed:
     """Return the measurement in plain numbers; refuse what would poison the belief: it takes NaN as it is."""
     if isinstance(measurement, Odometry):
@@ -349,9 +340,9 @@ def _checked(measurement: Timed, context: Context) -> Timed:
         )
     if isinstance(measurement.sequence, SequenceReading) and context.directions != SIDES:
         raise InvalidArgumentError(f"sequence: expected the directions {SIDES}, got {context.directions}")
-    stamp_ns = _integer_ns("stamp_ns", measurement.stamp_ns)
+    stamp_ns = integer_ns("stamp_ns", measurement.stamp_ns)
     if measurement.look is not None:
-        _integer_ns("look.stamp_ns", measurement.look.stamp_ns)
+        integer_ns("look.stamp_ns", measurement.look.stamp_ns)
     for name, value, low, high in _numbers(measurement):
         # NaN compares false, and what is no number does not compare.
         if not isinstance(value, int | float | np.number) or not low <= value <= high:

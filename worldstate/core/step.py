@@ -78,6 +78,7 @@ def site_geometry_of(
             one.hidden_std_rad,
             one.edge_std_rad,
             one.pace_hz,
+            one.hides,
             0.0 if one.corner_m is None else yaw_rad,
         )
         for one in context.occluders

@@ -94,3 +94,14 @@ def in_range(
         left, right = "(" if open_low else "[", ")" if open_high else "]"
         raise InvalidArgumentError(f"{name}: expected a number in {left}{low}, {high}{right}, got {number}")
     return number
+
+
+def named(name: str, value: object) -> None:
+    """Refuse what is no name.
+
+    Examples
+    --------
+    >>> named("source", "radar")
+    """
+    if not isinstance(value, str) or not value:
+        raise InvalidArgumentError(f"{name}: expected a name, got {value!r:.40}")

@@ -302,7 +302,7 @@ def _record(cls: Any) -> Plan:
     plans = {member.name: _plan(hints[member.name]) for member in members}
     flat = {member.name: plans.pop(member.name) for member in members if member.metadata.get("flat")}
     added = {member.name for member in members if member.metadata.get("added")}
-    write = _literal(layout, {name: write for name, (write, _) in plans.items()}, flat)
+    write = _writer(layout, {name: write for name, (write, _) in plans.items()}, flat)
 
     def read(data: object) -> dict[str, Any]:
         entries = _object(data)
@@ -324,18 +324,21 @@ def _record(cls: Any) -> Plan:
     return write, _then(read, lambda values: cls(**values))
 
 
-def _literal(layout: Layout, writers: dict[str, Write], flat: dict[str, Plan]) -> Write:
-    """Return the function that fills in a dict literal: a loop over the fields takes four times as long."""
+def _writer(layout: Layout, writers: dict[str, Write], flat: dict[str, Plan]) -> Write:
+    """Return the function that writes a dataclass: fields that stand as they are first, for speed."""
     stamp = {"schema": {"name": layout.schema, "version": layout.version}} if layout.schema else {}
-    entries = [f"{key!r}: {constant!r}" for key, constant in {**stamp, **layout.constants}.items()]
-    for name, write in writers.items():
-        value = f"value.{name}"
-        entries.append(f"{name!r}: {value if write is _as_is else f'write_{name}({value})'}")
-    entries += [f"**write_{name}(value.{name})" for name in flat]
-    known = {f"write_{name}": write for name, write in writers.items()}
-    known |= {f"write_{name}": write for name, (write, _) in flat.items()}
-    made: Write = eval(f"lambda value: {{{', '.join(entries)}}}", known)
-    return made
+    constants, names = {**stamp, **layout.constants}, (*writers, *flat)
+    changed = [(name, write) for name, write in writers.items() if write is not _as_is]
+
+    def write(value: Any) -> dict[str, Any]:
+        record = constants | {name: getattr(value, name) for name in names}
+        for name, write_value in changed:
+            record[name] = write_value(record[name])
+        for name, (write_flat, _) in flat.items():
+            record |= write_flat(record.pop(name))
+        return record
+
+    return write
 
 
 def _check_schema(stamp: object, layout: Layout) -> None:

@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 # A float stays a float, an array an array.
@@ -115,3 +117,17 @@ def nanoseconds(time_s: float) -> int:
     1500000000
     """
     return round(time_s * NANOSECONDS_PER_SECOND)
+
+
+def integer_ns(name: str, value: object) -> int:
+    """Return a time stamp as a Python integer.
+
+    Examples
+    --------
+    >>> integer_ns("stamp_ns", 5)
+    5
+    """
+    # NaN and infinity would pass comparisons and stay in the belief.
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InvalidArgumentError(f"{name}: expected integer nanoseconds, got {value!r:.40}")
+    return int(value)

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from numbers import Integral
 
-from worldstate.ground.checks import in_range
+from worldstate.ground.checks import in_range, named
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.values import integer_ns
 
-_FASTEST_MPS, _FASTEST_TURN_HZ, _FARTHEST_M = 100.0, 10.0, 1e6
+_FARTHEST_M = 1e6
+_MOST = {"speed_mps": 100.0, "yaw_rate_rad_s": 10.0, "speed_std_mps": 100.0, "yaw_rate_std_rad_s": 10.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +83,10 @@ class Odometry:
     pose: EgoPose | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.source, str) or not self.source:
-            raise InvalidArgumentError(f"source: expected a name, got {self.source!r:.40}")
-        if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, Integral):
-            raise InvalidArgumentError(f"stamp_ns: expected integer nanoseconds, got {self.stamp_ns!r:.40}")
+        named("source", self.source)
         if not isinstance(self.pose, EgoPose | None):
             raise InvalidArgumentError(f"pose: expected an EgoPose, got {self.pose!r:.40}")
-        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
-        fastest, turn = _FASTEST_MPS, _FASTEST_TURN_HZ
-        numbers = {
-            "speed_mps": in_range("speed_mps", self.speed_mps, -fastest, fastest),
-            "yaw_rate_rad_s": in_range("yaw_rate_rad_s", self.yaw_rate_rad_s, -turn, turn),
-            "speed_std_mps": in_range("speed_std_mps", self.speed_std_mps, 0.0, fastest),
-            "yaw_rate_std_rad_s": in_range("yaw_rate_std_rad_s", self.yaw_rate_std_rad_s, 0.0, turn),
-        }
-        for name, number in numbers.items():
-            object.__setattr__(self, name, number)
+        object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
+        for name, most in _MOST.items():
+            low = 0.0 if "_std_" in name else -most
+            object.__setattr__(self, name, in_range(name, getattr(self, name), low, most))

@@ -1,14 +1,13 @@
 """Positions: what a radar, a lidar or a radio message says of where road users are."""
 
 from dataclasses import dataclass
-from numbers import Integral
 
 import numpy as np
 
 from worldstate.abduction.road_users import ClassShares
-from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.checks import finite_array, in_range, named
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import nanoseconds
+from worldstate.ground.values import integer_ns, nanoseconds
 
 from .sector import Sector
 
@@ -157,10 +156,7 @@ class PositionScan:
     latency_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.source, str) or not self.source:
-            raise InvalidArgumentError(f"source: expected a name, got {self.source!r:.40}")
-        if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, Integral):
-            raise InvalidArgumentError(f"stamp_ns: expected integer nanoseconds, got {self.stamp_ns!r:.40}")
+        named("source", self.source)
         positions = tuple(self.positions)
         if len(positions) > MOST_POSITIONS or not all(isinstance(one, Position) for one in positions):
             got = f"{len(positions)} items"
@@ -168,7 +164,7 @@ class PositionScan:
         if not isinstance(self.searched, SearchedSector | None):
             raise InvalidArgumentError(f"searched: expected a SearchedSector, got {self.searched!r:.40}")
         object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
+        object.__setattr__(self, "stamp_ns", integer_ns("stamp_ns", self.stamp_ns))
         object.__setattr__(self, "latency_s", in_range("latency_s", self.latency_s, 0.0, 1e3))
 
     @property

@@ -25,7 +25,7 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
         "--uncalibrated", action="store_true",
         help="go on where the model was made for another array or rate; no cue states an alpha then",
     )  # fmt: skip
-    grounded = "weigh the signature with bearing and approach, eq. (5) (default: off)"
+    grounded = "weigh windows with bearing and approach, eq. (5), not the sequence (default: off)"
     add("--grounded", action="store_true", help=grounded)
     ego_noise = "learn the own vehicle's noise while nothing is there and hear past it (default: off)"
     add("--ego-noise", action="store_true", help=ego_noise)
