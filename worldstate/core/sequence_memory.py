@@ -25,7 +25,6 @@ from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     SequenceAlarm,
     SequencePosterior,
-    soon_log_odds,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.arrival_rate import ArrivalRate
@@ -120,9 +119,12 @@ class SequenceMemory:
     def prior(self, context: Context) -> FloatArray:
         """Return the distribution of the groups that is expected of each side, shape (2, groups)."""
         hidden = None if context.priors is None else context.priors.hidden / len(SIDES)
+        return np.array([context_prior(self.share, hidden, nats) for nats in self.learned_nats(context)])
+
+    def learned_nats(self, context: Context) -> list[float]:
+        """Return by how much the log-odds of each side are moved by what was seen; a given prior stands."""
         usual_hz = float(self.share[: len(COMING_S)].sum() / self.share.sum()) / COMING_S[-1]
-        learned = (one.shift_nats(usual_hz) for one in self.arrivals)
-        return np.array([context_prior(self.share, hidden, nats) for nats in learned])
+        return [0.0 if context.priors else one.shift_nats(usual_hz) for one in self.arrivals]
 
     def _explained(self) -> FloatArray:
         """Return log p(sound | one comes) of each side, given who has just come into view there, shape (2,).
@@ -156,16 +158,21 @@ class SequenceMemory:
 
         .. math:: t_j = L_j - L_{j-1}
 
-        with L of both sides after the prior, the sequence, every look, and who has just come into view.
+        with L of both sides after the prior, the sequence, every look, and who has just come into view. The
+        last term takes the learned traffic out again: the alarm keeps to its onsets an hour of a usual
+        street. Left in, in busy streets the other side of a single was alarmed in .56 of the cases for .35.
         """
-        told = np.cumsum([np.zeros_like(self.sides.belief), *self._told.values()], axis=0)
+        nats, pieces = np.array(self.learned_nats(context)), self._told
+        if nats.any():
+            pieces = pieces | {"usual traffic": -nats[:, None] * COMES}
+        told = np.cumsum([np.zeros_like(self.sides.belief), *pieces.values()], axis=0)
         # States and groups count alike: those who come soon behind somebody come soon.
         before = states_of(self.prior(context), self.share)
         weights = np.concatenate([before[None], self.sides.belief * np.exp(told)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
         log_odds = np.log(soon) - np.log(later)
         terms = np.diff(log_odds, axis=0, prepend=np.zeros((1, len(SIDES))))
-        return dict(zip(("prior", "sequence", *self._told), terms.tolist(), strict=True))
+        return dict(zip(("prior", "sequence", *pieces), terms.tolist(), strict=True))
 
     @property
     def mean_log_odds(self) -> FloatArray:
@@ -219,12 +226,12 @@ def informed(
             # Whoever has come into view is seen there but for a miss; who is seen was handed over.
             kept = replace(kept, unseen=tuple(chance * look.answer.miss_rate for chance in kept.unseen))
     looks = tuple(sorted(looks, key=attrgetter("sensor")))
-    return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=measurement.stamp_ns))
+    return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=measurement.stamp_ns), context)
 
 
-def _alerted(kept: SequenceMemory) -> SequenceMemory:
+def _alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
-    left, right = soon_log_odds(kept.posterior)[0].tolist()
+    left, right = np.sum(list(kept.log_odds_terms(context).values()), axis=0).tolist()
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
     kept = replace(kept, recent=recent)
