@@ -28,9 +28,9 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.acoustic_domain import array_of, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
-from worldstate.adapters.files.ego_speed import EgoSpeed
 from worldstate.adapters.files.engine_file import EngineSpeed, read_engine
 from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -188,10 +188,9 @@ class Source:
         What it has heard beforehand, from a checkpoint.
     co_evidence : CoEvidenceChannel or None
         Asked in place of the detections: a camera that runs.
-    ego : EgoSpeed or None
-        Speed of the ego vehicle over time, which then stands in the context.
     others : tuple of callables
-        What other sensors measured, each returning it in the order of stamps, on the clock of the sound.
+        What other sensors measured, odometry too, each returning it in the order of stamps on the clock of
+        the sound.
 
     Examples
     --------
@@ -228,7 +227,6 @@ class Source:
     sequence: SequenceModel | NotUsable | None = None
     history: SequenceHistory | None = None
     co_evidence: CoEvidenceChannel | None = None
-    ego: EgoSpeed | None = None
     others: tuple[OtherModality, ...] = ()
 
     def world(self) -> WorldFilter:
@@ -324,7 +322,7 @@ def open_source(
     resume: Path | str | Checkpoint | None = None,
     start_s: float = 0.0,
     engine: Path | str | EngineSpeed | None = None,
-    ego: EgoSpeed | None = None,
+    ego: OdometryLog | None = None,
     others: Sequence[OtherModality] = (),
     settings: ListenSettings | None = None,
 ) -> Source:
@@ -361,8 +359,8 @@ def open_source(
         with a clock of its own brings it.
     engine : path or EngineSpeed, optional
         Speed of the own engine, as `read_engine` reads it; its lines are cancelled, with `ego_noise` only.
-    ego : EgoSpeed, optional
-        Speed of the ego vehicle over time, in place of the one speed of the context.
+    ego : OdometryLog, optional
+        How the ego vehicle moves, in place of the one speed of the context.
     others : sequence of callables, optional
         What other sensors measured: functions that return `Measurement` and `PositionScan` in their order.
     settings : ListenSettings, optional
@@ -410,8 +408,7 @@ def open_source(
         resume=None if before is None else before.world,
         start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
         or (sound.start_ns if isinstance(sound, SoundStream) else 0),
-        ego=ego,
-        others=tuple(others),
+        others=tuple(others) if ego is None else (*others, ego.told.__iter__),
         engine=read_engine(engine) if isinstance(engine, Path | str) else engine,
     )
 
@@ -615,25 +612,16 @@ def listen_steps(source: Source) -> Iterator[Step]:
     [(60,), (60,), (60,)]
     """
     world, signature, reader = source.world(), source.signature(), source.reader()
-    # What the belief to go on from has taken in already is left out.
-    waiting = Waiting(source.others, -1 if source.resume is None else source.resume.stamp_ns)
+    # What the belief to go on from has taken in already, or what was told before it began, is left out.
+    waiting = Waiting(source.others, source.start_ns - 1 if source.resume is None else world.stamp_ns)
     measured = measure_steps(source, lambda: world.explanation.none, signature, reader)
     for frame, measurement in measured:
-        world = _driven(world, source.ego, frame.stamp_ns)
         for other in waiting.until(measurement.stamp_ns):
             world = world.update(other)
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         site = signature.estimate if isinstance(signature, SiteSignature) else None
         history = reader.history if isinstance(reader, SequenceReader) else None
         yield Step(frame, measurement, world, site, history)
-
-
-def _driven(world: WorldFilter, ego: EgoSpeed | None, stamp_ns: int) -> WorldFilter:
-    """Return the belief with the speed of the ego at a time, where it is reported."""
-    speed_mps = world.context.ego_speed_mps if ego is None else ego.at(stamp_ns)
-    if speed_mps == world.context.ego_speed_mps:
-        return world
-    return replace(world, context=replace(world.context, ego_speed_mps=speed_mps))
 
 
 def measure_steps(

@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
 
 from worldstate.adapters.camera.detector import Detector
+from worldstate.core.fixed_lag import Timed
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement.measurement import Measurement
-from worldstate.measurement.position import PositionScan
 from worldstate.state import WorldState
 
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
 # What other modalities say, each time it is asked for anew.
-OtherModality: TypeAlias = Callable[[], Iterable[Measurement | PositionScan]]
+OtherModality: TypeAlias = Callable[[], Iterable[Timed]]
 
 
 class DetectorPart(Protocol):
@@ -74,7 +73,7 @@ class MeasurementsPart(Protocol):
     []
     """
 
-    def __call__(self, path: Path, /) -> Iterable[Measurement | PositionScan]:
+    def __call__(self, path: Path, /) -> Iterable[Timed]:
         """Return measurements in the order of their stamps; what wraps a `MeasurementAdapter` does."""
         ...
 
@@ -153,17 +152,17 @@ class Waiting:
         self._rest = (one for one in merged if one.stamp_ns > after_ns)
         self._next = next(self._rest, None)
 
-    def until(self, stamp_ns: int) -> Iterator[Measurement | PositionScan]:
+    def until(self, stamp_ns: int) -> Iterator[Timed]:
         """Yield what was measured up to a time and has not been yielded before."""
         while self._next is not None and self._next.stamp_ns <= stamp_ns:
             yield self._next
             self._next = next(self._rest, None)
 
 
-def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Measurement | PositionScan]:
+def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:
     for one in part(path):
-        if not isinstance(one, Measurement | PositionScan):
+        if not isinstance(one, Timed):
             raise InvalidArgumentError(
-                f"{name}: expected measurements of Measurement or PositionScan, got {one!r:.60}"
+                f"{name}: expected Measurement, PositionScan or Odometry, got {one!r:.60}"
             )
         yield one

@@ -14,10 +14,11 @@ from worldstate.adapters.camera.detections import (
     DetectionFrame,
     DetectionLog,
 )
-from worldstate.adapters.files.ego_speed import EgoSpeed
 from worldstate.adapters.files.json_file import refused_as_file
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.measurement.odometry import Odometry
 
 from .bag_audio import AUDIO_KINDS, BagSound, first_stamp
 from .bag_reader import BagReader, open_bag
@@ -40,7 +41,7 @@ class BagInput:
     sound: BagSound
     array: MicrophoneArray | None
     detections: DetectionLog | None
-    ego: EgoSpeed | None
+    ego: OdometryLog | None
 
 
 def read_sound(path: Path, topic: str | None = None) -> tuple[BagSound, MicrophoneArray | None]:
@@ -129,13 +130,13 @@ def _best(results: Any) -> tuple[str, float]:
     return str(getattr(best, "class_id", getattr(best, "id", "unknown"))), float(best.score)
 
 
-def _ego(bag: BagReader, topic: str) -> EgoSpeed:
-    reported = [
-        (stamp_of(said.header) or recorded_ns, said.twist.twist.linear.x)
+def _ego(bag: BagReader, topic: str) -> OdometryLog:
+    told = (
+        (stamp_of(said.header) or recorded_ns, said.twist.twist)
         for recorded_ns, said in _few(bag, topic, 100 * MAX_FRAMES)
-    ]
-    stamps = np.array([stamp for stamp, _ in reported], dtype=np.int64)
-    return EgoSpeed(stamps, np.array([speed for _, speed in reported], dtype=np.float64))
+    )
+    # Not its pose: the frame of odometry is not the map in which the corners of a context stand.
+    return OdometryLog(tuple(Odometry(topic, ns, twist.linear.x, twist.angular.z) for ns, twist in told))
 
 
 def _few(bag: BagReader, topic: str, most: int = MAX_FRAMES) -> Iterator[tuple[int, Any]]:

@@ -5,16 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from worldstate.adapters.audio.open_sound import SoundInput, open_sound
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ, TRUTH_NAME
-from worldstate.adapters.files.ego_speed import EgoSpeed
 from worldstate.adapters.files.json_file import read_json
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.values import nanoseconds
+from worldstate.measurement.odometry import Odometry
 
 from .bag_writer import Storage, WriteMessage, bag_writer
 from .message_types import ARRAY, AUDIO, DETECTIONS, ODOMETRY, header
@@ -33,7 +33,7 @@ def write_recording(
     sound: SoundInput,
     array: MicrophoneArray,
     detections: DetectionLog | None = None,
-    ego: EgoSpeed | None = None,
+    ego: OdometryLog | None = None,
     *,
     start_ns: int = 0,
     storage: Storage = "mcap",
@@ -63,14 +63,14 @@ def write_recording(
             _write(write, event)
 
 
-def ego_speed_of(recording: Recording) -> EgoSpeed | None:
-    """Return the speed of a recording's ego: 0 where it stands, as simulated where that is known."""
+def odometry_of(recording: Recording) -> OdometryLog | None:
+    """Return the odometry of a recording's ego: it stands, as simulated where that is known."""
     with open_audio(recording.audio_path, strict=False) as audio:
         steps = int(audio.duration_s * FRAME_RATE_HZ) + 1
     standing = recording.moving_ego is False
     speeds = [0.0] * steps if standing else _simulated_speeds(recording.path / TRUTH_NAME)
-    stamps = np.round(np.arange(len(speeds)) * (1_000_000_000 / FRAME_RATE_HZ)).astype(np.int64)
-    return EgoSpeed(stamps, np.array(speeds, dtype=np.float64)) if speeds else None
+    told = (Odometry("odometry", nanoseconds(i / FRAME_RATE_HZ), one) for i, one in enumerate(speeds))
+    return OdometryLog(tuple(told)) if speeds else None
 
 
 def _simulated_speeds(path: Path) -> list[float]:
@@ -109,11 +109,15 @@ def _boxes(frame: DetectionFrame) -> Iterator[dict[str, Any]]:
         yield {"bbox": {"center": {"position": centre}} | size, "results": [said]}
 
 
-def _driven(ego: EgoSpeed | None, start_ns: int) -> Iterator[_Event]:
+def _driven(ego: OdometryLog | None, start_ns: int) -> Iterator[_Event]:
     if ego is None:
         return
-    for stamp_ns, speed_mps in zip(ego.stamps_ns.tolist(), ego.speed_mps.tolist(), strict=True):
-        head = header(start_ns + stamp_ns, "odom")
-        twist = {"twist": {"linear": {"x": speed_mps}}}
-        values = {"header": head, "child_frame_id": "base_link", "twist": twist}
-        yield start_ns + stamp_ns, ODOMETRY_TOPIC, ODOMETRY, values
+    for told in ego.told:
+        stamp_ns = start_ns + told.stamp_ns
+        twist = {"linear": {"x": told.speed_mps}, "angular": {"z": told.yaw_rate_rad_s}}
+        values = {
+            "header": header(stamp_ns, "odom"),
+            "child_frame_id": "base_link",
+            "twist": {"twist": twist},
+        }
+        yield stamp_ns, ODOMETRY_TOPIC, ODOMETRY, values

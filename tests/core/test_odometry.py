@@ -1,5 +1,6 @@
 """The ego vehicle moves: what stands moves in its axes, and a corner that it has passed hides nobody."""
 
+import json
 import math
 
 import gtsam
@@ -10,8 +11,10 @@ from hypothesis import strategies as st
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
+from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.belief.ego_motion import EgoMotion, driven
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.measurement import Position, PositionScan
 from worldstate.measurement.odometry import EgoPose, Odometry
 from worldstate.state.context import corner_at, open_road
@@ -133,3 +136,47 @@ def test_a_claim_from_an_open_road_is_in_view() -> None:
     for context, status in ((OPEN, "emerged"), (Context(), "hidden")):
         entity = WorldFilter(context).update(PositionScan("v2x", 0, (far,))).state.entities[0]
         assert entity.status == status
+
+
+def test_odometry_is_read_from_csv_and_wrong_lines_are_named(tmp_path) -> None:
+    path = tmp_path / "ego.csv"
+    path.write_text("time_s,speed_mps,yaw_rate_rad_s,x_m,y_m,yaw_rad\n0,5,0.1,2,1,0.3\n0.1,5.5,0,2.5,1,0.3\n")
+    log = read_odometry(path)
+    assert log.told[0] == Odometry("odometry", 0, 5.0, 0.1, pose=EgoPose((2.0, 1.0), 0.3))
+    assert log.moves and log.told[1].stamp_ns == 100_000_000
+    for text, words in (
+        ("time_s,speed_mps\n0,fast\n", "line 2: expected a finite number as speed_mps"),
+        ("time_s,speed_mps\n0,500\n", "line 2: speed_mps: expected a number in"),
+        ("time_s,speed_mps\n1,5\n1,5\n", "increasing times"),
+        ("time_s,speed_mps,x_m\n1,5,0\n", "expected y_m, yaw_rad beside"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputFileError, match=words):
+            read_odometry(path)
+
+
+def test_a_run_with_odometry_drives_up_to_the_corner(approach, tmp_path) -> None:
+    context, ego, out = tmp_path / "c.json", tmp_path / "ego.csv", tmp_path / "states.jsonl"
+    arms = [
+        {"direction": "left", "corner_m": [20.0, 4.0], "crossing_m": 24.0},
+        {"direction": "right", "corner_m": [20.0, -4.0], "crossing_m": 24.0},
+    ]
+    context.write_text(json.dumps({"arms": arms}))
+    ego.write_text("time_s,speed_mps\n" + "".join(f"{0.1 * k:.1f},1.5\n" for k in range(100)))
+    command = [
+        "run",
+        str(approach.folder),
+        "--context",
+        str(context),
+        "--odometry",
+        str(ego),
+        "--out",
+        str(out),
+    ]
+    assert main(command) == 0
+    states = [json.loads(line) for line in out.read_text().splitlines()]
+    for state in (states[0], states[-1]):
+        x = 1.5 * state["stamp_ns"] * 1e-9
+        assert state["ego"]["position_m"] == pytest.approx([x, 0.0], abs=1e-6)
+        edge = state["context"]["occluders"][0]["edge_azimuth_rad"]
+        assert edge == pytest.approx(math.atan2(4.0, 20.0 - x), abs=1e-6)

@@ -18,13 +18,14 @@ from scripted_states import scripted_states
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.export.autoware import autoware_objects
 from worldstate.adapters.export.scene import scene_update
-from worldstate.adapters.files.ego_speed import EgoSpeed
+from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.ros.bag_input import BagTopics, read_bag
 from worldstate.adapters.ros.bag_writer import bag_writer
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
 from worldstate.adapters.ros.state_bag import state_bag
 from worldstate.cli.main import main
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError
+from worldstate.measurement.odometry import Odometry
 
 RATE_HZ, CHANNELS = 8000, 4
 STATES = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in scripted_states()]
@@ -265,7 +266,7 @@ def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
         [0.8],
         [[10.0, 20.0, 40.0, 60.0]],
     )
-    assert held.ego.at(3_750_000_000) == 3.0
+    assert [(one.stamp_ns, one.speed_mps) for one in held.ego.told][:1] == [(3_000_000_000, 0.0)]
     assert held.ego.moves
     assert held.array is None
 
@@ -275,16 +276,16 @@ def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
     from worldstate.frontend import MicrophoneArray
 
     path = write_blocks(tmp_path / "bag", sound_of(2 * RATE_HZ))
-    stamps = np.array([5_000_000_000, 7_000_000_000])
+    told = [Odometry("wheels", 5_000_000_000 + k * 250_000_000, 2.0 * k) for k in range(9)]
     source = open_source(
         read_bag(path).sound,
         array=MicrophoneArray([[0, y, 0] for y in (0.1, 0.05, -0.05, -0.1)]),
-        ego=EgoSpeed(stamps, np.array([0.0, 8.0])),
+        ego=OdometryLog(tuple(told)),
         settings=ListenSettings(uncalibrated=True),
     )
     said = {step.state.stamp_ns: step.state.context.ego_speed_mps for step in listen_steps(source)}
     assert list(said) == [6_000_000_000 + k * 100_000_000 for k in range(11)]
-    assert list(said.values()) == pytest.approx([4.0 + 0.4 * k for k in range(11)])
+    assert list(said.values()) == [2.0 * int(4 + 0.4 * k) for k in range(11)]
 
 
 def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
@@ -338,7 +339,9 @@ def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
     (folder / "truth.json").write_text(json.dumps({"ego": {"speed_mps": [4.0] * 5 + [2.0] * 6}}))
     assert main(["to-bag", str(folder), str(tmp_path / "driven"), "--start", "3"]) == 0
     ego = read_bag(tmp_path / "driven").ego
-    assert [ego.at(3_000_000_000 + k * 100_000_000) for k in (0, 4, 5, 10)] == [4.0, 4.0, 2.0, 2.0]
+    assert [(one.stamp_ns, one.speed_mps) for one in ego.told] == [
+        (3_000_000_000 + k * 100_000_000, 4.0 if k < 5 else 2.0) for k in range(11)
+    ]
 
 
 def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
@@ -348,13 +351,6 @@ def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
     capsys.readouterr()
     assert main(["run", str(log)]) == 2
     assert "`worldstate replay` reads" in capsys.readouterr().err
-
-
-def test_an_ego_that_cannot_be_is_refused():
-    with pytest.raises(InvalidArgumentError, match="at most 100 m/s, got 250"):
-        EgoSpeed(np.array([0, 1]), np.array([0.0, -250.0]))
-    with pytest.raises(InvalidArgumentError, match="increasing"):
-        EgoSpeed(np.array([1, 1]), np.array([0.0, 1.0]))
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

@@ -45,8 +45,8 @@ from worldstate.ground.errors import InputFileError
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionLog
-    from worldstate.adapters.files.ego_speed import EgoSpeed
     from worldstate.adapters.files.engine_file import EngineSpeed
+    from worldstate.adapters.files.odometry_file import OdometryLog
     from worldstate.adapters.listen import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
@@ -80,6 +80,8 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--mask-dead", action="store_true", help="leave silent channels out instead of refusing the recording"
     )
+    moves = "columns time_s, speed_mps; optional yaw_rate_rad_s, and x_m, y_m, yaw_rad where corners stand"
+    add("--odometry", type=Path, metavar="CSV", help=moves)
     rpm = "columns time_s, rpm of the own engine: cancel its lines, with --ego-noise"
     add("--engine-rpm", type=Path, metavar="CSV", help=rpm)
     firings = "firings a turn: half the cylinders (default: %(default)g)"
@@ -161,14 +163,16 @@ def _source(arguments: argparse.Namespace) -> "Source":
 
 def _input(
     arguments: argparse.Namespace,
-) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, EgoSpeed | None]":
-    """Return sound, array, detections and speed of the ego: options, or what a bag holds."""
+) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, OdometryLog | None]":
+    """Return sound, array, detections and odometry: options, or what a bag holds."""
+    from worldstate.adapters.files.odometry_file import read_odometry
     from worldstate.adapters.ros.bag_input import needed_array, read_bag
     from worldstate.ground.errors import InvalidArgumentError
 
     bag, array = bag_of(arguments), given_array(arguments)
     if bag is None:
-        return sound_of(arguments), array, arguments.detections, None
+        told = None if arguments.odometry is None else read_odometry(arguments.odometry)
+        return sound_of(arguments), array, arguments.detections, told
     if arguments.start:
         raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
     held = read_bag(bag, topics_of(arguments))

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.ovad import Recording
     from worldstate.adapters.ros.bag_writer import check_bag_target
-    from worldstate.adapters.ros.recording_bag import ego_speed_of, write_recording
+    from worldstate.adapters.ros.recording_bag import odometry_of, write_recording
     from worldstate.cli.common.progress import track
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import nanoseconds
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     start_ns = nanoseconds(in_range("--start", arguments.start, 0.0, 4e9))
     recording = Recording.open(arguments.recording)
     array, seen = choose_array(recording.path, given_array(arguments)), recording.read_detections()
-    ego = ego_speed_of(recording)
+    ego = odometry_of(recording)
     written = write_recording(
         arguments.out, recording.audio_path, array, seen, ego,
         start_ns=start_ns, storage=arguments.ros_storage,
