@@ -15,7 +15,7 @@ STAMPED_PCM, PCM = "audio_common_msgs/msg/AudioDataStamped", "audio_common_msgs/
 PCM_INFO = "audio_common_msgs/msg/AudioInfo"
 DETECTIONS, ODOMETRY = "vision_msgs/msg/Detection2DArray", "nav_msgs/msg/Odometry"
 OBJECTS = "autoware_perception_msgs/msg/PredictedObjects"
-MARKERS = "visualization_msgs/msg/MarkerArray"
+MARKERS, TEXT = "visualization_msgs/msg/MarkerArray", "std_msgs/msg/String"
 
 _OURS = ("MultiChannelAudio", "MicrophoneArray", "RiskAdvisory", "RiskAdvisories")
 _OTHERS = ("audio_common_msgs", "autoware_perception_msgs", "vision_msgs")

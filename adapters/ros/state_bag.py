@@ -1,4 +1,4 @@
-"""World-states as a bag: risk advisories, objects and markers."""
+"""World-states as a bag: risk advisories, objects, markers, and the snapshots themselves."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,12 +9,13 @@ from worldstate.adapters.export.autoware import autoware_objects
 from worldstate.adapters.export.lane_objects import CROSSING_M
 from worldstate.state import RiskCue, WorldState
 
+from .bag_reader import open_bag
 from .bag_writer import Storage, bag_writer
-from .message_types import ADVISORIES, MARKERS, OBJECTS, header, time_of
+from .message_types import ADVISORIES, MARKERS, OBJECTS, TEXT, header, time_of
 from .scene_markers import scene_markers
 
 ADVISORIES_TOPIC, OBJECTS_TOPIC = "/worldstate/advisories", "/worldstate/objects"
-MARKERS_TOPIC = "/worldstate/markers"
+MARKERS_TOPIC, SNAPSHOT_TOPIC = "/worldstate/markers", "/worldstate/snapshot"
 
 
 @contextmanager
@@ -28,8 +29,17 @@ def state_bag(
             write(ADVISORIES_TOPIC, ADVISORIES, state.stamp_ns, risk_advisories(state))
             write(OBJECTS_TOPIC, OBJECTS, state.stamp_ns, autoware_objects(state, crossing_m))
             write(MARKERS_TOPIC, MARKERS, state.stamp_ns, scene_markers(state))
+            write(SNAPSHOT_TOPIC, TEXT, state.stamp_ns, {"data": state.to_json()})
 
         yield write_state
+
+
+def bag_snapshot_lines(path: Path) -> Iterator[str]:
+    """Yield the snapshots of a bag as the text that was written."""
+    with open_bag(path) as bag:
+        if bag.count(SNAPSHOT_TOPIC) and bag.kind_of(SNAPSHOT_TOPIC) == TEXT:
+            for _, message in bag.messages(SNAPSHOT_TOPIC):
+                yield message.data
 
 
 def risk_advisories(state: WorldState) -> dict[str, Any]:

@@ -130,6 +130,17 @@ def test_markers_draw_the_scene_and_nothing_of_the_one_before(written):
     )
 
 
+def test_replay_gives_back_what_was_written_from_the_folder_and_from_its_file(written, tmp_path, capsys):
+    (storage,) = (file for file in written.iterdir() if file.suffix != ".yaml")
+    for log in (written, storage):
+        assert main(["replay", str(log), "--out", str(tmp_path / "states.jsonl")]) == 0
+        assert (tmp_path / "states.jsonl").read_text().splitlines() == [state.to_json() for state in STATES]
+    write_blocks(tmp_path / "sound", sound_of(RATE_HZ))
+    capsys.readouterr()
+    assert main(["replay", str(tmp_path / "sound")]) == 2
+    assert "expected snapshots, got none" in capsys.readouterr().err
+
+
 def test_a_message_is_laid_out_as_cdr_says(tmp_path):
     """Parsed by hand: a header of four bytes, little endian, each value at a multiple of its size."""
     samples = sound_of(3)
@@ -175,7 +186,10 @@ def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach,
         for cue, as_before in zip(one["cues"], other["cues"], strict=True):
             assert cue["risk"] == pytest.approx(as_before["risk"], abs=1e-9)
         assert [one["status"] for one in one["entities"]] == [one["status"] for one in other["entities"]]
-    assert len(read_by_others(tmp_path / "c")) == 3 * len(of_bag)
+    assert len(read_by_others(tmp_path / "c")) == 4 * len(of_bag)
+    replayed = tmp_path / "d.jsonl"
+    assert main(["replay", str(tmp_path / "c"), "--out", str(replayed)]) == 0
+    assert replayed.read_bytes() == again.read_bytes()
 
 
 def test_other_commands_hear_a_bag_by_its_own_array(bag_of_approach, tmp_path, capsys):

@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.export.state_log import read_log
+    from worldstate.adapters.state_log import read_log
     from worldstate.cli.common.progress import progress_bar
     from worldstate.ground.errors import InvalidArgumentError
     from worldstate.ground.values import nanoseconds, seconds

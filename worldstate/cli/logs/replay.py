@@ -1,7 +1,7 @@
 """`worldstate replay`: the snapshots of a log again, as they were written.
 
-Read the snapshots of an MCAP file or of JSON lines, and write or serve them anew. --out of an MCAP file that
-`worldstate run` wrote holds the same bytes as the --out of that run.
+Read the snapshots of an MCAP file, of a bag of ROS 2 or of JSON lines, and write or serve them anew. --out of
+an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --out of that run.
 """
 
 import argparse
@@ -23,15 +23,15 @@ examples:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="what `worldstate run --mcap` or --out wrote")
+    add("log", type=Path, metavar="LOG", help="what `worldstate run --mcap`, --ros-bag or --out wrote")
     add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
     add_log_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.export.state_log import read_log
     from worldstate.adapters.files.states_file import states_writer
+    from worldstate.adapters.state_log import read_log
     from worldstate.cli.common.progress import progress_bar
     from worldstate.ground.values import seconds
     from worldstate.operations.recordings.warning import WarningMeter
