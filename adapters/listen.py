@@ -151,7 +151,7 @@ class Source:
     array : MicrophoneArray
         One microphone a channel, in the order of the channels.
     detections : DetectionLog or None
-        What the camera reported; None counts as not asked.
+        What the camera reported, on the clock of the sound; None counts as not asked.
     model : SignatureModel or EnsembleModel
         From features to likelihoods.
     policy : CueingPolicy
@@ -400,6 +400,8 @@ def open_source(
     sound = as_sound(path)
     source, recording = _heard(sound, array, model, context, settings, ego is not None and ego.moves)
     source = _with_camera(source, recording, detections, detector, camera, miss_rates)
+    if source.detections is not None:
+        source = replace(source, detections=source.detections.shifted(source.camera.stamp_offset_s))
     before = read_checkpoint(resume) if isinstance(resume, Path | str) else resume
     return replace(
         source,

@@ -150,6 +150,10 @@ class DetectionLog:
     def __len__(self) -> int:
         return len(self.frames)
 
+    def shifted(self, offset_s: float) -> "DetectionLog":
+        """Return the same frames with stamps that are later by so many seconds."""
+        return DetectionLog(self.frames, self.stamps_ns + nanoseconds(offset_s), self.source)
+
     def latest(self, stamp_ns: int, max_age_ns: int) -> int | None:
         """Return the number of the last frame taken at or before `stamp_ns`, None if too old or not there."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns + STAMP_SLACK_NS, side="right")) - 1

@@ -19,14 +19,14 @@ from worldstate.measurement.measurement import Sighting
 class PinholeCamera:
     r"""A camera without distortion, looking along `yaw_rad`, beside the origin of `base_link`.
 
-    For something on the horizon in column u of a W pixels wide image, seen by a camera pitched by p,
+    For something on the horizon in column u of a W pixels wide image, seen by a camera pitched up by p,
 
-    .. math:: \tan a = \cos p \tan h \,(2 u_0 - 2u) / W
+    .. math:: \tan a = \frac{\cos p \tan h \,(2 u_0 - 2u) / W + \sin p \sin r}{\cos r}
 
-    is the azimuth a off the optical axis, left positive, with half angle of view h and the axis in column
-    u_0. The camera is not at the origin of `base_link`, where the array is: the azimuth there depends on the
-    range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at another range
-    is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to 1.8 deg at 30 deg
+    is the azimuth a off the optical axis, left positive, with half angle of view h, the axis in column u_0
+    and roll r. The camera is not at the origin of `base_link`, where the array is: the azimuth there depends
+    on the range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at another
+    range is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to 1.8 deg at 30 deg
     and 10 m.
 
     The defaults are the published facts of OVAD: half angle of view 0.6 rad, aspect 0.628, the camera 0.567 m
@@ -41,6 +41,10 @@ class PinholeCamera:
         Half the horizontal angle of view, in (0, pi/2).
     principal_px : float, optional
         Column of the optical axis; the middle of the image where not given.
+    roll_rad : float
+        Turn about the optical axis, in (-pi/2, pi/2); positive lifts the left side.
+    stamp_offset_s : float
+        What brings the stamps of its images to the clock of the sound, seconds, in [-10, 10].
     position_m : tuple of float
         Of the camera in `base_link`, (x, y, z).
     yaw_rad, pitch_rad : float
@@ -74,6 +78,8 @@ class PinholeCamera:
     nominal_range_m: float = 10.0
     range_spread: float = 0.5
     principal_px: float | None = None
+    roll_rad: float = 0.0
+    stamp_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
         in_range("width_px", self.width_px, 1, 1 << 16)
@@ -81,6 +87,8 @@ class PinholeCamera:
         in_range("half_angle_rad", self.half_angle_rad, 0.0, math.pi / 2, open_low=True, open_high=True)
         in_range("yaw_rad", self.yaw_rad, -math.pi, math.pi)
         in_range("pitch_rad", self.pitch_rad, -math.pi / 2, math.pi / 2, open_low=True, open_high=True)
+        in_range("roll_rad", self.roll_rad, -math.pi / 2, math.pi / 2, open_low=True, open_high=True)
+        in_range("stamp_offset_s", self.stamp_offset_s, -10.0, 10.0)
         in_range("range_spread", self.range_spread, 0.0, math.inf)
         if self.principal_px is not None:
             in_range("principal_px", self.principal_px, 0.0, self.width_px)
@@ -106,7 +114,7 @@ class PinholeCamera:
             Radians in (-pi, pi], left positive, same shape.
         """
         column = np.asarray(column_px, dtype=np.float64)
-        seen = np.arctan(self._slope * (self._middle - 2.0 * column / self.width_px)) + self.yaw_rad
+        seen = np.arctan(self._tangent(column)) + self.yaw_rad
         x = self.position_m[0] + self.nominal_range_m * np.cos(seen)
         y = self.position_m[1] + self.nominal_range_m * np.sin(seen)
         return np.asarray(wrap_angle(np.arctan2(y, x)))
@@ -126,7 +134,8 @@ class PinholeCamera:
         """
         off_axis = self.off_axis(azimuth_rad)
         ahead = np.where(np.abs(off_axis) < math.pi / 2, off_axis, np.nan)
-        return np.asarray(0.5 * self.width_px * (self._middle - np.tan(ahead) / self._slope))
+        across = (np.tan(ahead) * math.cos(self.roll_rad) - self._tilt) / self._slope
+        return np.asarray(0.5 * self.width_px * (self._middle - across))
 
     def off_axis(self, azimuth_rad: ArrayLike) -> FloatArray:
         """Return the azimuth off the optical axis, at the camera, of an azimuth in `base_link`, (-pi, pi]."""
@@ -140,7 +149,7 @@ class PinholeCamera:
 
     def sees(self, azimuth_rad: ArrayLike) -> BoolArray:
         """Tell whether an azimuth in `base_link` lies between the edges of the image."""
-        left, right = (math.atan(self._slope * (self._middle - edge)) for edge in (0.0, 2.0))
+        left, right = np.arctan(self._tangent(np.array([0.0, self.width_px])))
         off_axis = self.off_axis(azimuth_rad)
         return np.asarray((right <= off_axis) & (off_axis <= left))
 
@@ -200,13 +209,24 @@ class PinholeCamera:
     def _slope(self) -> float:
         return math.cos(self.pitch_rad) * math.tan(self.half_angle_rad)
 
+    @property
+    def _tilt(self) -> float:
+        return math.sin(self.pitch_rad) * math.sin(self.roll_rad)
+
+    def _tangent(self, column_px: FloatArray) -> FloatArray:
+        """Return tan(a) off the optical axis."""
+        across = self._middle - 2.0 * column_px / self.width_px
+        return np.asarray((self._slope * across + self._tilt) / math.cos(self.roll_rad))
+
 
 def read_camera(path: str | Path) -> PinholeCamera:
     """Read a camera from JSON.
 
     ``{"width_px", "height_px", "horizontal_fov_deg"}`` or, in place of the field of view, ``{"fx", "cx"}`` of
     a calibration without distortion, pixels; optional are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up
-    positive) and ``"position_m": [x, y, z]`` in `base_link`, all 0 where not given.
+    positive), ``"roll_deg"`` (left side up), ``"position_m": [x, y, z]`` in `base_link`, and
+    ``"stamp_offset_s"``, which brings the stamps of its images to the clock of the sound; all 0 where not
+    given.
 
     Parameters
     ----------
@@ -234,12 +254,12 @@ def read_camera(path: str | Path) -> PinholeCamera:
     [-45.0, 45.0]
     """
     with refused_as_file(path):
-        return read_record(_CameraFile, path, "camera").camera()
+        return read_record(CameraRecord, path, "camera").camera()
 
 
 @dataclass(frozen=True, slots=True)
-class _CameraFile:
-    """What a camera file holds."""
+class CameraRecord:
+    """What a camera file holds, and a car file of each camera."""
 
     width_px: int
     height_px: int
@@ -248,9 +268,13 @@ class _CameraFile:
     cx: float | None = None
     yaw_deg: float | None = None
     pitch_deg: float | None = None
+    roll_deg: float | None = None
     position_m: tuple[float, float, float] | None = None
+    stamp_offset_s: float | None = None
+    name: str | None = None
 
     def camera(self) -> PinholeCamera:
+        """Return the camera."""
         if (self.horizontal_fov_deg is None) == (self.fx is None):
             raise InvalidArgumentError("camera: expected either horizontal_fov_deg or fx")
         half_angle = 0.5 * math.radians(self.horizontal_fov_deg or 0.0)
@@ -265,4 +289,6 @@ class _CameraFile:
             yaw_rad=math.radians(self.yaw_deg or 0.0),
             pitch_rad=math.radians(self.pitch_deg or 0.0),
             principal_px=self.cx,
+            roll_rad=math.radians(self.roll_deg or 0.0),
+            stamp_offset_s=self.stamp_offset_s or 0.0,
         )

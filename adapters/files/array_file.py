@@ -76,11 +76,11 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     data = read_bytes(name, "an array file", MAX_BYTES)
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
-        return _array(name, _xml_positions(name, data), axes or "acoular")
+        return checked_array(name, _xml_positions(name, data), axes or "acoular")
     if start in (b"[", b"{"):
         positions, said = _json_positions(name, data)
-        return _array(name, positions, axes or said)
-    return _array(name, _csv_positions(name, data), axes or "base_link")
+        return checked_array(name, positions, axes or said)
+    return checked_array(name, _csv_positions(name, data), axes or "base_link")
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:
@@ -118,8 +118,8 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
     write_text(path, "\n".join([head, *rows, "</MicArray>", ""]))
 
 
-def _array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> MicrophoneArray:
-    """Check what a file held, and turn it into `base_link` axes."""
+def checked_array(path: Path, in_file: Sequence[Sequence[float]], axes: str) -> MicrophoneArray:
+    """Check the positions that a file held, and turn them into `base_link` axes."""
     if axes not in get_args(Axes):
         raise InputFileError(path, f"axes: expected {' or '.join(get_args(Axes))}, got {axes!r:.40}")
     if not 2 <= len(in_file) <= MAX_MICROPHONES:

@@ -77,4 +77,5 @@ class LiveCamera:
     def _over_looks(self) -> VisionQuery:
         stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._looks], dtype=np.int64)
         log = DetectionLog(tuple(frame for _, frame in self._looks), stamps_ns, "the camera")
-        return replace(self._source, detections=log).camera_channel()
+        on_sound_clock = log.shifted(self._source.camera.stamp_offset_s)
+        return replace(self._source, detections=on_sound_clock).camera_channel()

@@ -19,13 +19,14 @@ CAMERAS = st.builds(
     position_m=st.tuples(st.floats(-3, 3), st.floats(-1, 1), st.floats(-1, 1)),
     yaw_rad=st.floats(-math.pi, math.pi),
     pitch_rad=st.floats(-0.4, 0.4),
+    roll_rad=st.floats(-0.3, 0.3),
     nominal_range_m=st.floats(5.0, 100.0),
 )
 
 
 def mirrored(camera: PinholeCamera) -> PinholeCamera:
     x, y, z = camera.position_m
-    return replace(camera, position_m=(x, -y, z), yaw_rad=-camera.yaw_rad)
+    return replace(camera, position_m=(x, -y, z), yaw_rad=-camera.yaw_rad, roll_rad=-camera.roll_rad)
 
 
 @given(camera=CAMERAS, share=st.floats(0.0, 1.0))
@@ -59,7 +60,13 @@ def test_agrees_with_opencv(camera: PinholeCamera, off_axis: float) -> None:
     yaw, pitch = camera.yaw_rad, camera.pitch_rad
     forward = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
-    rotation = np.stack([right, np.cross(forward, right), forward])
+    down, roll = np.cross(forward, right), camera.roll_rad
+    # Positive lifts the left side, and so lowers the right one.
+    right, down = (
+        math.cos(roll) * right + math.sin(roll) * down,
+        math.cos(roll) * down - math.sin(roll) * right,
+    )
+    rotation = np.stack([right, down, forward])
     pixels, _ = cv2.projectPoints(
         point.reshape(1, 1, 3), cv2.Rodrigues(rotation)[0], -rotation @ centre, matrix, None
     )

@@ -160,4 +160,4 @@ def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_pa
 
 def test_the_command_asks_for_the_array(stand_in, capsys):
     assert main(["live"]) == 2
-    assert "--array: expected the positions of the microphones, or --play" in capsys.readouterr().err
+    assert "--array: expected the positions of the microphones, or --car" in capsys.readouterr().err

@@ -13,7 +13,8 @@ DETECTIONS_HELP = """\
 LENS_HELP = """\
 --camera takes JSON:
 {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
-the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "position_m": [x, y, z] in base_link."""
+the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "roll_deg" (left side up), "position_m":
+[x, y, z] in base_link, "stamp_offset_s" (added to the stamps of its images: the clock of the sound)."""
 
 
 def add_camera_options(parser: argparse.ArgumentParser) -> None:

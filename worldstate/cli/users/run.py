@@ -24,11 +24,11 @@ from typing import TYPE_CHECKING
 from worldstate.cli.common.array_options import (
     add_array_options,
     add_search_options,
-    given_array,
     stance,
 )
 from worldstate.cli.common.bag_options import add_topic_options, topics_of
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
+from worldstate.cli.common.car_options import add_car_options, given_sensors
 from worldstate.cli.common.detector_options import (
     MOVING,
     add_detector_options,
@@ -65,6 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_sound_options(parser)
     add_array_options(parser)
+    add_car_options(parser)
     add_search_options(parser)
     add_listen_options(parser)
     _add_recording_options(parser)
@@ -142,13 +143,14 @@ def _source(arguments: argparse.Namespace) -> "Source":
     boxes = detector_filter(arguments) if arguments.detector in MOVING else boxes_of(arguments)
     settings = replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes)
     detector = None if arguments.detector is None else detector_maker(arguments)()
-    sound, array, detections, ego = _input(arguments)
+    given, camera = given_sensors(arguments)
+    sound, array, detections, ego = _input(arguments, given)
     return open_source(
         sound,
         array=array,
         detections=detections,
         ego=ego,
-        camera=arguments.camera,
+        camera=camera,
         miss_rates=arguments.miss_rates,
         model=arguments.model,
         context=given_context(arguments),
@@ -162,14 +164,14 @@ def _source(arguments: argparse.Namespace) -> "Source":
 
 
 def _input(
-    arguments: argparse.Namespace,
+    arguments: argparse.Namespace, array: "MicrophoneArray | None"
 ) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, OdometryLog | None]":
     """Return sound, array, detections and odometry: options, or what a bag holds."""
     from worldstate.adapters.files.odometry_file import read_odometry
     from worldstate.adapters.ros.bag_input import needed_array, read_bag
     from worldstate.ground.errors import InvalidArgumentError
 
-    bag, array = bag_of(arguments), given_array(arguments)
+    bag = bag_of(arguments)
     if bag is None:
         told = None if arguments.odometry is None else read_odometry(arguments.odometry)
         return sound_of(arguments), array, arguments.detections, told

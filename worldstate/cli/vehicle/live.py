@@ -20,8 +20,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, add_search_options, given_array, stance
+from worldstate.cli.common.array_options import add_array_options, add_search_options, stance
 from worldstate.cli.common.camera_options import LENS_HELP, add_lens_options, boxes_of
+from worldstate.cli.common.car_options import add_car_options, given_sensors
 from worldstate.cli.common.detector_options import add_detector_options, detector_filter, detector_maker
 from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
@@ -49,6 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_array_options(parser)
     parser.description = f"{parser.description}\n\n{LENS_HELP}"
+    add_car_options(parser)
     _add_sound_options(parser)
     add_search_options(parser)
     add_listen_options(parser)
@@ -100,12 +102,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source":
     from worldstate.adapters.listen import open_source
 
+    array, camera = given_sensors(arguments)
     moving = arguments.camera_device is not None
     boxes = detector_filter(arguments) if moving else boxes_of(arguments)
     return open_source(
         sound,
-        array=given_array(arguments),
-        camera=arguments.camera,
+        array=array,
+        camera=camera,
         miss_rates=arguments.miss_rates,
         model=arguments.model,
         context=given_context(arguments),
@@ -119,9 +122,10 @@ def _microphones(arguments: argparse.Namespace) -> "SoundFeed":
     from worldstate.ground.checks import in_range
     from worldstate.ground.errors import InvalidArgumentError
 
-    array = given_array(arguments)
+    array, _ = given_sensors(arguments)
     if array is None:
-        raise InvalidArgumentError("--array: expected the positions of the microphones, or --play RECORDING")
+        problem = "expected the positions of the microphones, or --car, or --play RECORDING"
+        raise InvalidArgumentError(f"--array: {problem}")
     device = arguments.device
     number = int(device) if device is not None and device.isdecimal() else device
     rate_hz = int(in_range("--rate", arguments.rate, 1000, 1_000_000))

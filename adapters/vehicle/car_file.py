@@ -1,0 +1,182 @@
+"""The sensors of a vehicle in one file: its array, its cameras, where they are, how their clocks differ."""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
+from worldstate.adapters.files.array_file import checked_array, read_array
+from worldstate.adapters.files.atomic import write_text
+from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import ADDED, decode
+
+from .mounting import Mounting
+
+MOST_CAMERAS = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Car:
+    """A vehicle as its file describes it, in the axes of `base_link` with the origin at the array.
+
+    Sound has no range, so that azimuths are those at the array. What the file places about another origin,
+    such as the rear axle, is moved there.
+
+    Parameters
+    ----------
+    array : MicrophoneArray
+        Turned as it is mounted.
+    cameras : mapping of str to PinholeCamera
+        By name, in the order of the file; positions relative to the array.
+    """
+
+    array: MicrophoneArray
+    cameras: Mapping[str, PinholeCamera]
+
+    def camera(self, name: str | None = None) -> PinholeCamera | None:
+        """Return a camera by its name; without one the first, None where there is none.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If there is no camera of that name.
+        """
+        if name is None:
+            return next(iter(self.cameras.values()), None)
+        if name not in self.cameras:
+            raise InvalidArgumentError(f"camera: expected one of {', '.join(self.cameras)}, got {name}")
+        return self.cameras[name]
+
+
+def read_car(path: str | Path) -> Car:
+    """Read a vehicle from JSON.
+
+    ``{"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5}, "cameras": [{"name":
+    "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "position_m": [1.9, 0, 1.3]}]}``.
+    The array has a ``"file"`` as `read_array` reads it, beside the car file, or ``"positions_m"``; it is
+    mounted at ``"position_m"`` with ``"yaw_deg"``, ``"pitch_deg"`` and ``"roll_deg"`` (`Mounting`). Cameras
+    are as `read_camera` reads them, with a ``"name"``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Car
+        As the file says.
+
+    Raises
+    ------
+    InputFileError
+        If a file is missing, too large, no JSON, has a key that means nothing here, or a value is missing or
+        out of range; the message names the key.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> array = '{"positions_m": [[0.2, 0, 0], [0, 0.1, 0]], "position_m": [1.2, 0, 1.6], "yaw_deg": 90}'
+    >>> with TemporaryDirectory() as folder:
+    ...     name = Path(folder) / "car.json"
+    ...     _ = name.write_text(f'{{"array": {array}}}')
+    ...     read_car(name).array.positions_m.round(3).tolist()
+    [[1.2, 0.2, 1.6], [1.1, 0.0, 1.6]]
+    """
+    with refused_as_file(path):
+        given = read_json(path, "a car file")
+        _check_keys(given, "car", {one.name for one in fields(_CarFile)})
+        record = decode(_CarFile, given, "car")
+        return record.car(Path(path))
+
+
+def aligned(path: str | Path, camera: str, offset_s: float, yaw_deg: float) -> None:
+    """Add what an alignment found to the offset and the yaw of a camera in a car file; the rest stays."""
+    car = read_car(path)
+    car.camera(camera)
+    document = read_json(path, "a car file")
+    if not isinstance(document, dict):  # it was read as one above
+        raise InputFileError(path, "expected an object")
+    for one in document["cameras"]:
+        if one["name"] == camera:
+            one["stamp_offset_s"] = round(one.get("stamp_offset_s", 0.0) + offset_s, 4)
+            one["yaw_deg"] = round(one.get("yaw_deg", 0.0) + yaw_deg, 3)
+    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+@dataclass(frozen=True, slots=True)
+class _ArrayRecord:
+    """What a car file holds of its array."""
+
+    file: str | None = None
+    positions_m: tuple[tuple[float, float, float], ...] | None = None
+    position_m: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=ADDED)
+    yaw_deg: float = field(default=0.0, metadata=ADDED)
+    pitch_deg: float = field(default=0.0, metadata=ADDED)
+    roll_deg: float = field(default=0.0, metadata=ADDED)
+
+    def array(self, path: Path) -> MicrophoneArray:
+        """Return the array as it is mounted."""
+        if (self.file is None) == (self.positions_m is None):
+            raise InvalidArgumentError("car.array: expected either file or positions_m")
+        file = self.file
+        own = self.positions_m or () if file is None else read_array(path.parent / file).positions_m
+        with _placed_at("car.array"):
+            mounting = Mounting(self.position_m, self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return checked_array(path, mounting.applied(own).tolist(), "base_link")
+
+
+@dataclass(frozen=True, slots=True)
+class _CarFile:
+    """What a car file holds."""
+
+    array: _ArrayRecord
+    cameras: tuple[CameraRecord, ...] = field(default=(), metadata=ADDED)
+    name: str | None = None
+
+    def car(self, path: Path) -> Car:
+        """Return the car, its origin moved to the array."""
+        if len(self.cameras) > MOST_CAMERAS:
+            got = len(self.cameras)
+            raise InvalidArgumentError(f"car.cameras: expected at most {MOST_CAMERAS}, got {got}")
+        array, cameras = self.array.array(path), {}
+        for number, record in enumerate(self.cameras):
+            where = f"car.cameras[{number}]"
+            if not record.name or record.name in cameras:
+                raise InvalidArgumentError(f"{where}.name: expected one of its own, got {record.name!r}")
+            with _placed_at(where):
+                cameras[record.name] = _relative(record, self.array.position_m)
+        return Car(array, cameras)
+
+
+def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:
+    """Return a camera with its position relative to the array."""
+    there = Mounting(record.position_m or (0.0, 0.0, 0.0)).position_m
+    x, y, z = (one - origin for one, origin in zip(there, array_m, strict=True))
+    return replace(record, position_m=(x, y, z)).camera()
+
+
+@contextmanager
+def _placed_at(where: str) -> Iterator[None]:
+    """Let refusals name the part of the file that they are about."""
+    try:
+        yield
+    except InvalidArgumentError as error:
+        raise InvalidArgumentError(f"{where}: {str(error).removeprefix('camera: ')}") from error
+
+
+def _check_keys(given: object, where: str, known: set[str]) -> None:
+    """Refuse keys that mean nothing: one that is spelt wrong would be left out in silence."""
+    if not isinstance(given, dict):
+        return  # the decoder says what it is
+    unknown = sorted(set(given) - known)
+    if unknown:
+        raise InvalidArgumentError(f"{where}: expected keys among {sorted(known)}, got {unknown}")
+    _check_keys(given.get("array"), "car.array", {one.name for one in fields(_ArrayRecord)})
+    cameras = given.get("cameras")
+    for number, camera in enumerate(cameras if isinstance(cameras, list) else ()):
+        _check_keys(camera, f"car.cameras[{number}]", {one.name for one in fields(CameraRecord)})

@@ -1,0 +1,162 @@
+"""A vehicle in one file: turned arrays, several cameras, clocks, and a message for every wrong field."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from scipy.spatial.transform import Rotation
+
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.camera.pinhole import read_camera
+from worldstate.adapters.listen import ListenSettings, open_source
+from worldstate.adapters.vehicle.car_file import read_car
+from worldstate.adapters.vehicle.mounting import Mounting
+from worldstate.cli.main import main
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+
+# Three-dimensional: two rings of five, one above the other.
+TURN = 2.0 * np.pi * np.arange(10) / 5
+RINGS = np.stack([0.2 * np.cos(TURN), 0.2 * np.sin(TURN), np.repeat([0.0, 0.15], 5)], axis=1)
+ARRAY = {"positions_m": RINGS.tolist(), "position_m": [1.2, 0.1, 1.6], "yaw_deg": 30.0, "pitch_deg": -12.0}
+LENS = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 60.0}
+FRONT = LENS | {"name": "front", "position_m": [2.0, 0.1, 1.2], "stamp_offset_s": 0.25}
+LEFT = LENS | {"name": "left", "position_m": [1.5, 0.9, 1.2], "yaw_deg": 60.0, "roll_deg": 3.0}
+CAR = {"name": "shuttle", "array": ARRAY, "cameras": [FRONT, LEFT]}
+
+
+def written(folder: Path, car: object) -> Path:
+    path = folder / "car.json"
+    path.write_text(json.dumps(car))
+    return path
+
+
+@pytest.mark.parametrize("angles", [(30.0, -12.0, 5.0), (-170.0, 80.0, -179.0), (0.0, 0.0, 90.0)])
+def test_a_mounting_turns_as_scipy_does(angles):
+    yaw, pitch, roll = angles
+    turned = Rotation.from_euler("ZYX", [yaw, -pitch, roll], degrees=True).apply(RINGS)
+    mounted = Mounting((1.0, 2.0, 3.0), yaw, pitch, roll).applied(RINGS)
+    np.testing.assert_allclose(mounted, turned + np.array([1.0, 2.0, 3.0]), atol=1e-12)
+
+
+def test_a_camera_that_looks_up_and_an_array_that_does_turn_alike(tmp_path):
+    # What lies ahead of a sensor that is pitched up lies above the vehicle.
+    assert Mounting(pitch_deg=20.0).applied([[1.0, 0.0, 0.0]])[0, 2] > 0.0
+    lens = written(tmp_path, LENS | {"pitch_deg": 20.0})
+    assert read_camera(lens).pitch_rad > 0.0
+
+
+def test_a_tilted_array_in_space_hears_azimuths_of_the_vehicle(tmp_path):
+    array = read_car(written(tmp_path, CAR)).array
+    rate, azimuth = 16_000, math.radians(50.0)
+    spectrum = np.fft.rfft(np.random.default_rng(2).standard_normal(2 * rate))
+    frequencies = np.fft.rfftfreq(2 * rate, 1.0 / rate)
+    phase = np.exp(-2j * np.pi * frequencies[:, None] * array.delays_s(azimuth))
+    sound = np.fft.irfft(spectrum[:, None] * phase, axis=0)
+    settings = FrontEndSettings(azimuth_span_deg=(-180.0, 180.0))
+    heard = FrontEnd(array, rate, settings).process(sound)[-1]
+    assert math.degrees(heard.bearing_rad) == pytest.approx(50.0, abs=1.0)
+
+
+def test_cameras_have_names_and_stand_relative_to_the_array(tmp_path):
+    car = read_car(written(tmp_path, CAR))
+    assert list(car.cameras) == ["front", "left"]
+    assert car.camera() is car.cameras["front"]
+    assert car.cameras["front"].position_m == pytest.approx((0.8, 0.0, -0.4))
+    assert car.cameras["left"].position_m == pytest.approx((0.3, 0.8, -0.4))
+    assert math.degrees(car.cameras["left"].yaw_rad) == pytest.approx(60.0)
+    assert car.cameras["front"].stamp_offset_s == 0.25
+    with pytest.raises(InvalidArgumentError, match="expected one of front, left, got rear"):
+        car.camera("rear")
+
+
+def test_the_array_may_stand_in_a_file_beside(tmp_path):
+    (tmp_path / "mics.csv").write_text("\n".join(",".join(map(str, row)) for row in RINGS.tolist()))
+    beside = {"array": {"file": "mics.csv"} | {k: v for k, v in ARRAY.items() if k != "positions_m"}}
+    inline = read_car(written(tmp_path, CAR)).array
+    np.testing.assert_allclose(read_car(written(tmp_path, beside)).array.positions_m, inline.positions_m)
+
+
+def changed(part: str, **keys: object) -> object:
+    array = ARRAY | keys if part == "array" else ARRAY
+    front = FRONT | keys if part == "front" else FRONT
+    return {"array": array, "cameras": [front, LEFT]} | (keys if part == "car" else {})
+
+
+@pytest.mark.parametrize(
+    ("car", "said"),
+    [
+        ([], "car: expected an object"),
+        ({"cameras": []}, "car.array: expected an object, got None"),
+        (changed("car", wheels=4), r"car: expected keys among .*, got \['wheels'\]"),
+        (changed("array", file="mics.csv"), "car.array: expected either file or positions_m"),
+        (changed("array", yaw=3.0), r"car.array: expected keys among .*'yaw_deg'\], got \['yaw'\]"),
+        (changed("array", pitch_deg=100.0), r"car.array: pitch_deg: expected a number in \[-90.0, 90.0\]"),
+        (changed("array", position_m=[1200.0, 0.0, 1600.0]), r"car.array: position_m.x: .* got 1200.0"),
+        (changed("array", positions_m=[[0.0, 1.0]]), r"car.array.positions_m\[0\]"),
+        (changed("array", positions_m=[[0.0, 1.0, 0.0]]), "expected 2 to 1024 microphones, got 1"),
+        (changed("array", yaw_deg="left"), "car.array.yaw_deg: expected a finite number, got 'left'"),
+        (changed("front", name="left"), r"car.cameras\[1\].name: expected one of its own, got 'left'"),
+        (changed("front", name=None), r"car.cameras\[0\].name: expected one of its own"),
+        (changed("front", fx=500.0), r"car.cameras\[0\]: expected either horizontal_fov_deg or fx"),
+        (changed("front", fov=60.0), r"car.cameras\[0\]: expected keys among .*, got \['fov'\]"),
+        (changed("front", stamp_offset_s=40.0), r"car.cameras\[0\]: stamp_offset_s: .* got 40.0"),
+        (changed("front", roll_deg=90.0), r"car.cameras\[0\]: roll_rad: expected a number in"),
+    ],
+)
+def test_every_wrong_field_is_named(tmp_path, car, said):
+    with pytest.raises(InputFileError, match=said) as refused:
+        read_car(written(tmp_path, car))
+    assert "car.json" in str(refused.value)
+
+
+def test_the_offset_moves_the_looks_on_the_clock_of_the_sound(tmp_path):
+    soundfile.write(
+        tmp_path / "street.wav", np.random.default_rng(0).uniform(-0.01, 0.01, (24_000, 10)), 16_000
+    )
+    car = read_car(written(tmp_path, CAR))
+    seen = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))
+    log = DetectionLog((seen,), np.array([1_000_000_000]))
+    source = open_source(
+        tmp_path / "street.wav",
+        array=car.array,
+        camera=car.camera("front"),
+        detections=log,
+        settings=ListenSettings(uncalibrated=True),
+    )
+    channel = source.camera_channel()
+    assert channel.last_look(1_200_000_000) is None
+    assert channel.last_look(1_300_000_000).stamp_ns == 1_250_000_000
+
+
+def test_run_and_live_take_the_car_in_place_of_array_and_camera(tmp_path, capsys):
+    noise = np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10))
+    soundfile.write(tmp_path / "street.wav", noise, 16_000)
+    car, sound = str(written(tmp_path, CAR)), str(tmp_path / "street.wav")
+    assert main(["run", sound, "--car", car, "--uncalibrated", "--json"]) == 0
+    heard = json.loads(capsys.readouterr().out)
+    assert heard["array"].startswith("10 microphones")
+    assert main(["live", "--play", sound, "--speed", "20", "--car", car, "--uncalibrated", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["array"] == heard["array"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--array", "mics.csv"], "--car: expected no --array and no --camera with it"),
+        (["--camera", "lens.json"], "--car: expected no --array and no --camera with it"),
+        (["--camera-name", "rear"], "camera: expected one of front, left, got rear"),
+    ],
+)
+def test_options_that_say_two_things(tmp_path, capsys, words, said):
+    assert main(["run", "street.wav", "--car", str(written(tmp_path, CAR)), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_name_without_a_car(capsys):
+    assert main(["run", "street.wav", "--camera-name", "rear"]) == 2
+    assert "--camera-name: expected --car" in capsys.readouterr().err
