@@ -21,7 +21,7 @@ from worldstate.adapters.simulation.stream.arrivals import (
     draw_events,
     draw_sounds,
 )
-from worldstate.adapters.simulation.stream.manoeuvres import Driver, emerges
+from worldstate.adapters.simulation.stream.manoeuvres import MANOEUVRES, Driver, emerges
 from worldstate.adapters.simulation.stream.motion import SpeedLimit, drive_along
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.adapters.simulation.stream.sight import (
@@ -33,6 +33,7 @@ from worldstate.adapters.simulation.stream.sight import (
 from worldstate.adapters.simulation.stream.traffic import FLOWS, HAZARDS, Traffic, traffic_named
 from worldstate.adapters.simulation.stream.truth import describe_events, vehicle_truth
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.stream_figure import FLOW_COLOURS
 
 NEVER_SEEN = {"turns_away", "parks", "far"}
 
@@ -229,3 +230,7 @@ def test_signals_are_the_vehicles_own_and_bells_those_of_riders() -> None:
     assert told["signal"] == (leaders[0].signal or None)
     with pytest.raises(InvalidArgumentError, match="signals"):
         Traffic("test", {}, signals={"voice": 0.1})
+
+
+def test_every_flow_has_a_colour_in_the_figure():
+    assert set(FLOW_COLOURS) >= set(MANOEUVRES)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 # One colour for what comes out of a hidden arm alike, others for each kind of negative.
 FLOW_COLOURS = {
-    "left": RED, "right": RED, "both": RED, "follows": ORANGE, "waits": PURPLE, "turns_away": BLUE,
-    "parks": SKY, "far": "0.5", "from_behind": GREEN, "from_ahead": YELLOW,
+    "left": RED, "right": RED, "both": RED, "queue": RED, "follows": ORANGE, "waits": PURPLE,
+    "turns_away": BLUE, "parks": SKY, "far": "0.5", "from_behind": GREEN, "from_ahead": YELLOW,
 }  # fmt: skip
 MAP_M = 60.0  # as far to the sides
 WALLS_M = 12.0  # the ego's own street is drawn this far behind it
