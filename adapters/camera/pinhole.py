@@ -25,9 +25,9 @@ class PinholeCamera:
 
     is the azimuth a off the optical axis, left positive, with half angle of view h, the axis in column u_0
     and roll r. The camera is not at the origin of `base_link`, where the array is: the azimuth there depends
-    on the range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at another
-    range is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to 1.8 deg at 30 deg
-    and 10 m.
+    on the range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at
+    another range is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to
+    1.8 deg at 30 deg and 10 m.
 
     The defaults are the published facts of OVAD: half angle of view 0.6 rad, aspect 0.628, the camera 0.567 m
     behind, 0.485 m below and 0.0316 m right of the array, pitched up by 0.11979 rad. The height only matters

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
@@ -94,18 +95,31 @@ def read_car(path: str | Path) -> Car:
         return record.car(Path(path))
 
 
-def aligned(path: str | Path, camera: str, offset_s: float, yaw_deg: float) -> None:
-    """Add what an alignment found to the offset and the yaw of a camera in a car file; the rest stays."""
+def write_aligned(
+    path: str | Path, out: str | Path, camera: str | None, offset_s: float, yaw_deg: float
+) -> None:
+    """Write a car file anew with an alignment added to one camera, the first without a name.
+
+    Raises
+    ------
+    InputFileError
+        If the car file cannot be read, or names its array beside it and the new one is elsewhere.
+    InvalidArgumentError
+        If it has no such camera.
+    """
     car = read_car(path)
-    car.camera(camera)
-    document = read_json(path, "a car file")
-    if not isinstance(document, dict):  # it was read as one above
-        raise InputFileError(path, "expected an object")
-    for one in document["cameras"]:
-        if one["name"] == camera:
-            one["stamp_offset_s"] = round(one.get("stamp_offset_s", 0.0) + offset_s, 4)
-            one["yaw_deg"] = round(one.get("yaw_deg", 0.0) + yaw_deg, 3)
-    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    if car.camera(camera) is None:
+        raise InputFileError(path, "expected a camera to align, it has none")
+    with refused_as_file(path):
+        record = decode(_CarFile, read_json(path, "a car file"), "car")
+    here, there = Path(path).absolute().parent, Path(out).absolute().parent
+    if record.array.file is not None and here != there and not Path(record.array.file).is_absolute():
+        raise InputFileError(out, f"expected a file in {here}, where {record.array.file} is")
+    document: Any = read_json(path, "a car file")
+    one = next(each for each in document["cameras"] if camera is None or each["name"] == camera)
+    one["stamp_offset_s"] = round((one.get("stamp_offset_s") or 0.0) + offset_s, 4)
+    one["yaw_deg"] = round((one.get("yaw_deg") or 0.0) + yaw_deg, 3)
+    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 @dataclass(frozen=True, slots=True)

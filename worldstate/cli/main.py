@@ -19,6 +19,7 @@ COMMANDS = (
     "users.demo",
     "users.run",
     "vehicle.live",
+    "vehicle.align",
     "logs.explain",
     "logs.replay",
     "logs.plot",

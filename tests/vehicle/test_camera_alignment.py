@@ -1,0 +1,160 @@
+"""Offset and yaw of a camera, from made-up passes, and from rendered ones that were moved."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.listen import ListenSettings, open_source
+from worldstate.adapters.vehicle.car_file import read_car, write_aligned
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.operations.alignment.camera_alignment import align
+from worldstate.operations.alignment.heard_passes import HeardPass, heard_passes
+
+STREET_M, PACE_MPS = 10.0, 7.0
+
+
+def azimuth(time_s: np.ndarray, side: int) -> np.ndarray:
+    """Return the azimuth of a vehicle that comes from a side and is ahead at 0 s."""
+    return np.arctan2(-side * PACE_MPS * time_s, STREET_M)
+
+
+def passes(
+    n: int, offset_s: float, yaw_deg: float, *, std_deg: float = 3.0, other: float = 0.3, sides=(1, -1)
+) -> list[HeardPass]:
+    """Return passes whose camera needs this offset and yaw: stamps are too early, azimuths too low."""
+    rng = np.random.default_rng(7)
+    found = []
+    for number in range(n):
+        side, start_s = sides[number % len(sides)], 20.0 * number
+        box_s, sound_s = np.arange(-0.8, 0.8, 0.1), np.arange(-2.0, 2.0, 0.1) + 0.03
+        heard = azimuth(sound_s, side) + np.radians(std_deg) * rng.standard_normal(len(sound_s))
+        astray = rng.random(len(heard)) < other
+        heard[astray] = rng.uniform(-math.pi / 2, math.pi / 2, int(astray.sum()))
+        box_rad = azimuth(box_s, side) - math.radians(yaw_deg)
+        found.append(HeardPass(start_s + box_s - offset_s, box_rad, start_s + sound_s, heard))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "yaw_deg"), [(0.0, 0.0), (0.234, 3.3), (-0.45, -8.1), (0.81, 0.0), (-0.05, 12.0)]
+)
+def test_offset_and_yaw_are_found_among_reflections(offset_s, yaw_deg):
+    found = align(passes(20, offset_s, yaw_deg))
+    assert found.offset_s == pytest.approx(offset_s, abs=0.02)
+    assert found.yaw_deg == pytest.approx(yaw_deg, abs=0.8)
+    assert found.passes == 20
+    assert 0.6 < found.agreeing < 0.85
+    assert 1.0 < found.median_error_deg < 3.5
+
+
+def test_intervals_hold_the_truth_and_narrow_with_passes():
+    few, many = (align(passes(n, 0.2, 3.0)) for n in (6, 40))
+    for found in (few, many):
+        (low_s, high_s), (low_deg, high_deg) = found.offset_interval_s, found.yaw_interval_deg
+        assert low_s - 0.005 <= 0.2 <= high_s + 0.005
+        assert low_deg - 0.1 <= 3.0 <= high_deg + 0.1
+    assert np.ptp(many.offset_interval_s) < np.ptp(few.offset_interval_s)
+    assert np.ptp(many.yaw_interval_deg) < np.ptp(few.yaw_interval_deg)
+
+
+@pytest.mark.parametrize(
+    ("sides", "said"), [((1,), "12 from the left, 0 from"), ((-1,), "0 from the left, 12")]
+)
+def test_vehicles_from_one_side_do_not_tell_the_two_apart(sides, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        align(passes(12, 0.1, 2.0, sides=sides))
+
+
+def test_too_few_and_too_far():
+    with pytest.raises(InvalidArgumentError, match=r"expected at least 5 vehicles .* got 4"):
+        align(passes(4, 0.0, 0.0))
+    with pytest.raises(InvalidArgumentError, match="at its edge: correct it by hand first"):
+        align(passes(20, 0.0, 25.0, other=0.0))
+
+
+RINGS = [[0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [-0.1, -0.1, 0.1]]
+LENS = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 60.0}
+CAMERAS = [LENS | {"name": "front"}, LENS | {"name": "left", "yaw_deg": 60.0, "stamp_offset_s": 0.5}]
+
+
+@pytest.fixture
+def car(tmp_path):
+    path = tmp_path / "car.json"
+    path.write_text(json.dumps({"array": {"positions_m": RINGS}, "cameras": CAMERAS}))
+    return path
+
+
+def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monkeypatch):
+    sounds = [tmp_path / f"{number}.wav" for number in range(10)]
+    for sound in sounds:
+        soundfile.write(sound, np.random.default_rng(0).normal(0.0, 0.1, (9_000, 3)), 8_000)
+    seen = iter(passes(10, 0.2, 3.0))
+    monkeypatch.setattr(
+        "worldstate.operations.alignment.heard_passes.heard_passes", lambda source, margin_s: [next(seen)]
+    )
+    out = tmp_path / "aligned.json"
+    words = ["align", *map(str, sounds), "--car", str(car), "--camera-name", "left", "--out", str(out)]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["recordings"], found["passes"]) == (10, 10)
+    before, after = read_car(car), read_car(out)
+    assert after.cameras["left"].stamp_offset_s == pytest.approx(0.5 + found["offset_s"], abs=1e-4)
+    assert math.degrees(after.cameras["left"].yaw_rad) == pytest.approx(60.0 + found["yaw_deg"], abs=1e-3)
+    assert after.cameras["front"] == before.cameras["front"]
+    np.testing.assert_array_equal(after.array.positions_m, before.array.positions_m)
+
+
+def test_the_array_of_a_car_is_found_from_the_new_file_or_it_is_refused(tmp_path):
+    (tmp_path / "mics.csv").write_text("\n".join(",".join(map(str, row)) for row in RINGS))
+    (tmp_path / "elsewhere").mkdir()
+    path = tmp_path / "car.json"
+    path.write_text(json.dumps({"array": {"file": "mics.csv"}, "cameras": CAMERAS}))
+    write_aligned(path, tmp_path / "new.json", None, 0.1, 2.0)
+    assert read_car(tmp_path / "new.json").cameras["front"].stamp_offset_s == 0.1
+    with pytest.raises(InputFileError, match=r"where mics.csv is"):
+        write_aligned(path, tmp_path / "elsewhere" / "new.json", None, 0.1, 2.0)
+
+
+def test_what_cannot_be_aligned(car, tmp_path, capsys):
+    assert main(["align", "nowhere"]) == 2
+    assert "nowhere: expected a data set" in capsys.readouterr().err
+    assert main(["align", str(tmp_path), "--out", str(tmp_path / "new.json")]) == 2
+    assert "--out: expected --car with it" in capsys.readouterr().err
+    words = ["align", str(car), str(car), "--car", str(car), "--detections", str(car)]
+    assert main(words) == 2
+    assert "--detections: expected one recording with it" in capsys.readouterr().err
+
+
+def test_a_recording_without_a_camera_has_no_passes(tmp_path):
+    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.1, (9_000, 3)), 8_000)
+    (tmp_path / "mics.json").write_text(json.dumps(RINGS))
+    settings = ListenSettings(uncalibrated=True)
+    source = open_source(tmp_path / "a.wav", array=tmp_path / "mics.json", settings=settings)
+    assert heard_passes(source, 1.0) == []
+
+
+@pytest.mark.slow
+def test_rendered_streets_give_the_offset_and_the_yaw_that_were_put_in(tmp_path):
+    for site, seed in (("SA1", 3), ("SB2", 3)):
+        words = ["--minutes", "4", "--site", site, "--traffic", "approaches", "--bandwidth", "2000"]
+        assert main(["simulate", "--out", str(tmp_path), *words, "--seed", str(seed)]) == 0
+    sources = [
+        open_source(folder, settings=ListenSettings(uncalibrated=True)) for folder in tmp_path.iterdir()
+    ]
+    for offset_s, yaw_deg in ((0.0, 0.0), (0.3, 4.0)):
+        moved = [
+            replace(
+                one,
+                detections=one.detections.shifted(-offset_s),
+                camera=replace(one.camera, yaw_rad=-math.radians(yaw_deg)),
+            )
+            for one in sources
+        ]
+        found = align([one for source in moved for one in heard_passes(source, 1.0)])
+        assert found.offset_s == pytest.approx(offset_s, abs=0.1)
+        assert found.yaw_deg == pytest.approx(yaw_deg, abs=2.0)

@@ -1,0 +1,172 @@
+r"""Offset of a camera's clock and its yaw against the array, by the bearings of vehicles in view.
+
+A bearing of the sound is that of the vehicle in view, with a normal error, or of something else, at any
+azimuth. With the place in the boxes that is heard, b(t), offset d and yaw y,
+
+.. math:: L(d, y) = \sum_i \log\Big(\epsilon + (1 - \epsilon)\, \pi\,
+          N\big(\theta_i; b(t_i - d) + y, \sigma^2\big)\Big)
+
+to which a bearing adds nothing where no box was seen at its time. It is read on a grid, so that no start has
+to be near.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import wrap_angle
+
+from .heard_passes import HeardPass
+
+# What is looked for: clocks that were started by hand, brackets that were put on by eye.
+LARGEST_OFFSET_S, LARGEST_YAW_DEG = 1.0, 15.0
+_OFFSET_STEP_S, _YAW_STEP_DEG = 0.01, 0.25
+# Error of a bearing of a vehicle in view: the published median of 3.4 degrees, and what a box adds.
+_STD_RAD = np.radians(4.0)
+# Share of bearings that are of something else: at busy junctions every second one.
+_OTHER = 0.5
+# An interval over fewer passes would be that of one or two vehicles.
+FEWEST_PASSES = 5
+_FEWEST_A_SIDE = 2
+_DRAWS = 400
+# A bearing near the first or the last box counts less, over so many seconds: boxes and bearings come every
+# 0.1 s, and whole bearings that enter or leave would pull the offset to multiples of that.
+_TAPER_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """What has to be added to a camera's stamps and yaw, each with its 95 % interval."""
+
+    offset_s: float  # To the stamps of its images, so that they are on the clock of the sound
+    offset_interval_s: tuple[float, float]
+    yaw_deg: float  # To its yaw, left positive
+    yaw_interval_deg: tuple[float, float]
+    passes: int  # Vehicles in view
+    bearings: int  # Bearings of the sound while one was in view
+    agreeing: float  # Share of those that are rather its own than something else's
+    median_error_deg: float  # Of these
+
+
+def align(passes: Sequence[HeardPass], seed: int = 0) -> Alignment:
+    """Return the alignment that most bearings agree with; the interval is a bootstrap over the passes.
+
+    Parameters
+    ----------
+    passes : sequence of HeardPass
+        Vehicles that turned through the view; those that came from both sides tell the yaw from the offset.
+    seed : int
+        Of the bootstrap.
+
+    Returns
+    -------
+    Alignment
+        To be added to what the camera's file says.
+
+    Raises
+    ------
+    InvalidArgumentError
+        With fewer than five passes or fewer than two from a side, or if the best is at the edge of what is
+        looked for.
+    """
+    _check_enough(passes)
+    support = np.stack([_support(one) for one in passes])
+    offset_s, yaw_deg = _best(support.sum(axis=0))
+    _check_inside(offset_s, yaw_deg)
+    draws = np.random.default_rng(seed).integers(0, len(passes), (_DRAWS, len(passes)))
+    counts = np.stack([np.bincount(draw, minlength=len(passes)) for draw in draws])
+    drawn = np.array([_best(np.tensordot(count, support, 1)) for count in counts])
+    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
+    errors = np.concatenate([_errors(one, offset_s, yaw_deg, only_seen=True) for one in passes])
+    own = np.abs(errors) < _own_within()
+    return Alignment(
+        offset_s=offset_s,
+        offset_interval_s=(float(low[0]), float(high[0])),
+        yaw_deg=yaw_deg,
+        yaw_interval_deg=(float(low[1]), float(high[1])),
+        passes=len(passes),
+        bearings=len(errors),
+        agreeing=float(own.mean()),
+        median_error_deg=float(np.degrees(np.median(np.abs(errors[own])))),
+    )
+
+
+def _check_enough(passes: Sequence[HeardPass]) -> None:
+    if len(passes) < FEWEST_PASSES:
+        problem = f"expected at least {FEWEST_PASSES} vehicles that turn through the view, got {len(passes)}"
+        raise InvalidArgumentError(f"passes: {problem}: give more recordings")
+    left = sum(float(one.box_rad[0]) > float(one.box_rad[-1]) for one in passes)
+    right = len(passes) - left
+    if min(left, right) < _FEWEST_A_SIDE:
+        got = f"{left} from the left, {right} from the right"
+        problem = f"expected at least {_FEWEST_A_SIDE} vehicles from each side, got {got}"
+        raise InvalidArgumentError(f"passes: {problem}: a turned camera sees those of one side late or early")
+
+
+def _check_inside(offset_s: float, yaw_deg: float) -> None:
+    if abs(offset_s) > LARGEST_OFFSET_S - _OFFSET_STEP_S or abs(yaw_deg) > LARGEST_YAW_DEG - _YAW_STEP_DEG:
+        within = f"within {LARGEST_OFFSET_S:g} s and {LARGEST_YAW_DEG:g} deg"
+        got = f"got {offset_s:.2f} s and {yaw_deg:.1f} deg at its edge"
+        raise InvalidArgumentError(f"passes: expected an alignment {within}, {got}: correct it by hand first")
+
+
+def _grid() -> tuple[FloatArray, FloatArray]:
+    n_offsets, n_yaws = round(LARGEST_OFFSET_S / _OFFSET_STEP_S), round(LARGEST_YAW_DEG / _YAW_STEP_DEG)
+    offsets_s = _OFFSET_STEP_S * np.arange(-n_offsets, n_offsets + 1)
+    yaws_deg = _YAW_STEP_DEG * np.arange(-n_yaws, n_yaws + 1)
+    return offsets_s.astype(np.float64), yaws_deg.astype(np.float64)
+
+
+def _support(one: HeardPass) -> FloatArray:
+    """Return L of one pass on the grid, shape (offsets, yaws)."""
+    offsets_s, yaws_deg = _grid()
+    rows = []
+    for offset_s in offsets_s:
+        errors_rad = _errors(one, offset_s, 0.0)[:, None] - np.radians(yaws_deg)
+        rows.append(_weights(one, offset_s) @ _gain(errors_rad))
+    return np.stack(rows)
+
+
+def _errors(one: HeardPass, offset_s: float, yaw_deg: float, *, only_seen: bool = False) -> FloatArray:
+    """Return bearing minus box, radians, where asked for only of those at whose time the box was seen."""
+    seen = _weights(one, offset_s) > 0.0
+    box_rad = np.interp(one.sound_time_s - offset_s, one.box_time_s, one.box_rad)
+    errors_rad = wrap_angle(one.sound_rad - box_rad - np.radians(yaw_deg))
+    return np.asarray(errors_rad)[seen] if only_seen else np.asarray(errors_rad)
+
+
+def _weights(one: HeardPass, offset_s: float) -> FloatArray:
+    """Return how much each bearing counts: 1 within the boxes, 0 outside."""
+    at_s = one.sound_time_s - offset_s
+    inside_s = np.minimum(at_s - one.box_time_s[0], one.box_time_s[-1] - at_s)
+    return np.asarray(np.clip(inside_s / _TAPER_S, 0.0, 1.0))
+
+
+def _gain(errors_rad: FloatArray) -> FloatArray:
+    density = np.exp(-0.5 * (errors_rad / _STD_RAD) ** 2) / (_STD_RAD * np.sqrt(2.0 * np.pi))
+    return np.asarray(np.log(_OTHER + (1.0 - _OTHER) * np.pi * density))
+
+
+def _own_within() -> float:
+    """Return the error at which a bearing is as likely of the vehicle as of something else."""
+    ratio = (1.0 - _OTHER) * np.pi / (_OTHER * _STD_RAD * np.sqrt(2.0 * np.pi))
+    return float(_STD_RAD * np.sqrt(2.0 * np.log(ratio)))
+
+
+def _best(total: FloatArray) -> tuple[float, float]:
+    """Return offset and yaw of the largest value, between the points of the grid by parabolas."""
+    offsets_s, yaws_deg = _grid()
+    row, column = np.unravel_index(int(total.argmax()), total.shape)
+    return _peak(offsets_s, total[:, column], int(row)), _peak(yaws_deg, total[row], int(column))
+
+
+def _peak(grid: FloatArray, values: FloatArray, at: int) -> float:
+    if not 0 < at < len(grid) - 1:
+        return float(grid[at])
+    before, here, after = values[at - 1 : at + 2]
+    bend = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return float(grid[at] + shift * (grid[1] - grid[0]))
