@@ -46,7 +46,7 @@ def test_the_chance_to_be_in_the_lane_of_the_ego_vehicle_is_that_of_draws(x: flo
 
 def test_of_two_in_a_lane_one_is_in_front_and_oncoming_traffic_is_in_neither() -> None:
     told = seen((10.0, 20.0, 0.0, -8.0), (10.0, 30.0, 0.0, -8.0), (13.5, 25.0, 0.0, 8.0))
-    assert told["0", "1", "in_front_of"] > 0.95 and told["1", "0", "same_lane"] > 0.95
+    assert told["0", "1", "in_front_of"] > 0.95 and told["0", "1", "same_lane"] > 0.95
     assert ("1", "0", "in_front_of") not in told
     assert not any("2" in key[:2] for key in told if key[2] in ("same_lane", "in_front_of"))
 
