@@ -65,6 +65,14 @@ def test_no_line_is_drawn_across_a_gap(timeline):
     assert np.isfinite(whole.azimuth_rad).all()
 
 
+def test_the_axis_begins_with_the_first_window_on_a_clock_of_1970_too(timeline):
+    late = replace(timeline, time_s=timeline.time_s + 1.7e9)
+    for one, first_s in ((timeline, 0.0), (late, 1.7e9)):
+        low, high = draw_timeline(one).axes[0].get_xlim()
+        assert low == pytest.approx(first_s, abs=1e-3)
+        assert high == pytest.approx(one.time_s[-1] + 0.1, abs=1e-3)
+
+
 def test_a_recording_without_entities_is_drawn(timeline, tmp_path):
     empty = replace(timeline, entities=())
     assert not drawn(empty)

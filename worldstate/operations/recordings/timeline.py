@@ -229,7 +229,9 @@ def _draw_statistic(axes: "Axes", timeline: Timeline) -> None:
     label = rf"threshold $\gamma(\alpha={timeline.alpha:g})$ on $s$"
     axes.axhline(timeline.threshold, color=BLUE, linestyle=":", label=label)
     axes.set(xlabel="time (s), end of the decision window", ylabel="statistic, risk", ylim=(-0.02, 1.02))
-    axes.set_xlim(0.0, timeline.time_s[-1] + _HOP_S if timeline.time_s.size else 1.0)
+    # The first window begins a second before its decision: at 0, or where a bag's clock or --start says.
+    first_s, last_s = timeline.time_s[[0, -1]] if timeline.time_s.size else (1.0, 1.0)
+    axes.set_xlim(first_s - 1.0, last_s + _HOP_S)
 
 
 def _mark_visible(panels: "list[Axes]", timeline: Timeline) -> None:
