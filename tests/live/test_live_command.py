@@ -5,8 +5,10 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -134,3 +136,66 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
     exec(compile(program, "live.md", "exec"), given)
     assert len(published) == 11
     assert [view.sensor for view in published[-1].searched] == ["camera"]
+
+
+class Capture:
+    """What is used of OpenCV's VideoCapture: images of a grey wall, ten a second."""
+
+    def __init__(self, device: int) -> None:
+        self._opened = True
+
+    def isOpened(self) -> bool:  # noqa: N802 - its name there
+        return self._opened
+
+    def read(self):
+        time.sleep(0.1)
+        return True, np.full((480, 640, 3), 90, np.uint8)
+
+    def release(self) -> None:
+        self._opened = False
+
+
+def looked_at(states):
+    snapshots = map(json.loads, states.read_text().splitlines())
+    return [view["sensor"] for snapshot in snapshots for view in snapshot["searched"]]
+
+
+def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "worldstate.adapters.live.image_feed.opencv", lambda: SimpleNamespace(VideoCapture=Capture)
+    )
+    lens, states = tmp_path / "lens.json", tmp_path / "states.jsonl"
+    lens.write_text(json.dumps({"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70}))
+    asked = "--camera-device", 0, "--camera", lens, "--out", states, "--json"
+    assert main(command(street, *asked)) == 0
+    # In the first second there is no state yet, for which images would be looked at; four of them wait.
+    assert 0 < json.loads(capsys.readouterr().out)["images_dropped"] < 15
+    assert "camera" in looked_at(states)
+
+
+def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
+    states = tmp_path / "states.jsonl"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    stopped = threading.Event()
+
+    def detect():
+        empty = json.dumps({"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}).encode()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as detector:
+            while not stopped.wait(0.05):
+                for datagram in (empty, b"nonsense"):
+                    detector.sendto(datagram, ("127.0.0.1", port))
+
+    detecting = threading.Thread(target=detect, daemon=True)
+    detecting.start()
+    try:
+        asked = "--detections", f"127.0.0.1:{port}", "--out", states, "--json"
+        assert main(command(street, *asked)) == 0
+    finally:
+        stopped.set()
+        detecting.join()
+    report = json.loads(capsys.readouterr().out)
+    assert report["detections_refused"] > 0
+    assert "expected" in report["last_refusal"] or "JSON" in report["last_refusal"]
+    assert "camera" in looked_at(states)

@@ -144,41 +144,52 @@ def _with_camera(
     arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
 ) -> "tuple[Source, Losses]":
     """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
+    if arguments.detections is not None:
+        return _with_detections(arguments.detections, source, sound, opened)
+    if arguments.camera_device is not None:
+        return _with_device(arguments, source, sound, opened)
+    return source, dict
+
+
+def _with_detections(
+    address: str, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.detection_socket import DetectionSocket
+    from worldstate.adapters.live.live_camera import LiveCamera
+
+    looks = opened.enter_context(DetectionSocket(address, sound.stamp_ns))
+    return replace(source, co_evidence=LiveCamera(source, looks)), lambda: {
+        "detections_dropped": looks.dropped,
+        "detections_refused": looks.refused,
+        "last_refusal": looks.problem or None,
+    }
+
+
+def _with_device(
+    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
     from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
     from worldstate.adapters.live.live_camera import LiveCamera
 
-    if arguments.detections is not None:
-        looks = opened.enter_context(DetectionSocket(arguments.detections, sound.stamp_ns))
-        camera = LiveCamera(source, looks)
-        return replace(source, co_evidence=camera), lambda: {
-            "detections_dropped": looks.dropped,
-            "detections_refused": looks.refused,
-            "last_refusal": looks.problem or None,
-        }
-    if arguments.camera_device is None:
-        return source, dict
     images, detector = image_channel(), detector_maker(arguments)()
     size = source.camera.width_px, source.camera.height_px
-    seen = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
+    looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
     opened.enter_context(CameraFeed(arguments.camera_device, images))
-    camera = LiveCamera(source, seen, seen.degradation)
+    camera = LiveCamera(source, looks, looks.degradation)
     return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
 
 
 def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound") -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.states_file import states_writer
-    from worldstate.adapters.live.latency import CostMeter, LatencyMeter
     from worldstate.adapters.live.live_listening import live_steps
     from worldstate.ground.values import seconds
-    from worldstate.operations.recordings.warning import WarningMeter
+    from worldstate.operations.recordings.live_report import LiveReport
 
     from .live_view import live_view, loss_notices
 
-    warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
-    states, peak_risk, notices = 0, 0.0, loss_notices()
     shown = sys.stderr.isatty() if arguments.view is None else arguments.view
+    report, notice = LiveReport(source), loss_notices()
     with (
         states_writer(arguments.out) as write,
         log_hops(arguments, source, paced=False) as log,
@@ -186,29 +197,10 @@ def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound")
         stopped_by_signals(sound.close),
     ):
         for live in live_steps(source):
-            latency.add(live.latency_s)
-            state = live.step.state
-            write(state.to_json())
+            write(live.step.state.to_json())
             log(live.step)
-            show(live)
-            notices(live)
-            warnings.update(state)
-            states, peak_risk = states + 1, max(peak_risk, state.risk)
-            if arguments.duration is not None and seconds(state.stamp_ns) >= arguments.duration:
+            for watcher in (report.add, show, notice):
+                watcher(live)
+            if arguments.duration is not None and seconds(live.step.state.stamp_ns) >= arguments.duration:
                 break
-    spent = cost.read()
-    return {
-        "states": states,
-        "sound_s": sound.frames / sound.sample_rate_hz,
-        "overruns": sound.overruns,
-        "lost_s": sound.lost_s,
-        "latency_median_s": latency.quantile_s(0.5),
-        "latency_p99_s": latency.quantile_s(0.99),
-        "latency_largest_s": latency.quantile_s(1.0),
-        "wall_s": spent.wall_s,
-        "cpu_s": spent.cpu_s,
-        "cpu_share": spent.cpu_share,
-        "load": spent.load,
-        "peak_risk": peak_risk,
-        "advisory_onsets_s": list(warnings.summary().advisory_onsets_s),
-    }
+    return report.to_dict(sound)
