@@ -9,7 +9,7 @@ from tutorial_options import tutorial_options
 from worldstate import Measurement, WorldState, open_source
 from worldstate.adapters import Checkpoint, measure_steps, read_checkpoint, save_checkpoint
 from worldstate.adapters.simulation import DatasetSettings, write_dataset
-from worldstate.operations.figure_style import BLUE, RED, figure_file
+from worldstate.operations.figure_style import figure_file
 
 
 def deliveries(measured: list[Measurement], rng: np.random.Generator) -> list[tuple[float, Measurement]]:
@@ -49,8 +49,8 @@ def main(out: Path, size: str = "full") -> None:
     print(world.state.delivery)
     with figure_file(out / "08_embed.png", 8.0, 3.4) as figure:
         axes = figure.subplots()
-        for name, told, colour in (("in order, no delay", straight, BLUE), ("as delivered", live, RED)):
-            axes.step(*zip(*((at, chance(one)) for at, one in told), strict=True), color=colour, label=name)
+        for name, told in (("in order, no delay", straight), ("as delivered", live)):
+            axes.step([at for at, _ in told], [chance(s) for _, s in told], where="post", label=name)
         axes.axvline(live[len(live) // 2][0], color="black", linestyle=":", label="checkpoint")
         axes.set(ylim=(0.0, 1.0), xlabel="clock, s", ylabel="chance to come into view within 3 s")
         axes.legend(loc="upper left")
