@@ -6,22 +6,28 @@ from pathlib import Path
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode
-from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at
+from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_road
 
 from .json_file import read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """One approach side: the place of its corner and of the lane behind it."""
+    """One approach side: the place of its corner and of the lane behind it, or an open road."""
 
     direction: str
-    corner_m: tuple[float, float]
-    crossing_m: float
+    corner_m: tuple[float, float] | None = None
+    crossing_m: float | None = None
     speed_mps: float | None = None
     corner_std_m: float | None = None
+    open: bool | None = None
 
-    def occluder(self) -> Occluder:
+    def occluder(self, side: int) -> Occluder:
+        if self.open:
+            return open_road(self.direction, side)
+        if self.corner_m is None or self.crossing_m is None:
+            wanted = 'corner_m and crossing_m, or "open": true'
+            raise InvalidArgumentError(f"context.arms: expected {wanted} for {self.direction}")
         given = {"speed_mps": self.speed_mps, "corner_std_m": self.corner_std_m}
         known = {name: value for name, value in given.items() if value is not None}
         return corner_at(self.direction, self.corner_m, self.crossing_m, **known)
@@ -40,9 +46,11 @@ class _ContextFile:
 
     def context(self) -> Context:
         usual = Context()
-        known = usual.occluders if self.arms is None else tuple(arm.occluder() for arm in self.arms)
-        # In the usual order, which is that of a signature model's directions.
+        # In the usual order, which is that of a signature model's directions: left, right.
         order = {direction: place for place, direction in enumerate(usual.directions)}
+        known = usual.occluders
+        if self.arms is not None:
+            known = tuple(arm.occluder(-1 if order.get(arm.direction) else 1) for arm in self.arms)
         half_rad = usual.view_half_angle_rad
         if self.view_half_angle_deg is not None:
             half_rad = math.radians(self.view_half_angle_deg)
@@ -61,9 +69,9 @@ def read_context(path: str | Path) -> Context:
 
     ``{"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}``: the corner that
     hides an arm (x ahead, y to the left of the ego, metres) and the distance ahead of the lane in which
-    vehicles come from there; optional ``"speed_mps"`` of these and ``"corner_std_m"``. Beside the arms
-    ``"rates"`` and ``"priors"`` as `Rates` and `Priors` name them, ``"ego_speed_mps"``, ``"site"`` and
-    ``"view_half_angle_deg"``.
+    vehicles come from there; optional ``"speed_mps"`` of these and ``"corner_std_m"``. An arm with
+    ``"open": true`` in their place hides nobody. Beside the arms ``"rates"`` and ``"priors"`` as `Rates` and
+    `Priors` name them, ``"ego_speed_mps"``, ``"site"`` and ``"view_half_angle_deg"``.
 
     Parameters
     ----------

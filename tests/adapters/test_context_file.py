@@ -70,6 +70,12 @@ def test_a_file_says_what_stands_there_and_the_rest_is_usual(tmp_path: Path) -> 
     assert WorldFilter.from_dict(world.to_dict()).context == context
 
 
+def test_an_arm_may_be_an_open_road(tmp_path: Path) -> None:
+    context = read_context(written(tmp_path, arms=[{"direction": "right", "open": True}, LEFT]))
+    assert [(one.direction, one.hides) for one in context.occluders] == [("left", True), ("right", False)]
+    assert context.occluders[1].edge_azimuth_rad < 0.0 and not context.occluders[1].assumed
+
+
 def rates() -> dict[str, float]:
     return {name: getattr(Context().rates, name) for name in Context().rates.__dataclass_fields__}
 
@@ -84,6 +90,7 @@ def rates() -> dict[str, float]:
         ({"arms": [{**LEFT, "corner_m": [9.5, 3.0]}, RIGHT]}, "nearer than 9"),
         ({"arms": [{**LEFT, "speed_mps": -1.0}, RIGHT]}, "speed_mps"),
         ({"arms": [{**LEFT, "crossing_m": None}, RIGHT]}, "crossing_m"),
+        ({"arms": [{"direction": "left"}, RIGHT]}, "corner_m and crossing_m, or"),
         ({"ego_speed_mps": "fast"}, "ego_speed_mps"),
     ],
 )
