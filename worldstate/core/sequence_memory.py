@@ -139,10 +139,11 @@ class SequenceMemory:
     def hidden(self) -> HiddenBelief:
         """Whoever comes into view within eight seconds is hidden; who came unseen is there as it sounds.
 
-        What sounds in view, or as if it had left the view into the other side, is shared among those who may
-        have come into view unseen and somebody of whom nothing is known.
+        What sounds in view, or as if it had left the view into the other side, is one who may have come into
+        view unseen, or somebody of whom nothing is known. As few as explain it: a vehicle that may have come
+        from either side is one, of the likelier side, and two only as far as both chances exceed one.
         """
-        groups, unseen = self.posterior.groups[0], np.array(self.unseen)
+        groups, unseen = self.posterior.groups[0], _as_few(np.array(self.unseen))
         coming = np.minimum(self.coming.sum(axis=1), 1.0)
         there = groups[:, _SEEN] + groups[::-1, _PAST]
         emerged = np.minimum(there * unseen / (unseen.sum() + _OTHERS), 1.0 - coming)
@@ -178,6 +179,13 @@ class SequenceMemory:
     def mean_log_odds(self) -> FloatArray:
         """Mean log-odds of coming into view within three seconds over the last .3 s, shape (2,)."""
         return np.asarray(np.mean([one[1:] for one in self.recent], axis=0))
+
+
+def _as_few(chances: FloatArray) -> FloatArray:
+    """Return the chances with as much as one vehicle allows on the likelier side; a tie stays one."""
+    total, first = float(chances.sum()), chances == chances.max()
+    one = min(total, 1.0)
+    return np.where(first, one, total - one) if first.sum() == 1 else chances
 
 
 def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context) -> SequenceMemory:
