@@ -11,8 +11,8 @@ that of detections with stamps, too).
 --context says what stands at this place:
   {"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}
 the corner that hides the arm (x ahead, y left of the ego) and the lane behind it, metres, or "open": true of
-an arm that hides nobody; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors", "ego_speed_mps",
-"site", "view_half_angle_deg". With --odometry corners move as the ego does.
+an arm that hides nobody; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors",
+"ego_speed_mps", "site", "view_half_angle_deg". With --odometry corners move as the ego does.
 
 --gating compares the bearings with the moving boxes of the camera: what is gained in accuracy, and lost in
 coverage, where only prominent peaks are kept.
