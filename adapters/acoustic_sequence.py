@@ -38,6 +38,10 @@ def read_hop(
     sides = signature.sides
     if sides is None:
         return NotUsable("the model says nothing of single sides")
+    if (frame.feature <= 0.0).any():
+        # Samples that were lost, or no two microphones that are trusted: no street is silent.
+        reader.interrupt()
+        return NotUsable("no sound in a part of the window")
     looming = frame.looming
     rate_hz = std_hz = np.nan
     if not isinstance(looming, NotUsable):

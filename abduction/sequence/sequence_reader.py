@@ -107,6 +107,10 @@ class SequenceReader:
         self._model = model
         self.history = history or SequenceHistory()  # All that is carried; `Checkpoint` writes it to disk
 
+    def interrupt(self) -> None:
+        """Forget the last seconds, as after sound that was lost; what is usual in the street stays."""
+        self.history = SequenceHistory(minute=self.history.minute)
+
     def read(self, evidence: HopEvidence) -> SequenceReading | NotUsable:
         """Take the next hop in; return what it says together with those before."""
         self.history = history = self.history.heard(evidence)

@@ -118,3 +118,25 @@ def test_foreign_sounds_say_as_little_of_each_side_as_of_both() -> None:
     sides = SideEvidence(("left", "right"), (3.0, -1.0), 0.1, 0.1, 0.5)
     heard = neutral(SignatureEvidence(("left", "right"), (3.0, -1.0), -2.0, 0.5, sides), margin=2.0)
     assert heard.sides == replace(sides, log_ratios=(1.0, 0.0))
+
+
+def test_lost_sound_interrupts_the_sequence_and_leaves_nothing_behind(folder: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    # A wave from ahead, so that no microphone looks like a faulty one.
+    sound = 0.01 * (rng.standard_normal((8 * RATE_HZ, 1)) + 0.3 * rng.standard_normal((8 * RATE_HZ, 3)))
+    sound[3 * RATE_HZ : 3 * RATE_HZ + RATE_HZ * 9 // 10] = 0.0
+    soundfile.write(tmp_path / "sound.wav", sound, RATE_HZ)
+    source = open_source(tmp_path / "sound.wav", model=folder / "model.json", array=ARRAY)
+    # A silent window has no log energy; the settings of the tests turn a warning about that into an error.
+    heard = list(listen_steps(source))
+    said = [step.measurement.sequence for step in heard]
+    reasons = [one.reason if isinstance(one, NotUsable) else "" for one in said]
+    silent = [at for at, reason in enumerate(reasons) if reason == "no sound in a part of the window"]
+    assert 3.4 < heard[silent[0]].state.stamp_ns / 1e9 < 4.0
+    # Ten hops later a sequence is read again.
+    assert set(reasons[silent[-1] + 1 : silent[-1] + 10]) == {"less than 10 hops of evidence"}
+    assert set(reasons[silent[-1] + 10 :]) == {""}
+    end = heard[-1].history
+    assert end is not None
+    assert np.isfinite(end.minute).all()
+    assert len(end.minute) == len(heard) - len(silent)

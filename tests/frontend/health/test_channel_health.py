@@ -454,3 +454,15 @@ def test_masks_scale_back_to_the_whole() -> None:
     assert mask.pair_scale == pytest.approx(10 / 3)
     nobody = ChannelMask(np.zeros(3, bool))
     assert np.isfinite([nobody.power_scale, nobody.pair_scale]).all()
+
+
+def test_losses_of_the_transport_are_no_fault_of_a_microphone():
+    rng = np.random.default_rng(5)
+    sound = rng.standard_normal((40_000, 1)) + 0.3 * rng.standard_normal((40_000, 3))
+    for first in (9_900, 13_300, 17_750):
+        sound[first : first + 400] = 0.0  # 50 ms of every channel, across the ends of hops
+    array = MicrophoneArray([[0, 0.2, 0], [0, 0.0, 0], [0, -0.3, 0]])
+    frames = FrontEnd(array, 8_000).process(sound)
+    assert frames[-1].health.n_dropouts == 3
+    assert all(frame.health.mask.keep.all() for frame in frames)
+    assert not any(frame.health.faults for frame in frames)
