@@ -1,0 +1,122 @@
+"""The memory of a street: what passes teach it, what a moved edge does, and what it forgets."""
+
+import math
+
+import numpy as np
+import pytest
+
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.smoothing.learned_edge import LearnedEdge
+from worldstate.smoothing.learned_street import (
+    DAY_S,
+    LearnedStreet,
+    StreetPass,
+    forgotten,
+    watched,
+    with_looks,
+    with_pass,
+)
+from worldstate.smoothing.running_moments import Moments, NormalPrior
+from worldstate.smoothing.street_context import context_of
+from worldstate.state.context import Context
+
+LEFT, RIGHT = math.radians(24.0), math.radians(-29.0)
+
+
+def street_of(passes: int, seed: int = 0) -> LearnedStreet:
+    rng, street = np.random.default_rng(seed), LearnedStreet("Elm Street")
+    for i in range(passes):
+        edge = (LEFT, RIGHT)[i % 2] + rng.normal(0.0, math.radians(0.3))
+        street = with_pass(
+            street, StreetPass(("left", "right")[i % 2], edge, rng.lognormal(math.log(0.7), 0.2))
+        )
+    return street
+
+
+def edge_after(*degrees: float) -> LearnedEdge:
+    edge = LearnedEdge()
+    for one in degrees:
+        edge = edge.with_pass(math.radians(one))
+    return edge
+
+
+def test_ten_passes_tell_edges_and_pace():
+    left, right = context_of(street_of(10)).occluders
+    assert abs(left.edge_azimuth_rad - LEFT) < math.radians(0.5)
+    assert abs(right.edge_azimuth_rad - RIGHT) < math.radians(0.5)
+    assert left.pace_hz > 0.55 > Context().occluders[0].pace_hz
+    assert not (left.assumed or right.assumed)
+
+
+def test_moments_are_those_of_the_sample_under_a_flat_prior():
+    values = np.random.default_rng(1).normal(3.0, 2.0, 50)
+    moments = Moments()
+    for value in values.tolist():
+        moments = moments.plus(value)
+    mean, mean_std, spread = moments.posterior(NormalPrior(0.0, 1e6, 2.0, freedom=1e-9))
+    assert mean == pytest.approx(values.mean())
+    assert spread == pytest.approx(values.std())
+    assert mean_std == pytest.approx(values.std() / math.sqrt(50))
+
+
+def test_the_predictive_density_is_that_of_scipy():
+    from scipy.stats import t
+
+    moments, prior = Moments().plus(0.4).plus(0.5), NormalPrior(0.56, 0.09, 0.02)
+    mean, mean_std, spread = moments.posterior(prior)
+    told = t.logpdf(0.47, prior.freedom + 2.0, mean, math.hypot(mean_std, spread))
+    assert moments.log_predictive(0.47, prior) == pytest.approx(told)
+
+
+def test_a_moved_edge_is_learned_anew_within_three_passes():
+    moved = edge_after(30.0, 30.2, 29.9, 30.1, 30.0, 24.0, 24.1, 24.0)
+    assert moved.changes == 1
+    assert abs(math.degrees(moved.mean_rad) - 24.0) < 0.5
+
+
+def test_a_stray_pass_changes_nothing():
+    edge = edge_after(30.0, 30.2, 12.0, 29.9, 30.1, 30.0)
+    assert edge.changes == 0
+    assert abs(math.degrees(edge.mean_rad) - 30.0) < 0.5
+
+
+def test_a_first_stray_pass_is_outvoted_and_no_change_of_the_place():
+    edge = edge_after(15.0, 30.0, 30.1, 29.9)
+    assert edge.changes == 0
+    assert abs(math.degrees(edge.mean_rad) - 30.0) < 1.0
+
+
+def test_time_takes_weight_and_leaves_means():
+    street = watched(street_of(10), 600.0)
+    later = forgotten(street, 30.0 * DAY_S)
+    for before, after in zip(street.arms, later.arms, strict=True):
+        assert after.arrivals == pytest.approx(before.arrivals / math.e)
+        assert after.exposure_s == pytest.approx(before.exposure_s / math.e)
+        assert after.edge.mean_rad == pytest.approx(before.edge.mean_rad, abs=math.radians(0.2))
+        assert after.edge.std_rad > before.edge.std_rad
+
+
+def test_forgetting_in_two_steps_is_forgetting_in_one():
+    street = with_looks(street_of(6), [0.1, 0.2], [0.3])
+    twice = forgotten(forgotten(street, 2.0 * DAY_S), 3.0 * DAY_S)
+    assert np.allclose(twice.looks, forgotten(street, 5.0 * DAY_S).looks)
+    with pytest.raises(InvalidArgumentError):
+        forgotten(street, -1.0)
+
+
+def test_rates_are_those_of_gamma_and_poisson():
+    street = watched(street_of(10), 100.0)
+    assert street.arms[0].rate_hz == pytest.approx((1.0 + 5.0) / (20.0 + 100.0))
+
+
+def test_misses_lower_the_detection_where_they_were():
+    street = with_looks(LearnedStreet(), [0.0] * 50 + [0.4] * 25, [0.4] * 25)
+    assert street.detection(0.0) > 0.95
+    assert street.detection(0.4) < 0.7
+
+
+def test_a_filter_keeps_the_learned_street_in_its_checkpoint():
+    world = WorldFilter(context_of(street_of(10))).predict(0.3)
+    again = WorldFilter.from_dict(world.to_dict())
+    assert again.context.occluders == world.context.occluders
