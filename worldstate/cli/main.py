@@ -29,6 +29,7 @@ COMMANDS = (
     "users.simulate",
     "users.to_bag",
     "users.label",
+    "users.learn_street",
     "users.train",
     "users.model",
     "users.calibrate",

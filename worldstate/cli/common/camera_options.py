@@ -4,8 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .array_options import given_array
+
 if TYPE_CHECKING:
-    from worldstate.adapters.camera.detections import DetectionFilter
+    from worldstate.adapters.audio.open_sound import SoundInput
+    from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
     from worldstate.adapters.listen import Source
 
 DETECTIONS_HELP = """\
@@ -41,6 +44,30 @@ def boxes_of(arguments: argparse.Namespace) -> "DetectionFilter":
     from worldstate.adapters.camera.detections import DetectionFilter
 
     return DetectionFilter(frozenset(arguments.classes), arguments.min_score, arguments.min_box_px)
+
+
+def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[Source, DetectionLog]":
+    """Return a recording of which boxes and camera are used, and no model has to fit the array; the boxes.
+
+    Raises
+    ------
+    InputFileError
+        If there are no boxes of a camera.
+    """
+    from worldstate.adapters.listen import ListenSettings, open_source
+    from worldstate.ground.errors import InputFileError
+
+    source = open_source(
+        sound,
+        array=given_array(arguments),
+        detections=arguments.detections,
+        camera=arguments.camera,
+        settings=ListenSettings(boxes=boxes_of(arguments), uncalibrated=True),
+    )
+    if source.detections is None:
+        problem = "expected boxes of a camera beside it, or --detections with what a detector reported"
+        raise InputFileError(source.audio_path, problem)
+    return source, source.detections
 
 
 def box_counts(source: "Source", *, as_json: bool) -> object:

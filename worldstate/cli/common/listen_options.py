@@ -33,6 +33,8 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
         "corners, lanes and rates of this place, JSON (default: a usual blind junction, and states say so)"
     )
     add("--context", type=Path, metavar="FILE", help=place)
+    street = "edges and pace of this place as learn-street wrote them, in place of --context"
+    add("--street", type=Path, metavar="JSON", help=street)
 
 
 def listen_settings(arguments: argparse.Namespace) -> "ListenSettings":
@@ -53,7 +55,14 @@ def listen_settings(arguments: argparse.Namespace) -> "ListenSettings":
 
 
 def given_context(arguments: argparse.Namespace) -> "Context | None":
-    """Return the place that --context names, None without it."""
+    """Return the place that --context or --street names, None without them."""
     from worldstate.adapters.files.context_file import read_context
+    from worldstate.ground.errors import InvalidArgumentError
+    from worldstate.operations.labelling.street_file import read_street
+    from worldstate.smoothing.street_context import context_of
 
-    return None if arguments.context is None else read_context(arguments.context)
+    if arguments.street is None:
+        return None if arguments.context is None else read_context(arguments.context)
+    if arguments.context is not None:
+        raise InvalidArgumentError("--street: expected it without --context, both say what stands there")
+    return context_of(read_street(arguments.street))

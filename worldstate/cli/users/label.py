@@ -13,8 +13,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.camera_options import add_camera_options, boxes_of
+from worldstate.cli.common.array_options import add_array_options
+from worldstate.cli.common.camera_options import add_camera_options, camera_source
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
@@ -51,19 +51,15 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate.ground.errors import InputFileError
     from worldstate.operations.labelling.box_tracks import box_tracks
     from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
     from worldstate.operations.labelling.pass_figure import write_pass_figure
     from worldstate.operations.labelling.pass_labels import label_passes
 
     check_outputs(arguments, "out", "windows", figures=("figure",))
-    source = _source(arguments)
-    if source.detections is None:
-        problem = "expected boxes of a camera beside it, or --detections with what a detector reported"
-        raise InputFileError(source.audio_path, problem)
+    source, detections = camera_source(arguments, sound_of(arguments))
     file = None if arguments.windows is None else file_below(source.audio_path, arguments.windows)
-    tracks = box_tracks(source.detections, source.camera, source.settings.boxes)
+    tracks = box_tracks(detections, source.camera, source.settings.boxes)
     with progress_bar("smoothing", len(tracks)) as bar:
         passes = label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
     write_open_label(arguments.out, source.audio_path.name, passes)
@@ -78,20 +74,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         summary |= {"windows": str(arguments.windows), "n_windows": len(rows)}
     lines = [f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}" for one in passes]
     return CommandResult(summary, lines=lines)
-
-
-def _source(arguments: argparse.Namespace) -> "Source":
-    from worldstate.adapters.listen import ListenSettings, open_source
-
-    # Only its sound, boxes and camera are used: no model has to fit the array.
-    settings = ListenSettings(boxes=boxes_of(arguments), uncalibrated=True)
-    return open_source(
-        sound_of(arguments),
-        array=given_array(arguments),
-        detections=arguments.detections,
-        camera=arguments.camera,
-        settings=settings,
-    )
 
 
 def _windows(

@@ -26,6 +26,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
+from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 
 HOPS, VEHICLES, ROWS = "hops", "vehicles", "rows"
@@ -88,6 +89,18 @@ def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
         blocks = audio.blocks(round(audio.sample_rate_hz))
         (hops,) = _heard_hops(blocks, [array], audio.sample_rate_hz, sound.name, about)
     return HeardStream(hops, _vehicles(()), _rows((), {}))
+
+
+def unheard_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream:
+    """Return who comes in a stream of which no sound is rendered: its hops hold times only."""
+    stream = draw_stream(settings, array)
+    hops = HopTable(
+        {"time_s": np.arange(HOP_S, settings.duration_s, HOP_S)},
+        name=settings.name,
+        about={"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
+    )
+    silence = {one.number: np.zeros(len(one.time_s)) for one in stream.vehicles}
+    return HeardStream(hops, _vehicles(stream.vehicles), _rows(stream.vehicles, silence))
 
 
 def _recorded(

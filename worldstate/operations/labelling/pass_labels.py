@@ -45,6 +45,7 @@ class PassLabel:
     label: str
     t0: FirstSight
     track: SmoothedTrack  # From some seconds before T0 until it was last seen
+    edge_rad: float = math.nan  # Azimuth of its corner by its own first box; NaN where the image cuts that
 
 
 def label_passes(
@@ -105,7 +106,9 @@ def _smoothed(
     for at in times:
         smoother.update(nanoseconds(at * HOP_S), {name: observations[at]})
     t0 = smoother.first_sight(name, "edge")
-    return None if t0 is None else PassLabel(one.arm or "", one.label, t0, smoother.track(name))
+    if t0 is None:
+        return None
+    return PassLabel(one.arm or "", one.label, t0, smoother.track(name), one.edge_rad)
 
 
 def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observation]]:

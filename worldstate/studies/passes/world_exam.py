@@ -16,6 +16,7 @@ from worldstate.measurement.measurement import Measurement
 from worldstate.operations.commissioning.commission import parts_of, stream_evidence
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_labels import stream_truth
+from worldstate.operations.labelling.street_passes import WatchedRecording, watched_recording
 from worldstate.state.context import Context, corner_at
 
 from .followed_stream import followed
@@ -65,6 +66,13 @@ def stream_measurements(
             detections = without_passes(detections, heard)
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
     return heard, measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
+
+
+def watched_stream(path: Path, seed: int) -> WatchedRecording:
+    """Return the passes of a stream before a camera; `seed` draws its misses."""
+    heard, camera = HeardStream.load(path), PinholeCamera()
+    detections = stream_detections(heard, np.random.default_rng(seed), camera)
+    return watched_recording(detections, camera, EVERYBODY, float(heard.hops.time_s[-1]))
 
 
 def known_context(name: str) -> Context:

@@ -1,0 +1,95 @@
+"""`worldstate learn-street`: boxes of a camera in, a street that `run` takes out."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
+
+from worldstate.adapters.camera.detections import DetectionFilter
+from worldstate.cli.main import main
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.labelling.street_file import read_street, write_street
+from worldstate.operations.labelling.street_passes import looks_at, streets_after, watched_recording
+from worldstate.smoothing.learned_street import LearnedStreet
+
+SPEED = 6.0
+
+
+@pytest.fixture(scope="module")
+def recording():
+    starts = [(1.0, 1), (9.0, -1), (17.0, 1)]
+    log = passing(starts, SPEED, np.random.default_rng(0))
+    return watched_recording(log, CAMERA, DetectionFilter(), 30.0)
+
+
+@pytest.fixture(scope="module")
+def street(recording):
+    return list(streets_after(LearnedStreet("Elm Street"), recording))
+
+
+def test_every_pass_is_a_lesson_and_all_time_is_exposure(street):
+    assert [sum(arm.arrivals for arm in one.arms) for one in street] == [1.0, 2.0, 3.0, 3.0]
+    assert [arm.exposure_s for arm in street[-1].arms] == pytest.approx([30.0, 30.0])
+
+
+def test_edges_and_paces_are_those_of_the_street(street):
+    left, right = street[-1].arms
+    assert abs(left.edge.mean_rad - EDGE_RAD) < math.radians(1.5)
+    assert abs(right.edge.mean_rad - EDGE_RAD) < math.radians(1.5)
+    seen = math.exp(left.log_pace.total / left.log_pace.weight)
+    assert seen == pytest.approx(SPEED / LANE_M, rel=0.15)
+
+
+def test_images_without_a_box_between_boxes_are_misses(recording):
+    found, missed = looks_at(recording.tracks[0], recording.image_s)
+    assert len(found) + len(missed) >= 10
+    # One in ten is left out by the camera.
+    assert 0 < len(missed) < 0.4 * len(found)
+
+
+def test_a_street_reads_back_as_it_was_written(street, tmp_path):
+    write_street(tmp_path / "street.json", street[-1])
+    assert read_street(tmp_path / "street.json") == street[-1]
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", '{"schema": {"name": "worldstate.WorldState", "version": "1.0.0"}}', "["]
+)
+def test_what_is_no_street_is_refused_by_name(text, tmp_path):
+    (tmp_path / "street.json").write_text(text)
+    with pytest.raises(InputFileError, match=r"street\.json"):
+        read_street(tmp_path / "street.json")
+
+
+def test_a_street_with_other_bins_is_refused(street, tmp_path):
+    write_street(tmp_path / "street.json", street[-1])
+    told = json.loads((tmp_path / "street.json").read_text()) | {"looks": [1.0]}
+    (tmp_path / "street.json").write_text(json.dumps(told))
+    with pytest.raises(InputFileError, match="18 bins"):
+        read_street(tmp_path / "street.json")
+
+
+def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys):
+    out, figure = tmp_path / "street.json", tmp_path / "street.png"
+    told = ["learn-street", str(approach.folder), "--out", str(out)]
+    assert main([*told, "--site", "here", "--figure", str(figure), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["n_passes"] == sum(arm["arrivals"] for arm in found["arms"].values())
+    assert figure.stat().st_size > 0
+    first = read_street(out)
+    assert main([*told, "--known", str(out), "--days", "1"]) == 0
+    again = read_street(out)
+    assert again.site == "here"
+    # A day takes a thirtieth of the weight.
+    assert again.arms[0].exposure_s == pytest.approx(first.arms[0].exposure_s * (1.0 + math.exp(-1 / 30)))
+    states = tmp_path / "states.jsonl"
+    assert main(["run", str(approach.folder), "--street", str(out), "--out", str(states)]) == 0
+    context = json.loads(states.read_text().splitlines()[-1])["context"]
+    assert context["site"] == "here"
+
+
+def test_a_place_is_said_once(approach, capsys):
+    assert main(["run", str(approach.folder), "--street", "a.json", "--context", "b.json"]) == 2
+    assert "--street" in capsys.readouterr().err

@@ -1,0 +1,86 @@
+"""What the passes of a recording tell of its street."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.ground.typing import FloatArray
+from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
+
+from .box_tracks import BoxTrack, box_tracks
+from .pass_labels import HOP_S, PassLabel, label_passes
+
+# Nearer to the axis nobody comes out of an arm: who turns there has overtaken, or was two vehicles.
+_LEAST_EDGE_RAD = math.radians(5.0)
+# Slower ones turn off or park behind the corner, faster ones were two vehicles.
+_SLOWEST_HZ, _FASTEST_HZ = 0.05, 3.0
+
+
+def street_pass(one: PassLabel) -> StreetPass:
+    """Return what a labelled pass tells of its arm: the edge, and the pace of who came past it."""
+    x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
+    pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
+    return StreetPass(
+        "left" if one.arm == "left" else "right",
+        seen_edge(one.arm, one.edge_rad),
+        pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
+    )
+
+
+def seen_edge(arm: str, edge_rad: float) -> float | None:
+    """Return the azimuth of the edge that a first box shows, None where it shows none of this arm."""
+    outwards_rad = edge_rad if arm == "left" else -edge_rad
+    return edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WatchedRecording:
+    """What a camera saw of a street in one recording."""
+
+    tracks: Sequence[BoxTrack]
+    passes: Sequence[PassLabel]
+    duration_s: float
+    image_s: float  # Between images
+
+
+def watched_recording(
+    log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter, duration_s: float
+) -> WatchedRecording:
+    """Return the passes of a recording, smoothed, with the boxes that they were made of."""
+    tracks = box_tracks(log, camera, keep)
+    passes = label_passes(tracks, camera.position_m[0])
+    image_s = float(np.median(np.diff(log.stamps_ns))) * 1e-9 if len(log.stamps_ns) > 1 else HOP_S
+    return WatchedRecording(tracks, passes, duration_s, image_s)
+
+
+def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterator[LearnedStreet]:
+    """Yield a street after every pass of a recording, and once more with all that the recording tells."""
+    before_s = 0.0
+    for one in sorted(recording.passes, key=lambda one: one.t0.time_s):
+        now_s = min(max(one.t0.time_s, before_s), recording.duration_s)
+        street = with_pass(watched(street, now_s - before_s), street_pass(one))
+        before_s = now_s
+        yield street
+    for track in recording.tracks:
+        street = with_looks(street, *looks_at(track, recording.image_s))
+    yield watched(street, recording.duration_s - before_s)
+
+
+def looks_at(track: BoxTrack, image_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the azimuths at which a vehicle was found, and those where images between had no box of it.
+
+    Before the first box and after the last one nobody knows whether it was in view.
+    """
+    middle = 0.5 * (track.left_rad + track.right_rad)
+    whole = np.isfinite(middle)
+    time_s, middle = track.time_s[whole], middle[whole]
+    if time_s.size < 2:
+        return middle, np.zeros(0)
+    images = np.round((time_s - time_s[0]) / image_s)
+    every = np.arange(images[-1] + 1.0)
+    missing = every[~np.isin(every, images)]
+    return middle, np.interp(missing, images, middle)
