@@ -22,7 +22,7 @@ from worldstate.operations.commissioning.stream_labels import stream_truth
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.passes.followed_stream import followed
 from worldstate.studies.passes.pass_outcomes import PassedStream, pass_figures
-from worldstate.studies.passes.stream_camera import stream_detections
+from worldstate.studies.passes.stream_camera import stream_detections, with_mover
 from worldstate.studies.passes.world_exam import EVERYBODY
 
 Vehicle = tuple[str, str, float]  # flow, arm, T0; "from_ahead" comes along the ego's own street
@@ -111,6 +111,16 @@ def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:
     middles = [np.mean(frame.boxes_px[0, [0, 2]]) for frame in log.frames if len(frame)]
     # It crosses from the left to the right of the image.
     assert middles[0] < 600 and middles[-1] > 1300
+
+
+def test_one_more_car_crosses_the_view_in_the_five_seconds_before_a_vehicle_comes() -> None:
+    made_up = stream([("left", "left", 12.0)])
+    before = stream_detections(made_up, np.random.default_rng(1))
+    after = with_mover(before, made_up)
+    more = [len(b) - len(a) for a, b in zip(before.frames, after.frames, strict=True)]
+    assert np.flatnonzero(more).tolist() == list(range(70, 120)) and max(more) == 1
+    left, right = after.frames[72].boxes_px[0], after.frames[117].boxes_px[0]
+    assert left[2] < 968 < right[0]
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.2))

@@ -26,8 +26,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("streams", type=Path, nargs="+", metavar="NPZ", help="streams that were listened to")
     add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
-    cameras = "boxes of everybody, of cars above 100 pixels, none, or of everybody but dead from every T0 on"
-    add("--camera", choices=("all", "cars", "none", "dies"), default="all", help=cameras)
+    cameras = "boxes of everybody, of cars above 100 pixels, none; dead from every T0 on; one more car before"
+    add("--camera", choices=("all", "cars", "none", "dies", "mover"), default="all", help=cameras)
     place = "give the filter the corners and lanes of the junction (default: those of a usual one)"
     add("--known-place", action="store_true", help=place)
     add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")

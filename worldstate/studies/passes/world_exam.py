@@ -22,9 +22,9 @@ from worldstate.state.context import Context, corner_at
 from .followed_stream import followed
 from .measured_stream import measurements
 from .pass_outcomes import PassedStream
-from .stream_camera import stream_detections, without_passes
+from .stream_camera import stream_detections, with_mover, without_passes
 
-CameraKind = Literal["all", "cars", "none", "dies"]
+CameraKind = Literal["all", "cars", "none", "dies", "mover"]
 # Everything that drives, however small its box; of OVAD's boxes its authors keep cars above 100 px.
 EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcycle", "bicycle"}), 0.5, 20.0)
 
@@ -64,6 +64,8 @@ def stream_measurements(
         detections = stream_detections(heard, np.random.default_rng(seed))
         if camera == "dies":
             detections = without_passes(detections, heard)
+        if camera == "mover":
+            detections = with_mover(detections, heard)
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
     return heard, measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
 
