@@ -15,10 +15,10 @@ from worldstate.ground.values import NotUsable
 LEVEL_BAND_HZ = (50.0, 2700.0)
 
 
-def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable | None:
+def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:
     """Return the sequence model of a file where it was made for what is heard, else why it is not used."""
     if model.sequence is None:
-        return None
+        return NotUsable("the model states no times: `worldstate commission` makes one that does")
     if uncalibrated:
         return NotUsable("uncalibrated: times are stated of the array that the model was made for")
     if not model.provenance.fit_for_use:

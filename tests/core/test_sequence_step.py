@@ -301,6 +301,28 @@ def test_who_came_into_view_unseen_is_there_as_long_as_it_sounds() -> None:
     assert again.update(heard(42, said[41])).state == dead[41].state
 
 
+def test_one_who_may_have_come_from_either_side_is_one_and_two_are_two() -> None:
+    """Half a chance on either side is one vehicle in view, near certainty on both is two."""
+
+    def in_view(chances: tuple[float, float]) -> list[float]:
+        said = []
+        for hop, one in enumerate(approach()):
+            groups = one.groups.copy()
+            for side, chance in enumerate(chances):
+                coming = approach()[hop].groups[0]
+                away = approach()[hop].groups[1] if hop < 30 else coming
+                groups[side] = chance * coming + (1.0 - chance) * away
+            said.append(replace(one, groups=groups))
+        world = run(WorldFilter(), [heard(hop + 1, one) for hop, one in enumerate(said)])[34]
+        sides = world.memory.sequence.hidden
+        return sorted(sides.emerged)
+
+    low, high = in_view((0.62, 0.55))
+    assert high > 0.75 and low < 0.4
+    low, high = in_view((0.97, 0.96))
+    assert high > 0.75 and low > 0.75
+
+
 @settings(max_examples=20)
 @given(SEEDS, st.floats(0.001, 0.1), st.floats(0.0, 2000.0), st.integers(0, 50))
 def test_arrivals_are_learned_as_a_gamma_posterior_and_move_the_prior_by_half_a_nat_at_most(

@@ -146,7 +146,9 @@ class SequenceMemory:
         groups, unseen = self.posterior.groups[0], _as_few(np.array(self.unseen))
         coming = np.minimum(self.coming.sum(axis=1), 1.0)
         there = groups[:, _SEEN] + groups[::-1, _PAST]
-        emerged = np.minimum(there * unseen / (unseen.sum() + _OTHERS), 1.0 - coming)
+        # P(this one | somebody is there), each of them with a chance of its own.
+        somebody = 1.0 - (1.0 - unseen).prod() * (1.0 - _OTHERS)
+        emerged = np.minimum(there * unseen / somebody, 1.0 - coming)
         return HiddenBelief(tuple(coming.tolist()), tuple(emerged.tolist()))
 
     def alarm_ends_ns(self, stamp_ns: int) -> tuple[int | None, ...]:

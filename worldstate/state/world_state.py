@@ -82,7 +82,7 @@ class WorldState:
         Whether the model was made for what was heard last. Of a foreign sound it gives the reason, and the
         evidence of that hop counts little; a warning signal comes from a vehicle.
     no_sequence : NotUsable or None
-        Why the cues state no times although the model could.
+        Why the cues state no times.
     delivery : Delivery
         Measurements that came late, twice, or too late.
     valid_until_ns : int or None

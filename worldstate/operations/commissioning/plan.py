@@ -70,7 +70,8 @@ class CommissionSettings:
 
     def __post_init__(self) -> None:
         in_range("junctions", self.junctions, 2, 200)
-        in_range("approach_minutes", self.approach_minutes, 0.5, 120.0)
+        # Of less there are streams in which nobody comes, and nothing is learned.
+        in_range("approach_minutes", self.approach_minutes, 0.8, 120.0)
         in_range("hazard_free_minutes", self.hazard_free_minutes, 0.5, 120.0)
         in_range("exam_minutes", self.exam_minutes, 0.5, 160.0)
         in_range("onsets_per_hour", self.onsets_per_hour, 0.1, 3600.0)
