@@ -12,7 +12,7 @@ from worldstate import listen
 from worldstate.adapters.simulation import VehicleSettings, draw_settings, simulate_recording, write_recording
 from worldstate.operations.figure_style import BLUE, GREEN, RED, YELLOW, figure_file
 
-COLOURS = {"hidden": YELLOW, "visible": GREEN, "coasting": "0.5"}
+COLOURS = {"hidden": YELLOW, "visible": GREEN, "emerged": BLUE}
 
 
 def main(out: Path, size: str = "full") -> None:

@@ -140,3 +140,10 @@ def test_lost_sound_interrupts_the_sequence_and_leaves_nothing_behind(folder: Pa
     assert end is not None
     assert np.isfinite(end.minute).all()
     assert len(end.minute) == len(heard) - len(silent)
+
+
+def test_a_model_that_states_no_times_says_so(folder: Path) -> None:
+    plain = replace(read_model(folder / "model.json"), sequence=None)
+    state = next(listen_steps(open_source(folder / "sound.wav", model=plain))).state
+    assert state.no_sequence is not None and "commission" in state.no_sequence.reason
+    assert {cue.within for cue in state.cues} == {None}
