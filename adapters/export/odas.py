@@ -23,10 +23,14 @@ class OdasTracks:
     """
 
     def __init__(self) -> None:
+        # Of who is there now: a long run has more entities than memory should hold.
         self._numbers: dict[str, int] = {}
+        self._count = 0
 
     def line(self, state: WorldState) -> str:
         """Return one line: the likeliest moving entities as directions, existence as activity."""
+        there = {one.id for one in state.entities}
+        self._numbers = {name: number for name, number in self._numbers.items() if name in there}
         moving = [one for one in state.entities if one.moving]
         likeliest = sorted(moving, key=lambda one: -one.existence_probability)[:_TRACKS]
         tracks = [self._track(one) for one in likeliest]
@@ -34,7 +38,10 @@ class OdasTracks:
         return json.dumps({"timeStamp": state.seq, "src": tracks + [empty] * (_TRACKS - len(tracks))})
 
     def _track(self, entity: Entity) -> dict[str, object]:
-        number = self._numbers.setdefault(entity.id, len(self._numbers) + 1)
+        if entity.id not in self._numbers:
+            self._count += 1
+            self._numbers[entity.id] = self._count
+        number = self._numbers[entity.id]
         x, y = math.cos(entity.azimuth_rad), math.sin(entity.azimuth_rad)
         activity = round(entity.existence_probability, 3)
         return {

@@ -16,6 +16,7 @@ from scripted_states import scripted_states
 
 from worldstate.adapters.export.autoware import autoware_objects
 from worldstate.adapters.export.lane_objects import lane_objects
+from worldstate.adapters.export.odas import OdasTracks
 from worldstate.cli.main import main
 
 STATES = scripted_states()
@@ -168,6 +169,16 @@ def test_odas_studio_gets_tracks_that_keep_their_numbers(log):
         assert math.hypot(one["src"][0]["x"], one["src"][0]["y"]) == pytest.approx(1.0, abs=1e-3)
         assert [track["id"] > 0 for track in one["src"]] == [k < len(state.entities) for k in range(4)]
     assert tracks[0]["src"][0]["id"] == tracks[-1]["src"][0]["id"]
+
+
+def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgotten():
+    tracks, numbers = OdasTracks(), []
+    with_entity = next(state for state in STATES if state.entities)
+    for hop in range(200):
+        one = replace(with_entity.entities[0], id=f"entity-{hop}", moving=True)
+        line = json.loads(tracks.line(replace(with_entity, entities=(one,))))
+        numbers.append(line["src"][0]["id"])
+    assert numbers == list(range(1, 201)) and len(tracks._numbers) == 1
 
 
 def test_what_is_missing_is_named(log, tmp_path, monkeypatch, capsys):
