@@ -190,7 +190,7 @@ class PinholeCamera:
         """
         left_px, _, right_px, _ = finite_array("box_px", box_px, (4,))
         if right_px < 0.0 or left_px > self.width_px:
-            got = f"columns {left_px:g} to {right_px:g}"
+            got = f"columns {left_px:g} to {right_px:g}: boxes of an image of another size or camera"
             raise InvalidArgumentError(f"box_px: expected columns 0 to {self.width_px}, got {got}")
         edges_px = np.clip([left_px, right_px], 0.0, self.width_px)
         left, right = self.azimuth(edges_px)
