@@ -11,7 +11,6 @@ from worldstate.frontend.approach.looming import Looming, fitted_looming
 from worldstate.frontend.approach.tone_stage import ToneStage
 from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.direction.bearing import bearing_of
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
 from worldstate.frontend.direction.noise_floor import noise_prominence
@@ -22,6 +21,7 @@ from worldstate.frontend.spectra.bands import SILENCE
 from worldstate.frontend.spectra.bins import bin_frequencies_hz
 from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
 from worldstate.frontend.spectra.sound_character import SoundCharacter
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode
-from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_road
+from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_side
 
 from .json_file import read_json, refused_as_file
 
@@ -24,7 +24,7 @@ class _Arm:
 
     def occluder(self, side: int) -> Occluder:
         if self.open:
-            return open_road(self.direction, side)
+            return open_side(self.direction, side)
         if self.corner_m is None or self.crossing_m is None:
             wanted = 'corner_m and crossing_m, or "open": true'
             raise InvalidArgumentError(f"context.arms: expected {wanted} for {self.direction}")

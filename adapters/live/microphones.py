@@ -14,7 +14,7 @@ from .portaudio import portaudio
 _LOST_SHARE = 0.5
 
 
-class Microphones:
+class PortAudioInput:
     """The first channels of an input device, one a microphone.
 
     Parameters

@@ -28,7 +28,7 @@ _BLOCKS_PER_SECOND = 10
 _Event = tuple[int, str, str, dict[str, Any]]
 
 
-def write_recording(
+def write_bag(
     path: Path,
     sound: SoundInput,
     array: MicrophoneArray,

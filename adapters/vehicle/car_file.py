@@ -21,7 +21,7 @@ MOST_CAMERAS = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Car:
+class CarSensors:
     """A vehicle as its file describes it, in the axes of `base_link` with the origin at the array.
 
     Sound has no range, so that azimuths are those at the array. What the file places about another origin,
@@ -53,7 +53,7 @@ class Car:
         return self.cameras[name]
 
 
-def read_car(path: str | Path) -> Car:
+def read_car(path: str | Path) -> CarSensors:
     """Read a vehicle from JSON.
 
     ``{"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5}, "cameras": [{"name":
@@ -69,7 +69,7 @@ def read_car(path: str | Path) -> Car:
 
     Returns
     -------
-    Car
+    CarSensors
         As the file says.
 
     Raises
@@ -152,7 +152,7 @@ class _CarFile:
     cameras: tuple[CameraRecord, ...] = field(default=(), metadata=ADDED)
     name: str | None = None
 
-    def car(self, path: Path) -> Car:
+    def car(self, path: Path) -> CarSensors:
         """Return the car, its origin moved to the array."""
         if len(self.cameras) > MOST_CAMERAS:
             got = len(self.cameras)
@@ -164,7 +164,7 @@ class _CarFile:
                 raise InvalidArgumentError(f"{where}.name: expected one of its own, got {record.name!r}")
             with _placed_at(where):
                 cameras[record.name] = _relative(record, self.array.position_m)
-        return Car(array, cameras)
+        return CarSensors(array, cameras)
 
 
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:

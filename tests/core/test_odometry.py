@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.files.odometry_file import read_odometry
-from worldstate.belief.ego_motion import EgoMotion, driven
+from worldstate.belief.ego_motion import EgoBelief, driven
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.measurement import Position, PositionScan
 from worldstate.measurement.odometry import EgoPose, Odometry
-from worldstate.state.context import corner_at, open_road
+from worldstate.state.context import corner_at, open_side
 
 CORNERS = Context(occluders=(corner_at("left", (8.0, 3.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
-OPEN = Context(occluders=(open_road("left", 1), open_road("right", -1)))
+OPEN = Context(occluders=(open_side("left", 1), open_side("right", -1)))
 _TWISTS = st.lists(st.tuples(st.floats(-5.0, 15.0), st.floats(-1.0, 1.0)), min_size=1, max_size=8)
 
 
@@ -52,13 +52,13 @@ def test_what_stands_is_where_the_pose_says(twists: list[tuple[float, float]]) -
 
 def test_the_pose_is_as_uncertain_as_noisy_odometry_leaves_it() -> None:
     rng = np.random.default_rng(1)
-    ego = EgoMotion(np.zeros(3), np.zeros((3, 3)), 6.0, 0.3, 0.2, 0.02)
+    ego = EgoBelief(np.zeros(3), np.zeros((3, 3)), 6.0, 0.3, 0.2, 0.02)
     ends = []
     for _ in range(2000):
-        one = EgoMotion(np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0)
+        one = EgoBelief(np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0)
         for _ in range(20):
             twist = 6.0 + 0.2 * rng.standard_normal(), 0.3 + 0.02 * rng.standard_normal()
-            one = driven(EgoMotion(one.pose, one.covariance, *twist, 0.0, 0.0), 0.1)
+            one = driven(EgoBelief(one.pose, one.covariance, *twist, 0.0, 0.0), 0.1)
         ends.append(one.pose)
     for _ in range(20):
         ego = driven(ego, 0.1)

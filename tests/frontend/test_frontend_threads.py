@@ -4,8 +4,8 @@ import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.blas_threads import one_blas_thread
 
 
 def blas_threads() -> set[int]:

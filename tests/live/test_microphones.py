@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from worldstate.adapters.live.live_sound import LiveSound
-from worldstate.adapters.live.microphones import Microphones
+from worldstate.adapters.live.microphones import PortAudioInput
 from worldstate.adapters.live.portaudio import MissingPortAudioError, portaudio
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError, MissingExtraError
@@ -74,7 +74,7 @@ def heard(module, feed, calls):
 
 
 def test_blocks_are_copied_in_order(stand_in):
-    feed = Microphones(4, RATE, "roof")
+    feed = PortAudioInput(4, RATE, "roof")
     _, samples = heard(stand_in, feed, [(0.1, 5.0), (0.2, 5.025)])
     assert samples[[0, LENGTH]].tolist() == [[pytest.approx(0.1)] * 4, [pytest.approx(0.2)] * 4]
     assert (feed.name, stand_in.stream.channels, stand_in.stream.blocksize) == ("roof array", 4, LENGTH)
@@ -82,7 +82,7 @@ def test_blocks_are_copied_in_order(stand_in):
 
 def test_an_overflow_of_the_device_is_counted_and_its_length_filled(stand_in):
     sound, samples = heard(
-        stand_in, Microphones(4, RATE), [(0.1, 5.0), (0.2, 5.025), (0.3, 5.125, "lost 75 ms")]
+        stand_in, PortAudioInput(4, RATE), [(0.1, 5.0), (0.2, 5.025), (0.3, 5.125, "lost 75 ms")]
     )
     assert sound.overruns == 1
     assert sound.lost_samples == 600
@@ -90,12 +90,12 @@ def test_an_overflow_of_the_device_is_counted_and_its_length_filled(stand_in):
 
 
 def test_an_overflow_without_capture_times_is_counted(stand_in):
-    sound, samples = heard(stand_in, Microphones(4, RATE), [(0.1, 0.0), (0.2, 0.0, "lost")])
+    sound, samples = heard(stand_in, PortAudioInput(4, RATE), [(0.1, 0.0), (0.2, 0.0, "lost")])
     assert (sound.overruns, sound.lost_samples, len(samples)) == (1, 0, 2 * LENGTH)
 
 
 def test_the_age_of_a_block_is_that_of_its_last_sample(stand_in):
-    sound, _ = heard(stand_in, Microphones(4, RATE), [(0.1, 5.0)])
+    sound, _ = heard(stand_in, PortAudioInput(4, RATE), [(0.1, 5.0)])
     # The stand-in calls 10 ms after the block's end.
     assert 0.01 <= sound.age_s(LENGTH) < 0.5
     assert sound.age_s(0) - sound.age_s(LENGTH) == pytest.approx(LENGTH / RATE, abs=5e-3)
@@ -108,14 +108,14 @@ def test_the_age_of_a_block_is_that_of_its_last_sample(stand_in):
 )
 def test_a_device_that_does_not_fit_is_refused_with_those_that_there_are(stand_in, channels, device, said):
     with pytest.raises(InvalidArgumentError, match=said) as refused:
-        Microphones(channels, RATE, device)
+        PortAudioInput(channels, RATE, device)
     assert "3 roof array (4)" in str(refused.value)
 
 
 def test_no_microphones_at_all(stand_in, monkeypatch):
     monkeypatch.setattr(stand_in, "query_devices", lambda *_: [])
     with pytest.raises(InvalidArgumentError, match="PortAudio finds none"):
-        Microphones(4, RATE)
+        PortAudioInput(4, RATE)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_pa
     array = tmp_path / "mics.csv"
     array.write_text("0,0.1,0\n0,0.02,0.05\n0,-0.04,0\n0,-0.1,0.03\n")
     rng = np.random.default_rng(5)
-    original = Microphones.start
+    original = PortAudioInput.start
 
     def start(feed, into):
         original(feed, into)
@@ -152,7 +152,7 @@ def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_pa
             times = SimpleNamespace(inputBufferAdcTime=1.0 + number / 40, currentTime=1.0 + (number + 1) / 40)
             stand_in.stream.callback(block, LENGTH, times, SimpleNamespace(input_overflow=False))
 
-    monkeypatch.setattr(Microphones, "start", start)
+    monkeypatch.setattr(PortAudioInput, "start", start)
     command = ["live", "--array", str(array), "--rate", str(RATE), "--uncalibrated", "--duration", "1.2"]
     assert main([*command, "--json"]) == 0
     assert '"states": 3' in capsys.readouterr().out

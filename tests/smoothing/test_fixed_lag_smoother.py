@@ -11,8 +11,8 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Approach, Bearing, Position
 from worldstate.smoothing import (
     AngularHeight,
+    EgoStep,
     FixedLagSmoother,
-    Odometry,
     PastEdge,
     Range,
     ReflectedBearing,
@@ -180,7 +180,7 @@ def test_a_moving_ego_sees_a_standing_vehicle_stand():
         x, y = np.array([30.0, 6.0]) - ego
         azimuth = math.atan2(y, x) - heading + rng.normal(0.0, 0.01)
         rate = 4.0 * math.cos(azimuth) / math.hypot(x, y) + rng.normal(0.0, 0.05)
-        odometry = Odometry(0.4, 0.002, 0.01) if hop else None
+        odometry = EgoStep(0.4, 0.002, 0.01) if hop else None
         smoother.update(hop * HOP_NS, {"parked": [Bearing(azimuth, 0.01), Approach(rate, 0.05)]}, odometry)
     track = smoother.track("parked")
     off = track.states[-1] - [30.0, 6.0, 0.0, 0.0]
@@ -196,7 +196,7 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(InvalidArgumentError, match="expected one of"):
         smoother.update(2 * HOP_NS, {"car": [PastEdge("nowhere", seen=True)]})
     with pytest.raises(InvalidArgumentError, match="late"):
-        smoother.update(0, {}, Odometry(1.0, 0.0, 0.0))
+        smoother.update(0, {}, EgoStep(1.0, 0.0, 0.0))
     with pytest.raises(InvalidArgumentError, match="'nobody'"):
         smoother.track("nobody")
 

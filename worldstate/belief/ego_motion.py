@@ -23,7 +23,7 @@ _SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(3, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EgoMotion:
+class EgoBelief:
     """Gaussian over the pose (x, y, yaw) in the map frame, and the twist that holds.
 
     Shapes: pose (3,), covariance (3, 3).
@@ -37,12 +37,12 @@ class EgoMotion:
     yaw_rate_std_rad_s: float
 
 
-def driven(ego: EgoMotion, step_s: float) -> EgoMotion:
+def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
     """Return the ego vehicle some seconds later.
 
     Examples
     --------
-    >>> quarter = EgoMotion(np.zeros(3), np.zeros((3, 3)), math.pi, math.pi / 2.0, 0.0, 0.0)
+    >>> quarter = EgoBelief(np.zeros(3), np.zeros((3, 3)), math.pi, math.pi / 2.0, 0.0, 0.0)
     >>> driven(quarter, 1.0).pose.round(3)
     array([2.   , 2.   , 1.571])
     """
@@ -59,7 +59,7 @@ def driven(ego: EgoMotion, step_s: float) -> EgoMotion:
     return replace(ego, pose=pose, covariance=flow @ ego.covariance @ flow.T + noise)
 
 
-def corrected(ego: EgoMotion | None, told: Odometry) -> EgoMotion:
+def corrected(ego: EgoBelief | None, told: Odometry) -> EgoBelief:
     """Return the ego vehicle as odometry has it: its twist, and its pose where that was told."""
     pose, covariance = (np.zeros(3), np.zeros((3, 3))) if ego is None else (ego.pose, ego.covariance)
     if told.pose is not None:
@@ -67,4 +67,4 @@ def corrected(ego: EgoMotion | None, told: Odometry) -> EgoMotion:
         pose = np.array([*at.position_m, at.yaw_rad])
         covariance = np.diag([at.position_std_m**2] * 2 + [at.yaw_std_rad**2])
     twist = told.speed_mps, told.yaw_rate_rad_s, told.speed_std_mps, told.yaw_rate_std_rad_s
-    return EgoMotion(pose, covariance, *twist)
+    return EgoBelief(pose, covariance, *twist)

@@ -10,7 +10,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag, SourceEvidence
-from worldstate.belief.ego_motion import EgoMotion
+from worldstate.belief.ego_motion import EgoBelief
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
@@ -68,7 +68,7 @@ class _Memory:
     advised_ns: tuple[Annotated[int | None, Keys("stamp_ns")], ...] = field(default=(), metadata=ADDED)
     events: tuple[Event, ...] = field(default=(), metadata=ADDED)
     relations: tuple[Relation, ...] = field(default=(), metadata=ADDED)
-    ego: EgoMotion | None = field(default=None, metadata=ADDED)
+    ego: EgoBelief | None = field(default=None, metadata=ADDED)
 
 
 @dataclass(frozen=True, slots=True)

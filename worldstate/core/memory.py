@@ -8,7 +8,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
-from worldstate.belief.ego_motion import EgoMotion
+from worldstate.belief.ego_motion import EgoBelief
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.track import Track
@@ -70,7 +70,7 @@ class Memory:
     no_sequence: NotUsable | None = None  # Why the last one that should have said so could not
     advised_ns: tuple[int | None, ...] = ()  # Since when an advisory has been out on each side
     events: tuple[Event, ...] = ()  # Of the last measurement
-    ego: EgoMotion | None = None  # By odometry; None without
+    ego: EgoBelief | None = None  # By odometry; None without
     relations: tuple[Relation, ...] = ()  # Then, with the intervals in which they have held
 
     @property

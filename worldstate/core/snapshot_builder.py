@@ -10,7 +10,7 @@ from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.announced import time_to_visible
-from worldstate.belief.ego_motion import EgoMotion
+from worldstate.belief.ego_motion import EgoBelief
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.kinematics.motion import MotionBelief
@@ -185,7 +185,7 @@ def visible_in(track: Track, site: SiteGeometry) -> tuple[float, float, float] |
     return max(mean_s - NINE_OF_TEN * std_s, 0.0), mean_s, mean_s + NINE_OF_TEN * std_s
 
 
-def ego_of(ego: EgoMotion) -> Ego:
+def ego_of(ego: EgoBelief) -> Ego:
     """Return the ego vehicle as it is published."""
     x, y, yaw = ego.pose.round(_DIGITS).tolist()
     covariance = tuple(map(tuple, ego.covariance.round(_DIGITS).tolist()))

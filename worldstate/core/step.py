@@ -20,7 +20,7 @@ from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
 from worldstate.belief.birth_death import birth_death, merged_tracks
-from worldstate.belief.ego_motion import EgoMotion, corrected, driven
+from worldstate.belief.ego_motion import EgoBelief, corrected, driven
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.position_update import position_update
@@ -66,7 +66,7 @@ class Weights:
 
 
 def site_geometry_of(
-    context: Context, settings: FilterSettings, ego: EgoMotion | None = None
+    context: Context, settings: FilterSettings, ego: EgoBelief | None = None
 ) -> SiteGeometry:
     """Return the site geometry of a context, as the ego vehicle has it."""
     yaw_rad = 0.0 if ego is None else float(ego.pose[2])
@@ -87,7 +87,7 @@ def site_geometry_of(
     return SiteGeometry(tuple(sides), context.view_half_angle_rad, settings, *twist)
 
 
-def from_here(model: FilterModel, ego: EgoMotion | None) -> FilterModel:
+def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
     """Return the model as the ego vehicle has it where it is now; without odometry, as the context says."""
     if ego is None:
         return model

@@ -16,7 +16,7 @@ from worldstate.measurement.measurement import Approach, Bearing
 from worldstate.measurement.position import Position
 
 from .geometry import azimuth, cartesian, closing_rate, in_ego_axes, log_range, reflected_place
-from .observations import AngularHeight, Odometry, PastEdge, Range, ReflectedBearing
+from .observations import AngularHeight, EgoStep, PastEdge, Range, ReflectedBearing
 from .settings import SmoothingSettings
 from .vector_factor import Factor, NoiseModel, vector_factor
 
@@ -234,7 +234,7 @@ def _sight_error(u: float, one: PastEdge) -> tuple[float, float]:
     return error, -slope / (share * error) if error > 1e-6 else 0.0
 
 
-def odometry_factor(before: int, after: int, one: Odometry) -> Factor:
+def odometry_factor(before: int, after: int, one: EgoStep) -> Factor:
     """Return the ego's motion between two updates."""
     import gtsam
 

@@ -20,7 +20,7 @@ from worldstate.measurement.position import Position
 from . import factors as f
 from .geometry import moved, polar
 from .graph import FactorGraph, Refined
-from .observations import AngularHeight, Observation, Odometry, PastEdge, Range, ReflectedBearing
+from .observations import AngularHeight, EgoStep, Observation, PastEdge, Range, ReflectedBearing
 from .settings import SmoothingSettings
 from .smoothed_track import FirstSight, SmoothedTrack
 from .vector_factor import CORNER, EGO, ENTITY, HEIGHT, WALL, Factor, key_of
@@ -179,7 +179,7 @@ class FixedLagSmoother:
         self,
         stamp_ns: int,
         observations: Mapping[str, Sequence[Observation]],
-        odometry: Odometry | None = None,
+        odometry: EgoStep | None = None,
     ) -> None:
         """Take in what was observed at one instant, of any number of entities.
 
@@ -189,7 +189,7 @@ class FixedLagSmoother:
             When it was observed, ns; earlier than the last one where it comes late.
         observations : mapping of str to sequence
             By entity. A new one begins at a bearing or a position.
-        odometry : Odometry, optional
+        odometry : EgoStep, optional
             How the ego has moved since the last update; not with a late one.
 
         Raises
@@ -405,7 +405,7 @@ class FixedLagSmoother:
             self._graph.add(f.prior_factor(key, start, np.array([[said.true_relative_std**2]])))
         return key
 
-    def _move_ego(self, stamp_ns: int, odometry: Odometry) -> None:
+    def _move_ego(self, stamp_ns: int, odometry: EgoStep) -> None:
         here = self._pose_at(self._now_ns)
         if not self._ego:
             first = self._add_pose(self._now_ns, here)

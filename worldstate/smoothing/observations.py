@@ -102,7 +102,7 @@ class PastEdge:
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class EgoStep:
     """How the ego has moved since the last update, in its own axes then.
 
     Parameters
@@ -114,7 +114,7 @@ class Odometry:
 
     Examples
     --------
-    >>> Odometry(0.5, 0.0, 0.0).std
+    >>> EgoStep(0.5, 0.0, 0.0).std
     (0.02, 0.02, 0.002)
     """
 

@@ -239,12 +239,12 @@ def corner_at(
     )
 
 
-def open_road(direction: str, side: int) -> Occluder:
+def open_side(direction: str, side: int) -> Occluder:
     """Return an approach side on which nothing hides anybody: an open road; `side` is 1 left, -1 right.
 
     Examples
     --------
-    >>> open_road("left", 1).hides
+    >>> open_side("left", 1).hides
     False
     """
     return replace(blind_corner(direction, side), id=f"open_{direction}", assumed=False, hides=False)

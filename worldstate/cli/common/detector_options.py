@@ -35,7 +35,7 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
     """
     from worldstate.adapters.camera.motion_detector import MotionDetector, MotionSettings
     from worldstate.adapters.camera.onnx_detector import OnnxSettings
-    from worldstate.adapters.own_parts import load_part
+    from worldstate.adapters.own_parts import DetectorPart, load_part
     from worldstate.ground.errors import InvalidArgumentError
 
     if arguments.detector == "onnx":
@@ -45,7 +45,7 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
         make()  # what is wrong with a model is said before the work begins
         return make
     if arguments.detector not in MOVING:
-        make_own: MakeDetector = load_part("worldstate.detectors", arguments.detector, "--detector", BUILT_IN)
+        make_own: DetectorPart = load_part("worldstate.detectors", arguments.detector, "--detector", BUILT_IN)
         return make_own
     settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
     return partial(MotionDetector, settings)

@@ -43,7 +43,7 @@ class StateLogs:
     """Everything that states are passed on to."""
 
     viewers: "list[LogSink]" = field(default_factory=list)  # These take messages
-    stacks: "list[Callable[[WorldState], None]]" = field(default_factory=list)  # These take states
+    stacks: "list[Callable[[WorldState], object]]" = field(default_factory=list)  # These take states
 
     def message(self, message: "LogMessage") -> None:
         """Pass a message on to every viewer."""
@@ -105,10 +105,10 @@ def _open_stacks(arguments: argparse.Namespace, logs: StateLogs, opened: ExitSta
 
         logs.stacks.append(opened.enter_context(odas_socket(arguments.odas)))
     for text in arguments.export:
-        from worldstate.adapters.own_parts import load_part, part_and_target
+        from worldstate.adapters.own_parts import ExporterPart, load_part, part_and_target
 
         name, target = part_and_target("--export", text)
-        export = load_part("worldstate.exporters", name, "--export")
+        export: ExporterPart = load_part("worldstate.exporters", name, "--export")
         logs.stacks.append(opened.enter_context(export(target)))
 
 

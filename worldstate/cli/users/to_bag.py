@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.datasets.array_choice import choose_array
     from worldstate.adapters.datasets.ovad import Recording
     from worldstate.adapters.ros.bag_writer import check_bag_target
-    from worldstate.adapters.ros.recording_bag import odometry_of, write_recording
+    from worldstate.adapters.ros.recording_bag import odometry_of, write_bag
     from worldstate.cli.common.progress import track
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import nanoseconds
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     recording = Recording.open(arguments.recording)
     array, seen = choose_array(recording.path, given_array(arguments)), recording.read_detections()
     ego = odometry_of(recording)
-    written = write_recording(
+    written = write_bag(
         arguments.out, recording.audio_path, array, seen, ego,
         start_ns=start_ns, storage=arguments.ros_storage,
     )  # fmt: skip

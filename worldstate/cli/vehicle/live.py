@@ -118,7 +118,7 @@ def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source
 
 
 def _microphones(arguments: argparse.Namespace) -> "SoundFeed":
-    from worldstate.adapters.live.microphones import Microphones
+    from worldstate.adapters.live.microphones import PortAudioInput
     from worldstate.ground.checks import in_range
     from worldstate.ground.errors import InvalidArgumentError
 
@@ -129,7 +129,7 @@ def _microphones(arguments: argparse.Namespace) -> "SoundFeed":
     device = arguments.device
     number = int(device) if device is not None and device.isdecimal() else device
     rate_hz = int(in_range("--rate", arguments.rate, 1000, 1_000_000))
-    return Microphones(array.n_microphones, rate_hz, number)
+    return PortAudioInput(array.n_microphones, rate_hz, number)
 
 
 def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":

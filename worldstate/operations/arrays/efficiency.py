@@ -14,11 +14,11 @@ from scipy.special import gammaincinv
 from worldstate.frontend.approach.tone import estimate_tone
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, broadside_rad, delay_crb_s2, tone_crb_hz2
 from worldstate.frontend.direction.gcc import gcc_delays
 from worldstate.frontend.direction.peaks import find_peaks
 from worldstate.frontend.direction.srp import srp_phat
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import ComplexArray, FloatArray
 

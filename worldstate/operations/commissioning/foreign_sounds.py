@@ -17,8 +17,8 @@ from worldstate.adapters.simulation.stream.event_sound import event_sound
 from worldstate.adapters.simulation.stream.microphones import Microphones
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES, SoundCharacter
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray, TextArray
 from worldstate.ground.values import NotUsable
 

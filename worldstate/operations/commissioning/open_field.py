@@ -26,10 +26,10 @@ from worldstate.adapters.simulation.sound.receiver import Receiver, standing_m
 from worldstate.adapters.simulation.sound.static_field import StaticSources
 from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.direction.feature import FEATURE_BAND_HZ, feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import Float32Array, FloatArray
 
 # 180 windows at a weight of .1 took the other side, named with p > .5, from .39 of the windows to .03

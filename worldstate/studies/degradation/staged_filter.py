@@ -12,7 +12,7 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings, moving_boxes
 from worldstate.adapters.listen import Source, measure_steps, unoccluded_sector
 from worldstate.core.filter import WorldFilter
-from worldstate.frontend.blas_threads import one_blas_thread
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings

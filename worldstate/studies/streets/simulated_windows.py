@@ -25,7 +25,6 @@ from worldstate.adapters.simulation.scene.settings import SimulationSettings, dr
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.array.steering import cross_spectra
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.direction.feature import (
     FEATURE_BAND_HZ,
     FEATURE_RATE_HZ,
@@ -37,6 +36,7 @@ from worldstate.frontend.direction.feature import (
 )
 from worldstate.frontend.spectra.bins import band_bins
 from worldstate.frontend.spectra.phat import whiten
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from worldstate.adapters.parallel import in_processes
-from worldstate.frontend.blas_threads import one_blas_thread
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
 from worldstate.ground.version import __version__
 

@@ -21,13 +21,13 @@ from worldstate.adapters.listen import ListenSettings, Source, Step, listen_step
 from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.blas_threads import one_blas_thread
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import AcousticFrame
+from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
