@@ -5,11 +5,22 @@ import json
 import numpy as np
 import pytest
 
-from worldstate import Approach, Bearing, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate import (
+    Approach,
+    Bearing,
+    Context,
+    Measurement,
+    NotUsable,
+    Sighting,
+    SignatureEvidence,
+    WorldFilter,
+)
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement.odometry import EgoPose, Odometry
+from worldstate.state.context import corner_at
 
 SILENT, TINY = NotUsable("not scripted"), 5e-324
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
@@ -89,13 +100,31 @@ def position(rng: np.random.Generator) -> Position:
     return Position(at, tuple(map(tuple, spread)), velocity, exists, (("car", extreme(rng, 0.0, 1.0)),))
 
 
-def something(rng: np.random.Generator, stamp_ns: int) -> Measurement | PositionScan:
-    return scan(rng, stamp_ns) if rng.random() < 0.3 else measurement(rng, stamp_ns)
+def odometry(rng: np.random.Generator, stamp_ns: int) -> Odometry:
+    """Return a drive of the whole accepted range, now and then from somewhere else on the map."""
+    at = (extreme(rng, -1e6, 1e6), extreme(rng, -1e6, 1e6)), extreme(rng, -np.pi, np.pi)
+    stds = max(extreme(rng, 0.0, 1e3), TINY), max(extreme(rng, 0.0, np.pi), TINY)
+    near = EgoPose((float(rng.uniform(-5.0, 5.0)), 0.0), float(rng.uniform(-0.5, 0.5)))
+    pose = (None, None, near, EgoPose(*at, *stds))[int(rng.integers(0, 4))]
+    twist = extreme(rng, -100.0, 100.0), extreme(rng, -10.0, 10.0)
+    deviations = abs(extreme(rng, 0.0, 100.0)), abs(extreme(rng, 0.0, 10.0))
+    return Odometry("wheels", stamp_ns, *twist, *deviations, pose=pose)
+
+
+def something(rng: np.random.Generator, stamp_ns: int) -> Measurement | PositionScan | Odometry:
+    kind = rng.random()
+    if kind < 0.1:
+        return odometry(rng, stamp_ns)
+    return scan(rng, stamp_ns) if kind < 0.35 else measurement(rng, stamp_ns)
+
+
+# Corners that an ego vehicle passes and leaves behind, as odometry throws it about.
+PLACE = Context(occluders=(corner_at("left", (8.0, 3.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
 
 
 def campaign(rng: np.random.Generator, steps: int) -> WorldFilter:
     """Filter what comes; look at every fiftieth state and every five-hundredth checkpoint."""
-    world, now_ns, last = WorldFilter(), HOUR_NS, something(rng, HOUR_NS)
+    world, now_ns, last = WorldFilter(PLACE), HOUR_NS, something(rng, HOUR_NS)
     for step in range(steps):
         now_ns += int(rng.choice([10**7, 10**8, 10**8, 5 * 10**8]))
         kind = rng.random()
@@ -121,6 +150,7 @@ def sound(world: WorldFilter) -> None:
     state.to_json()
     chances = [one.existence_probability for one in state.entities] + [cue.risk for cue in state.cues]
     chances += [chance for cue in state.cues for chance in (cue.within or {}).values()]
+    chances += [one.probability for one in state.relations]
     assert all(0.0 <= chance <= 1.0 for chance in chances)
     assert len(state.entities) < 140  # One scan may hold 128
 

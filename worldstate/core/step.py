@@ -13,7 +13,7 @@ from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
-from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
@@ -45,6 +45,7 @@ _TIE = 1e-9
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
 _MOST_CERTAIN = 0.999  # Of a message
+_NOBODY = 1e-12
 _NO_LOOK = Unqueried("sound alone")
 
 
@@ -119,7 +120,8 @@ def where_nobody_hides(measurement: Measurement, context: Context) -> Measuremen
     if not isinstance(reading, SequenceReading):
         return measurement
     groups = reading.groups.copy()
-    groups[is_open, : len(COMING_S)] = 0.0
+    # Next to nothing: shares of nothing at all are not defined.
+    groups[is_open] = np.maximum(groups[is_open] * (np.arange(len(GROUPS)) >= len(COMING_S)), _NOBODY)
     groups /= groups.sum(axis=1, keepdims=True)
     return replace(measurement, sequence=replace(reading, groups=groups))
 

@@ -8,6 +8,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
+_LEAST_STD_RAD, _FASTEST_HZ = 1e-4, 100.0
 _PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: who comes past it is in view
 
 
@@ -144,7 +145,7 @@ class Occluder:
         in_range("hidden_azimuth_rad", self.hidden_azimuth_rad, -math.pi, math.pi)
         in_range("hidden_std_rad", self.hidden_std_rad, 0.0, math.pi, open_low=True)
         in_range("edge_std_rad", self.edge_std_rad, 0.0, math.pi, open_low=True)
-        in_range("pace_hz", self.pace_hz, 0.0, 100.0, open_low=True)
+        in_range("pace_hz", self.pace_hz, 0.0, _FASTEST_HZ, open_low=True)
 
 
 def blind_corner(direction: str, side: int) -> Occluder:
@@ -223,14 +224,14 @@ def corner_at(
         )
     in_range("speed_mps", speed_mps, 0.0, 100.0, open_low=True)
     in_range("corner_std_m", corner_std_m, 0.0, 100.0, open_low=True)
-    pace_hz, slope = speed_mps / crossing_m, abs(y_m) / x_m
-    near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
+    pace_hz = speed_mps / crossing_m
+    hidden_rad, hidden_std = _behind(x_m, y_m, pace_hz)
     return Occluder(
         f"corner_{direction}",
         direction,
         math.atan2(y_m, x_m),
-        math.copysign(middle, y_m),
-        0.5 * (far - near),
+        hidden_rad,
+        hidden_std,
         # Across the line of sight, the same for every direction of the error.
         edge_std_rad=min(corner_std_m / math.hypot(x_m, y_m), math.pi),
         pace_hz=pace_hz,
@@ -276,17 +277,24 @@ def seen_from(
         return replace(occluder, hides=False)
     before_m, now_m = math.hypot(corner_x, corner_y), math.hypot(ahead_m, beside_m)
     std_m = math.hypot(occluder.edge_std_rad * before_m, position_std_m)
-    speed_mps, crossing_m = occluder.pace_hz * occluder.crossing_m, occluder.crossing_m - x
-    corner = (ahead_m, beside_m)
-    now = corner_at(occluder.direction, corner, crossing_m, speed_mps=speed_mps, corner_std_m=std_m)
+    pace_hz = occluder.pace_hz * occluder.crossing_m / (occluder.crossing_m - x)
+    hidden_rad, hidden_std = _behind(ahead_m, beside_m, pace_hz)
     return replace(
         occluder,
-        edge_azimuth_rad=math.remainder(now.edge_azimuth_rad - yaw, math.tau),
-        hidden_azimuth_rad=math.remainder(now.hidden_azimuth_rad - yaw, math.tau),
-        hidden_std_rad=now.hidden_std_rad,
+        edge_azimuth_rad=math.remainder(math.atan2(beside_m, ahead_m) - yaw, math.tau),
+        hidden_azimuth_rad=math.remainder(hidden_rad - yaw, math.tau),
+        hidden_std_rad=hidden_std,
         edge_std_rad=min(math.hypot(std_m / now_m, yaw_std_rad), math.pi),
-        pace_hz=now.pace_hz,
+        pace_hz=min(pace_hz, _FASTEST_HZ),
     )
+
+
+def _behind(ahead_m: float, beside_m: float, pace_hz: float) -> tuple[float, float]:
+    """Return azimuth and deviation of who comes in two seconds, give or take one, behind a corner."""
+    slope = abs(beside_m) / ahead_m
+    near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
+    # Of a corner far away or at hand the second makes no difference.
+    return math.copysign(middle, beside_m), max(0.5 * (far - near), _LEAST_STD_RAD)
 
 
 @dataclass(frozen=True, slots=True)
