@@ -261,6 +261,17 @@ def test_a_message_joins_the_vehicle_that_is_heard() -> None:
     np.testing.assert_allclose(joined.position_m, (10.0, 27.4, 0.0), atol=1e-9)
 
 
+def test_a_message_of_next_to_no_existence_is_weighed_against_a_certain_entity() -> None:
+    world = after(*(heard(0.1 * hop, left=500.0) for hop in range(1, 12)))
+    (certain,) = world.memory.tracks
+    there = replace(certain, existence=1.0)
+    world = replace(world, memory=replace(world.memory, tracks=(there,)), lag=None)
+    x, y = 20.0 * math.cos(there.motion.azimuth_rad), 20.0 * math.sin(there.motion.azimuth_rad)
+    denied = Position((x, y), diagonal(0.5, 0.5), existence_probability=1e-300)
+    for entity in world.update(radio(1.2, denied)).state.entities:
+        assert 0.0 <= entity.existence_probability <= 1.0
+
+
 def test_a_forged_claim_in_plain_view_is_refuted_and_stays_so_however_often_it_is_repeated() -> None:
     world, ghosts = WorldFilter(), []
     forged = Position((15.0, 1.0), diagonal(0.5, 0.5, 0.3, 0.3), (-1.0, 0.0), 0.99)

@@ -219,8 +219,8 @@ def _told(track: Track, position: Position, scan: PositionScan) -> float:
     if scan.source in track.sources:
         return track.existence
     odds = position.existence_probability / (1.0 - position.existence_probability)
-    exists = track.existence * odds / (track.existence * odds + 1.0 - track.existence)
-    return min(exists, _MOST_EXISTENCE)
+    before = min(track.existence, _MOST_EXISTENCE)
+    return min(before * odds / (before * odds + 1.0 - before), _MOST_EXISTENCE)
 
 
 def _detected(existence: float, searched: SearchedSector) -> float:
