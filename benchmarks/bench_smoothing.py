@@ -37,12 +37,12 @@ def smoothing_times(hops: int, rng: np.random.Generator, entities: int = 3) -> t
         for number in range(entities):
             # Each comes again when it has passed, under another name: 16 s, 24 m to 40 m away at first.
             after, passes = (hop + 53 * number) % PASS_HOPS, (hop + 53 * number) // PASS_HOPS
-            seen[f"{number}-{passes}"] = _observed(after, number, rng)
+            seen[f"{number}-{passes}"] = observed(after, number, rng)
         spent.append(_spent(lambda hop=hop, seen=seen: smoother.update(hop * HOP_NS, seen)))
     return spent, smoother.n_factor_slots
 
 
-def _observed(hop: int, number: int, rng: np.random.Generator) -> list[object]:
+def observed(hop: int, number: int, rng: np.random.Generator) -> list[object]:
     side = 1 if number % 2 == 0 else -1
     x, y, speed = 8.0 + number, side * (24.0 - 0.3 * hop), 3.0
     azimuth, r = math.atan2(y, x), math.hypot(x, y)

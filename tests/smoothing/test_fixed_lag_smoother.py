@@ -17,6 +17,7 @@ from worldstate.smoothing import (
     Range,
     ReflectedBearing,
     SmoothingSettings,
+    graph,
 )
 
 EXACT = SmoothingSettings(robust_k=1e4)
@@ -201,11 +202,29 @@ def test_what_cannot_be_is_refused():
         smoother.track("nobody")
 
 
+def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
+    from bench_smoothing import HOP_NS as BENCH_HOP_NS
+    from bench_smoothing import observed
+
+    def landmarks(every: int) -> list[np.ndarray]:
+        monkeypatch.setattr(graph, "_SUMMED_EVERY", every)
+        smoother, rng = FixedLagSmoother(), np.random.default_rng(3)
+        smoother.add_corner("left", 1, (5.0, 3.0), (1.0, 0.5))
+        smoother.add_corner("right", -1, (5.0, -3.0), (1.0, 0.5))
+        smoother.add_wall("opposite", 0.0, 8.0, (0.05, 0.5))
+        for hop in range(700):
+            seen = {f"{k}-{(hop + 53 * k) // 160}": observed((hop + 53 * k) % 160, k, rng) for k in (0, 1)}
+            smoother.update(hop * BENCH_HOP_NS, seen)
+        found = [part for name in ("left", "right", "opposite") for part in smoother.landmark(name)]
+        return [*found, np.array([smoother.n_factor_slots])]
+
+    summed, apart = landmarks(100), landmarks(10**9)
+    for one, other in zip(summed[:-1], apart[:-1], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    assert summed[-1] < apart[-1]
+
+
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="one marginal factor stays of every entity that ended at a corner: 2,512 slots for 1,850",
-    strict=True,
-)
 def test_an_hour_leaves_memory_and_graph_as_they_were():
     import tracemalloc
 

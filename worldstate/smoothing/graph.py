@@ -1,5 +1,6 @@
 """What becomes known between two updates of the incremental smoother, and the smoother itself."""
 
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,10 @@ import numpy as np
 from worldstate.ground.typing import FloatArray
 
 from .settings import SmoothingSettings
-from .vector_factor import EGO, Factor, kind_of
+from .vector_factor import CORNER, EGO, WALL, Factor, kind_of
+
+# Updates between two sums of what marginalised entities left: a minute at ten a second.
+_SUMMED_EVERY = 600
 
 
 def _parameters() -> Any:
@@ -60,12 +64,38 @@ class FactorGraph:
             graph.push_back(factor)
         for key, value in self._values.items():
             values.insert(key, gtsam.Pose2(*value) if kind_of(key) == EGO else value)
-        self._smoother.update(graph, values, self._times)
         self._updates += 1
+        summed = self._summed_marginals(graph) if self._updates % _SUMMED_EVERY == 0 else []
+        self._smoother.update(graph, values, self._times, summed)
         # One estimate costs as much as all, a quarter of an update: in between, what variables began with is
         # near enough to begin the next ones with.
         self._near = {} if self._updates % self._every == 0 else self._near | self._values
         self._clear()
+
+    def _summed_marginals(self, graph: Any) -> list[int]:
+        """Add one factor for all that marginalised entities left on the same landmarks; return their slots.
+
+        Every entity that ended at a corner leaves a quadratic one; kept apart, they grow with the hours.
+        """
+        import gtsam
+
+        slots = self._smoother.getFactors()
+        left = defaultdict[tuple[int, ...], list[int]](list)
+        for i in range(slots.size()):
+            if slots.exists(i) and isinstance(slots.at(i), gtsam.LinearContainerFactor):
+                left[tuple(sorted(slots.at(i).keys()))].append(i)
+        alike = {
+            keys: places
+            for keys, places in left.items()
+            if all(kind_of(key) in (CORNER, WALL) for key in keys) and len(places) > 1
+        }
+        for places in alike.values():
+            linear = gtsam.GaussianFactorGraph()
+            for i in places:
+                linear.push_back(slots.at(i).factor())
+            # No linearisation point, as gtsam's own have none: it holds that of their variables fixed.
+            graph.push_back(gtsam.LinearContainerFactor(gtsam.HessianFactor(linear)))
+        return [i for places in alike.values() for i in places]
 
     def value(self, key: int) -> FloatArray:
         """Return an estimate of a variable, no older than the last relinearisation."""
