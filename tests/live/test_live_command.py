@@ -121,7 +121,7 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
     (tmp_path / "camera.json").write_text(json.dumps(lens))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "worldstate.adapters.live.microphones.Microphones",
+        "worldstate.adapters.live.microphones.PortAudioInput",
         lambda channels, sample_rate_hz: Playback(open_sound(street / "street.wav"), speed=10.0),
     )
     found = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))
