@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from worldstate import Measurement, Sighting, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.association import FORBIDDEN, association_probabilities, joint_association
+from worldstate.belief.association import FORBIDDEN, association_probabilities, joint_association, propagated
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
@@ -115,15 +115,25 @@ def test_probabilities_are_those_of_all_joint_events(log_ratios, data):
     gated = data.draw(arrays(bool, log_ratios.shape))
     ratios = np.where(gated, log_ratios, FORBIDDEN)
     found = joint_association(ratios, np.ones(ratios.shape[1], bool))
-    np.testing.assert_allclose(association_probabilities(ratios, {}), counted(ratios), atol=1e-12)
+    np.testing.assert_allclose(association_probabilities(ratios), counted(ratios), atol=1e-12)
     np.testing.assert_allclose(found.chances, counted(ratios).sum(axis=0), atol=1e-12)
     assert all(gated[row, column] for column, row in found.found.items())
 
 
-def test_of_a_crowd_the_likeliest_assignment_is_taken():
+@settings(max_examples=30, deadline=None)
+@given(arrays(float, st.just((4, 4)), elements=st.floats(-6.0, 6.0)))
+def test_belief_propagation_is_near_the_sum_over_all_events(log_ratios):
+    near, exact = propagated(log_ratios), counted(log_ratios)
+    assert np.abs(near - exact).mean() < 0.05 and np.abs(near.sum(axis=0) - exact.sum(axis=0)).max() < 0.2
+    assert (near.sum(axis=0) <= 1.0 + 1e-9).all() and (near.sum(axis=1) <= 1.0 + 2e-3).all()
+
+
+def test_of_a_crowd_states_follow_the_likeliest_and_existence_all_events():
     crowd = np.full((8, 8), -2.0) + 6.0 * np.eye(8)
     found = joint_association(crowd, np.ones(8, bool))
-    assert found.found == {i: i for i in range(8)} and found.chances == [1.0] * 8
+    assert found.found == {i: i for i in range(8)}
+    # One of two that stand abreast has e^4 against 1 and seven of e^-2, which others have by e^4.
+    assert found.chances == pytest.approx([0.98] * 8, abs=0.01)
 
 
 def looked(time_s, nats, *sightings, kinds=()):
