@@ -15,8 +15,8 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence
+from worldstate.abduction.rate_matrix import transitions
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
 from .ratio_recursion import balanced
 from .sequence_model import COMING_S, GROUPS
@@ -27,8 +27,6 @@ _LEAK = 0.004  # Of the hops: what the sequence of groups does not foresee
 # of .73 in place of .94.
 _LEAST_SHIFT, _LARGEST_SHIFT = -0.5, 2.0
 _SMALLEST = 1e-12
-# The slowest rate is .04/s: by then the chain has settled; a larger exponent of expm only costs digits.
-_LONGEST_STEP_S = 1000.0
 _ROUNDS = 1000  # After 200 the prior still drifts by a percent, after these by 1e-9
 
 _COMING = len(COMING_S)
@@ -118,14 +116,7 @@ def state_transition(prior: FloatArray, step_ns: int) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def _transition(prior: tuple[float, ...], step_ns: int) -> FloatArray:
-    # Imported where it is needed: scipy.linalg takes as long to import as numpy.
-    from scipy.linalg import expm
-
-    step_s = min(step_ns / NANOSECONDS_PER_SECOND, _LONGEST_STEP_S)
-    matrix: FloatArray = np.maximum(expm(_rates_hz(prior) * step_s), 0.0)
-    matrix /= matrix.sum(axis=1, keepdims=True)
-    matrix.flags.writeable = False
-    return matrix
+    return transitions(_rates_hz(prior), step_ns)
 
 
 @lru_cache(maxsize=32)

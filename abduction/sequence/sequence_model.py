@@ -28,6 +28,7 @@ GROUPS = (*(f"coming_{end_s:g}s" for end_s in COMING_S), *OTHERS)
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
 # Times are stated of vehicles that come within so long: beyond, nothing in the sound says when.
 LONGEST_S = 5.0
+STATED = COMING_S.index(LONGEST_S) + 1  # So many groups
 _HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
 _LEVELS = np.array([[0.05], [0.95]])
 SMOOTHED_HOPS, HELD_HOPS = 3, 10
@@ -52,9 +53,8 @@ class SequencePosterior:
 
         The interval holds nine of ten of the times that it was calibrated on.
         """
-        ends = np.array(COMING_S)[np.array(COMING_S) <= LONGEST_S]
-        mass = self.groups[..., : len(ends)]
-        edges = np.concatenate([[0.0], ends])
+        mass = self.groups[..., :STATED]
+        edges = np.array([0.0, *COMING_S[:STATED]])
         share = mass / mass.sum(axis=-1, keepdims=True)
         mean = share @ (0.5 * (edges[1:] + edges[:-1]))
         below = np.cumsum(share, axis=-1) - share

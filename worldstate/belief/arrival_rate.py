@@ -13,7 +13,7 @@ from dataclasses import dataclass
 _SHAPE = 2.0
 _FORGOTTEN_S = 3600.0  # Traffic changes with the hour
 # A prior slides the alarm: by +2 nats from 15 to 58 onsets an hour, by -1 to a detection of .73 for .94.
-MOST_NATS = 0.5
+_MOST_NATS = 0.5
 _STEP_NATS = 0.1  # The chain is computed anew for every prior: a few are enough
 
 
@@ -39,4 +39,4 @@ class ArrivalRate:
         (-0.5, 0.5, 0.0)
         """
         nats = math.log((_SHAPE + self.count) / (_SHAPE + usual_hz * self.watched_s))
-        return round(min(max(nats, -MOST_NATS), MOST_NATS) / _STEP_NATS) * _STEP_NATS
+        return round(min(max(nats, -_MOST_NATS), _MOST_NATS) / _STEP_NATS) * _STEP_NATS

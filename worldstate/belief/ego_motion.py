@@ -18,6 +18,8 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.odometry import Odometry
 
+from .kinematics.cartesian import arc
+
 _ROW = Via(FloatArray, np.asarray, lambda row: row.reshape(3))
 _SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(3, 3))
 
@@ -46,11 +48,9 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
     >>> driven(quarter, 1.0).pose.round(3)
     array([2.   , 2.   , 1.571])
     """
-    turned = ego.yaw_rate_rad_s * step_s
+    chord, turned = arc(ego.speed_mps, ego.yaw_rate_rad_s, step_s)
     heading = float(ego.pose[2]) + 0.5 * turned
     ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
-    # numpy's sinc has a factor of pi.
-    chord = ego.speed_mps * step_s * float(np.sinc(0.5 * turned / math.pi))
     pose = ego.pose + chord * ahead + np.array([0.0, 0.0, turned])
     flow, gain = np.eye(3), np.stack([ahead, [0.0, 0.0, 1.0]], axis=1)
     flow[:2, 2] = -chord * ahead[1], chord * ahead[0]

@@ -10,14 +10,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from worldstate.abduction.rate_matrix import transitions
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
 RatesHz = tuple[float, ...]
 """arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""
-
-# At any rate above .01/s the chain is in equilibrium by then; a larger exponent of expm only costs digits.
-LONGEST_STEP_S = 1000.0
 
 
 @lru_cache(maxsize=64)
@@ -41,14 +38,7 @@ def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
 @lru_cache(maxsize=256)
 def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
     r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only."""
-    # Imported where it is needed: scipy.linalg takes as long to import as numpy.
-    from scipy.linalg import expm
-
-    step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
-    matrix: FloatArray = np.maximum(expm(generator(rates_hz, directions) * step_s), 0.0)
-    matrix /= matrix.sum(axis=1, keepdims=True)
-    matrix.flags.writeable = False
-    return matrix
+    return transitions(generator(rates_hz, directions), step_ns)
 
 
 @lru_cache(maxsize=64)

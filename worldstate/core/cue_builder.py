@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.belief.announced import announced
 from worldstate.belief.birth_death import hidden_on
 from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
@@ -110,7 +110,7 @@ def _times(kept: SequenceMemory | None, advisories: list[Advisory | None]) -> li
         return [None] * len(advisories)
     posterior = kept.posterior
     within = posterior.within()[0].tolist()
-    soon = posterior.groups[0, :, : COMING_S.index(LONGEST_S) + 1].sum(axis=1) > 0.5
+    soon = posterior.groups[0, :, :STATED].sum(axis=1) > 0.5
     # The times are those of whoever comes: of a street where nobody does they would say nothing.
     stated = [told is not None or likely for told, likely in zip(advisories, soon.tolist(), strict=True)]
     intervals_s = posterior.time_to_visible_s()[0].tolist() if any(stated) else within

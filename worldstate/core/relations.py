@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_model import COMING_S, LONGEST_S
+from worldstate.abduction.sequence.sequence_model import STATED
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.site_geometry import normal_share
 from worldstate.belief.track import Track
@@ -24,7 +24,6 @@ _HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
 _ALIKE = math.cos(math.radians(30.0))  # Of headings in one lane
 _LEAST_CROSSING_MPS = 0.3
 _CONFLICT_S = 5.0  # Beyond, vehicles have turned or braked
-_KNOWN_M = 5.0  # Standard deviation of a position from which on it is published
 _BESIDE = 10.0  # Metres ahead that a metre beside the lane counts for
 _LEAST = 0.05  # What is less likely is not named
 
@@ -33,7 +32,7 @@ def relations_at(memory: Memory, tracks: Sequence[Track], context: Context) -> t
     """Return the relations of some tracks, with the interval in which each has held."""
     before = {(one.src, one.dst, one.kind): one for one in memory.relations}
     edges = [one for track in tracks for one in _edges(track, memory, context)]
-    placed = [one for one in tracks if one.place and one.place.position_std_m < _KNOWN_M]
+    placed = [one for one in tracks if one.place and one.place.known]
     edges += _between(placed, memory.stamp_ns, context)
     now = {(one.src, one.dst, one.kind): one for one in edges}
     names = {track.id for track in tracks}
@@ -78,7 +77,7 @@ def _comes(track: Track, memory: Memory) -> float:
     if memory.sequence is None:
         return 1.0
     coming = memory.sequence.coming[track.side]
-    return float(coming[: COMING_S.index(LONGEST_S) + 1].sum() / max(coming.sum(), 1e-12))
+    return float(coming[:STATED].sum() / max(coming.sum(), 1e-12))
 
 
 def _between(tracks: Sequence[Track], stamp_ns: int, context: Context) -> Iterator[Relation]:

@@ -161,8 +161,16 @@ class SequenceMemory:
 
         .. math:: t_j = L_j - L_{j-1}
 
-        with L of both sides after the prior, the sequence, every look, and who has just come into view. The
-        last term takes the learned traffic out again: the alarm keeps to its onsets an hour of a usual
+        with L of both sides after the prior, the sequence, every look, and who has just come into view.
+        """
+        after = self.log_odds(context)
+        terms = np.diff(list(after.values()), axis=0, prepend=np.zeros((1, len(SIDES))))
+        return dict(zip(after, terms.tolist(), strict=True))
+
+    def log_odds(self, context: Context) -> dict[str, FloatArray]:
+        """Return the log-odds of coming into view within three seconds after each piece of evidence.
+
+        The last piece takes the learned traffic out again: the alarm keeps to its onsets an hour of a usual
         street. Left in, in busy streets the other side of a single was alarmed in .56 of the cases for .35.
         """
         nats, pieces = np.array(self.learned_nats(context)), self._told
@@ -173,9 +181,7 @@ class SequenceMemory:
         before = states_of(self.prior(context), self.share)
         weights = np.concatenate([before[None], self.sides.belief * np.exp(told)])
         soon, later = (np.maximum(weights @ mask, _LEAST_WEIGHT) for mask in (_SOON, ~_SOON))
-        log_odds = np.log(soon) - np.log(later)
-        terms = np.diff(log_odds, axis=0, prepend=np.zeros((1, len(SIDES))))
-        return dict(zip(("prior", "sequence", *pieces), terms.tolist(), strict=True))
+        return dict(zip(("prior", "sequence", *pieces), np.log(soon) - np.log(later), strict=True))
 
     @property
     def mean_log_odds(self) -> FloatArray:
@@ -184,7 +190,7 @@ class SequenceMemory:
 
 
 def _as_few(chances: FloatArray) -> FloatArray:
-    """Return the chances with as much as one vehicle allows on the likelier side; a tie stays one."""
+    """Return the chances with as much as one vehicle allows on the likelier side; a tie stays a tie."""
     total, first = float(chances.sum()), chances == chances.max()
     one = min(total, 1.0)
     return np.where(first, one, total - one) if first.sum() == 1 else chances
@@ -241,7 +247,7 @@ def informed(
 
 def _alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     """Return the memory with the mean log-odds of the last .3 s held against the threshold."""
-    left, right = np.sum(list(kept.log_odds_terms(context).values()), axis=0).tolist()
+    left, right = list(kept.log_odds(context).values())[-1].tolist()
     since_ns = kept.stamp_ns - _SMOOTHED_NS + _SLACK_NS
     recent = (*(one for one in kept.recent if one[0] > since_ns), (kept.stamp_ns, left, right))
     kept = replace(kept, recent=recent)

@@ -35,8 +35,7 @@ from .step import NEWS_HOLDS_NS
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
 _KNOWN_LOG_RANGE_STD = 0.25
-# A lane and a half, and a change of pace: beyond, a number would be taken for more than it says.
-_KNOWN_POSITION_STD_M, _KNOWN_VELOCITY_STD_MPS = 5.0, 5.0
+_KNOWN_VELOCITY_STD_MPS = 5.0  # A change of pace
 NINE_OF_TEN = 1.645  # Standard deviations to either side
 _ROUNDING = 1e-9
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
@@ -161,7 +160,7 @@ def _place(track: Track, range_m: float | None, hidden: bool, site: SiteGeometry
     if place is None and range_m is not None:
         azimuth_rad = motion.azimuth_rad
         return {"position_m": (range_m * math.cos(azimuth_rad), range_m * math.sin(azimuth_rad), 0.0)}
-    if place is None or place.position_std_m >= _KNOWN_POSITION_STD_M:
+    if place is None or not place.known:
         return {}
     x, y, vx, vy = place.mean.tolist()
     moves = place.velocity_std_mps < _KNOWN_VELOCITY_STD_MPS

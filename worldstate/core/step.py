@@ -45,7 +45,7 @@ _TIE = 1e-9
 # An advisory lives in time: without news it ends, as that of a sequence does, after a second.
 NEWS_HOLDS_NS = nanoseconds(1.0)
 _MOST_CERTAIN = 0.999  # Of a message
-_NOBODY = 1e-12
+_NOBODY = 1e-12  # Of a group of those who come, where nobody can: shares of none at all are not defined
 _NO_LOOK = Unqueried("sound alone")
 
 
@@ -120,7 +120,6 @@ def where_nobody_hides(measurement: Measurement, context: Context) -> Measuremen
     if not isinstance(reading, SequenceReading):
         return measurement
     groups = reading.groups.copy()
-    # Next to nothing: shares of nothing at all are not defined.
     groups[is_open] = np.maximum(groups[is_open] * (np.arange(len(GROUPS)) >= len(COMING_S)), _NOBODY)
     groups /= groups.sum(axis=1, keepdims=True)
     return replace(measurement, sequence=replace(reading, groups=groups))

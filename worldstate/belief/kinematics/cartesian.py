@@ -22,6 +22,8 @@ from worldstate.measurement.position import Position
 from .motion import MotionBelief, checked_covariance
 from .polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 
+# A lane and a half: of a position that is less sure, a number would be taken for more than it says.
+_KNOWN_STD_M = 5.0
 # m/s: without a measured velocity a road user in town may drive at up to twice this, in any direction.
 _UNKNOWN_SPEED_STD = 10.0
 # Polar coordinates are singular at the array itself, and no road user comes nearer than this.
@@ -59,6 +61,11 @@ class CartesianBelief:
         return _longest(self.covariance[:2, :2])
 
     @property
+    def known(self) -> bool:
+        """Whether the position is sure enough to be told."""
+        return self.position_std_m < _KNOWN_STD_M
+
+    @property
     def velocity_std_mps(self) -> float:
         """Standard deviation of the velocity along its longest axis."""
         return _longest(self.covariance[2:, 2:])
@@ -78,6 +85,13 @@ def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArr
     return np.array([*position.position_m, *(position.velocity_mps or (0.0, 0.0))]), noise
 
 
+def arc(speed_mps: float, yaw_rate_rad_s: float, step_s: float) -> tuple[float, float]:
+    r"""Return the chord :math:`v t\,\operatorname{sinc}(\omega t / 2)` of an arc, and its turn."""
+    turned = yaw_rate_rad_s * step_s
+    # numpy's sinc has a factor of pi.
+    return speed_mps * step_s * float(np.sinc(0.5 * turned / math.pi)), turned
+
+
 def predict_place(
     belief: CartesianBelief,
     step_s: float,
@@ -94,9 +108,7 @@ def predict_place(
     t, flow = step_s, np.eye(4) + step_s * np.eye(4, k=2)
     noise = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
     mean = belief.mean @ flow.T
-    turned = ego_yaw_rate_rad_s * step_s
-    # numpy's sinc has a factor of pi.
-    chord = ego_speed_mps * step_s * np.sinc(0.5 * turned / math.pi)
+    chord, turned = arc(ego_speed_mps, ego_yaw_rate_rad_s, step_s)
     mean[..., :2] -= chord * np.array([math.cos(0.5 * turned), math.sin(0.5 * turned)])
     strength = np.asarray(acceleration_psd)[..., None, None]
     covariance = flow @ belief.covariance @ flow.T + strength * noise
