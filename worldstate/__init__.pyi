@@ -1,6 +1,7 @@
 from .abduction.co_evidence import Absent as Absent
 from .abduction.co_evidence import Present as Present
 from .abduction.co_evidence import Unqueried as Unqueried
+from .abduction.cueing.cueing_policy import uncalibrated_policy as uncalibrated_policy
 from .abduction.evidence import SignatureEvidence as SignatureEvidence
 from .adapters.acoustic import AcousticAdapter as AcousticAdapter
 from .adapters.camera.detections import DetectionFrame as DetectionFrame
@@ -12,7 +13,6 @@ from .adapters.listen import listen_steps as listen_steps
 from .adapters.listen import open_source as open_source
 from .belief.settings import FilterSettings as FilterSettings
 from .core.filter import WorldFilter as WorldFilter
-from .core.filter import uncalibrated_policy as uncalibrated_policy
 from .frontend.array.microphone_array import MicrophoneArray as MicrophoneArray
 from .ground.errors import WorldstateError as WorldstateError
 from .ground.values import NotUsable as NotUsable

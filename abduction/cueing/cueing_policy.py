@@ -13,7 +13,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 
 from .adaptive_threshold import AdaptiveBudget
-from .risk_map import RiskMap
+from .risk_map import PlattMap, RiskMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,3 +226,26 @@ def _check_sustain_hops(sustain_hops: object) -> int:
     if not isinstance(sustain_hops, int | np.integer) or isinstance(sustain_hops, bool) or sustain_hops < 1:
         raise InvalidArgumentError(f"sustain_hops: expected a whole number >= 1, got {sustain_hops!r:.40}")
     return int(sustain_hops)
+
+
+def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
+    """Return a policy for trying things out: no false-alarm budget was ever measured for it (alpha 0).
+
+    Parameters
+    ----------
+    directions : int
+        Number of directions K.
+
+    Returns
+    -------
+    CueingPolicy
+        With alpha 0.
+
+    Examples
+    --------
+    >>> uncalibrated_policy().gamma
+    0.9
+    """
+    prior = (1.0 / (directions + 2),) * (directions + 2)
+    # Three windows in a row above .9; slope -1 and offset 0 make the risk the statistic itself.
+    return CueingPolicy(0.9, 3, 0.0, prior, PlattMap(-1.0, 0.0))

@@ -15,7 +15,8 @@ import scipy.fft
 from numpy.typing import ArrayLike
 
 from worldstate.frontend.bounds.cramer_rao import tone_crb_hz2
-from worldstate.ground.checks import finite_array, finite_complex, in_range
+from worldstate.frontend.spectra.finite_complex import finite_complex
+from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray
 from worldstate.ground.values import wrap_angle

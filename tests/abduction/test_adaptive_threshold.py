@@ -13,9 +13,9 @@ from scipy.signal import lfilter
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveBudget, AdaptiveThreshold
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, SustainedRule, uncalibrated_policy
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.core.filter import WorldFilter, uncalibrated_policy
+from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable

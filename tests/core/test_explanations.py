@@ -62,7 +62,7 @@ looks_of_any_kind = st.lists(st.tuples(logs, logs, logs, logs, answers), min_siz
 
 @given(rates, looks_of_any_kind)
 def test_it_sums_to_one_and_stays_finite(rate, looks):
-    belief = ExplanationBelief.settled(DIRECTIONS, rate)
+    belief = ExplanationBelief.settled(len(DIRECTIONS), rate)
     for left, right, visible, none, answer in looks:
         belief = belief.predict(rate, 100_000_000)
         belief = belief.update(evidence(left, right, visible, none), co_terms(answer))
@@ -82,7 +82,7 @@ def test_it_lumps_onto_the_three_explanations(rate, looks):
         ]
     )
     step = expm(flow * 0.1)
-    belief = ExplanationBelief.from_priors(DIRECTIONS, 0.2, 0.3, 0.5)
+    belief = ExplanationBelief.from_priors(len(DIRECTIONS), 0.2, 0.3, 0.5)
     three = np.array([0.2, 0.3, 0.5])
     for hidden, visible, none, answer in looks:
         belief = belief.predict(rate, 100_000_000)
@@ -99,7 +99,7 @@ def test_it_agrees_with_a_factor_graph():
     lump = np.zeros((6, 4))
     lump[[0, 1, 2, 3, 4, 5], [0, 1, 2, 2, 2, 3]] = 1.0
     step = (transition(rate, 2, 100_000_000) @ lump)[[0, 1, 4, 5]]
-    prior, belief = [0.1, 0.1, 0.3, 0.5], ExplanationBelief.from_priors(DIRECTIONS, 0.2, 0.3, 0.5)
+    prior, belief = [0.1, 0.1, 0.3, 0.5], ExplanationBelief.from_priors(len(DIRECTIONS), 0.2, 0.3, 0.5)
     graph = gtsam.DiscreteFactorGraph()
     graph.add([(0, 4)], " ".join(map(str, prior)))
     for i in range(1, steps + 1):
@@ -115,7 +115,7 @@ def test_it_agrees_with_a_factor_graph():
 
 @given(logs, logs, logs, logs)
 def test_blind_vision_is_neutral_and_perfect_vision_removes_the_visible(left, right, visible, none):
-    start = ExplanationBelief.from_priors(DIRECTIONS, 0.2, 0.3, 0.5)
+    start = ExplanationBelief.from_priors(len(DIRECTIONS), 0.2, 0.3, 0.5)
     heard = evidence(left, right, visible, none)
     blind = start.update(heard, co_terms(Absent(1.0)))
     unasked = start.update(heard, co_terms(Unqueried("-")))
@@ -125,7 +125,7 @@ def test_blind_vision_is_neutral_and_perfect_vision_removes_the_visible(left, ri
 
 @given(st.floats(0.01, 0.99), st.floats(0.0, 0.2))
 def test_hand_over_moves_mass_into_view_and_keeps_the_sum(hidden, residual):
-    start = ExplanationBelief.from_priors(DIRECTIONS, hidden, (1 - hidden) / 2, (1 - hidden) / 2)
+    start = ExplanationBelief.from_priors(len(DIRECTIONS), hidden, (1 - hidden) / 2, (1 - hidden) / 2)
     start = start.predict((0.05, 0.3, 0.1, 0.05, 0.05, 0.3), 10**9)
     after = start.emerge(0, residual)
     assert after.hidden[0] == pytest.approx(residual * start.hidden[0], abs=1e-12)
@@ -136,7 +136,7 @@ def test_hand_over_moves_mass_into_view_and_keeps_the_sum(hidden, residual):
 def test_what_came_into_view_is_remembered_by_side():
     """A hidden source that merely stops being hidden is still the one that was heard before."""
     rate = (0.05, 0.3, 0.1, 0.05, 0.05, 0.3)
-    belief = ExplanationBelief.from_priors(DIRECTIONS, 0.0, 0.0, 1.0)
+    belief = ExplanationBelief.from_priors(len(DIRECTIONS), 0.0, 0.0, 1.0)
     heard_hidden, heard_in_view = evidence(2.0, 0.0, 0.0, 0.0), evidence(0.0, 0.0, 2.0, 0.0)
     for heard in [heard_hidden] * 30 + [heard_in_view] * 30:
         belief = belief.predict(rate, 10**8).update(heard, co_terms(Unqueried("-")))

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from worldstate.ground.serialisation import Keys
 from worldstate.ground.typing import FloatArray
 
-from .explanation import ExplanationBelief
+from .explanation import AsLogs, ExplanationBelief
 
 # Window ends are rounded to samples and stamps to nanoseconds: two windows end to end differ from one
 # window's length by less than this.
@@ -40,7 +42,7 @@ class BeliefLag:
 
     Examples
     --------
-    >>> belief = ExplanationBelief.from_priors(("left", "right"), 0.2, 0.3, 0.5)
+    >>> belief = ExplanationBelief.from_priors(2, 0.2, 0.3, 0.5)
     >>> lag = BeliefLag(((0, belief),))
     >>> lag.base("acoustic", 10**9, window_ns=10**9).stamp_ns
     0
@@ -51,14 +53,15 @@ class BeliefLag:
     # Updating the belief of one window ago with the full likelihood makes ten interleaved filters of windows
     # that do not overlap, each of them exact.
 
-    beliefs: tuple[tuple[int, ExplanationBelief], ...]  # Time stamps, ns, in order, and the posterior at each
+    # Time stamps, ns, in order, and the posterior at each.
+    beliefs: tuple[Annotated[tuple[int, AsLogs], Keys("stamp_ns", "log_explanations")], ...]
     heard: tuple[SourceEvidence, ...] = ()  # Most recent evidence of each source, sorted by its name
 
     def base(self, source: str, stamp_ns: int, window_ns: int) -> LaggedBelief:
         """Return the newest belief that is a window old, or the oldest there is."""
         old = [past for past in self.beliefs if past[0] <= stamp_ns - window_ns + SLACK_NS]
         since_ns, belief = old[-1] if old else self.beliefs[0]
-        others = np.zeros(len(belief.directions) + 2)
+        others = np.zeros(belief.k + 2)
         for other in self.heard:
             if other.source != source and other.stamp_ns > since_ns:
                 others += other.log_likelihoods

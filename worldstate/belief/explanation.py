@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, posterior_of
+from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 
 from .markov_chain import RatesHz, equilibrium, transition
@@ -32,26 +35,30 @@ class ExplanationBelief:
 
     Examples
     --------
-    >>> start = ExplanationBelief.settled(("left", "right"), (0.05, 0.3, 0.1, 0.05, 0.05, 0.3))
+    >>> start = ExplanationBelief.settled(2, (0.05, 0.3, 0.1, 0.05, 0.05, 0.3))
     >>> round(start.hidden_total, 3), round(start.visible, 3), round(start.none, 3)
     (0.176, 0.235, 0.588)
     """
 
-    directions: tuple[str, ...]  # The K approach sides
     log_probabilities: tuple[float, ...]  # In the order of `markov_chain`, length 2K + 2, nats
 
     @classmethod
-    def settled(cls, directions: tuple[str, ...], rates_hz: RatesHz) -> "ExplanationBelief":
-        """Return the equilibrium of the rates, all visible mass from elsewhere."""
-        return cls(directions, _logs(equilibrium(rates_hz, len(directions))))._without_origins()
+    def settled(cls, k: int, rates_hz: RatesHz) -> "ExplanationBelief":
+        """Return the equilibrium of the rates for K sides, all visible mass from elsewhere."""
+        belief = cls(_logs(equilibrium(rates_hz, k)))
+        for side in range(k):
+            belief = belief.forget_origin(side)
+        return belief
 
     @classmethod
-    def from_priors(
-        cls, directions: tuple[str, ...], hidden: float, visible: float, none: float
-    ) -> "ExplanationBelief":
-        """Return the belief of three priors, the hidden one divided evenly among the directions."""
-        k = len(directions)
-        return cls(directions, _logs(np.array([*[hidden / k] * k, *[0.0] * k, visible, none])))
+    def from_priors(cls, k: int, hidden: float, visible: float, none: float) -> "ExplanationBelief":
+        """Return the belief of three priors, the hidden one divided evenly among K sides."""
+        return cls(_logs(np.array([*[hidden / k] * k, *[0.0] * k, visible, none])))
+
+    @property
+    def k(self) -> int:
+        """Number of approach sides."""
+        return len(self.log_probabilities) // 2 - 1
 
     @property
     def probabilities(self) -> FloatArray:
@@ -61,23 +68,22 @@ class ExplanationBelief:
     @property
     def hidden(self) -> tuple[float, ...]:
         """P(hidden in direction k)."""
-        return tuple(self.probabilities[: len(self.directions)].tolist())
+        return tuple(self.probabilities[: self.k].tolist())
 
     @property
     def emerged(self) -> tuple[float, ...]:
         """P(in view, having come from direction k)."""
-        k = len(self.directions)
-        return tuple(self.probabilities[k : 2 * k].tolist())
+        return tuple(self.probabilities[self.k : 2 * self.k].tolist())
 
     @property
     def hidden_total(self) -> float:
         """P(hidden) over all directions, as in eq. (6)."""
-        return float(self.probabilities[: len(self.directions)].sum())
+        return float(self.probabilities[: self.k].sum())
 
     @property
     def visible(self) -> float:
         """P(visible)."""
-        return float(self.probabilities[len(self.directions) : -1].sum())
+        return float(self.probabilities[self.k : -1].sum())
 
     @property
     def none(self) -> float:
@@ -86,19 +92,15 @@ class ExplanationBelief:
 
     def predict(self, rates_hz: RatesHz, step_ns: int) -> "ExplanationBelief":
         """Return the belief after a time step without a measurement."""
-        moved = self.probabilities @ transition(rates_hz, len(self.directions), step_ns)
+        moved = self.probabilities @ transition(rates_hz, self.k, step_ns)
         return replace(self, log_probabilities=_logs(moved / moved.sum()))
 
-    def update(
-        self,
-        evidence: SignatureEvidence,
-        log_co_evidence: FloatArray,
-    ) -> "ExplanationBelief":
+    def update(self, evidence: SignatureEvidence, log_co_evidence: FloatArray) -> "ExplanationBelief":
         """Return the belief after one window with its co-evidence.
 
         Shapes: log_co_evidence (K + 2,).
         """
-        k = len(self.directions)
+        k = self.k
         parts = np.array(self.log_probabilities[k:-1])
         visible = np.logaddexp.reduce(parts)
         prior = np.array([*self.log_probabilities[:k], visible, self.log_probabilities[-1]])
@@ -111,7 +113,7 @@ class ExplanationBelief:
         """Return the belief after a hand-over: the hidden mass of a direction moves into view."""
         # `residual` is the share that stays hidden, since the sighting may be of another vehicle. The rest
         # counts as from elsewhere: the entity is seen now, and its existence no longer read from here.
-        p, k = self.probabilities, len(self.directions)
+        p, k = self.probabilities, self.k
         moved = p[direction] * (1.0 - residual)
         p[direction] -= moved
         p[2 * k] += moved + p[k + direction]
@@ -123,7 +125,7 @@ class ExplanationBelief:
 
         Shapes: hidden (K,). Sides exclude each other here: given more than one in all, they share it.
         """
-        p, k = self.probabilities, len(self.directions)
+        p, k = self.probabilities, self.k
         least = np.array(hidden) * min(_MOST_HIDDEN / max(sum(hidden), _MOST_HIDDEN), 1.0)
         raised = np.maximum(least - p[:k], 0.0)
         if not raised.any():
@@ -135,16 +137,16 @@ class ExplanationBelief:
 
     def forget_origin(self, direction: int) -> "ExplanationBelief":
         """Return the belief with the visible mass that came from a direction counted as from elsewhere."""
-        p, k = self.probabilities, len(self.directions)
+        p, k = self.probabilities, self.k
         p[2 * k] += p[k + direction]
         p[k + direction] = 0.0
         return replace(self, log_probabilities=_logs(p))
 
-    def _without_origins(self) -> "ExplanationBelief":
-        belief = self
-        for direction in range(len(self.directions)):
-            belief = belief.forget_origin(direction)
-        return belief
+
+# As checkpoints hold it.
+AsLogs: TypeAlias = Annotated[
+    ExplanationBelief, Via(tuple[float, ...], attrgetter("log_probabilities"), ExplanationBelief)
+]
 
 
 def _logs(probabilities: FloatArray) -> tuple[float, ...]:

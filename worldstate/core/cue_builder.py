@@ -56,8 +56,8 @@ def cues_of(memory: Memory, model: FilterModel, sensors: tuple[SensorHealth, ...
     # All sides together: what is taken out of arrays once.
     shared = partial(
         RiskCue,
-        statistic=min(instant.hidden_total, 1.0),
-        log_lambda=instant.log_lambda if math.isfinite(instant.log_lambda) else None,
+        statistic=instant.hidden_total,
+        log_lambda=instant.log_lambda,
         hypotheses=priors_of(explanation),
     )
     risks = hidden_risks(memory, model)
@@ -142,7 +142,8 @@ def _heard(memory: Memory, model: FilterModel) -> list[EvidenceTerms]:
             for k in range(len(means))
         ]
     prior, threshold = _rule_log_odds(memory, model)
-    heard, looked = _bounded(memory.heard_nats), _bounded(instant.log_lambda)
+    looked_nats = math.inf if instant.log_lambda is None else instant.log_lambda
+    heard, looked = _bounded(memory.heard_nats), _bounded(looked_nats)
     terms_nats = {"prior": prior, "window": heard, "look": looked - heard}
     told = EvidenceTerms("hidden", terms_nats, prior + looked, threshold)
     return [told] * len(model.site.sides)

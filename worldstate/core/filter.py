@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.cueing.risk_map import PlattMap
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated_policy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
@@ -26,7 +25,7 @@ from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
 
 from . import step
-from .checkpoint import FilterRecord, LagRecord, memory_of, memory_record
+from .checkpoint import FilterRecord, LagRecord
 from .cue_builder import cues_of, hidden_risks
 from .entity_events import published
 from .fixed_lag import FixedLag, Timed, restored
@@ -47,29 +46,6 @@ _KINDS: dict[str, Any] = {
     "sequence": SequenceReading | NotUsable | None,
     "fault": str | None,
 }
-
-
-def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
-    """Return a policy for trying things out: no false-alarm budget was ever measured for it (alpha 0).
-
-    Parameters
-    ----------
-    directions : int
-        Number of directions K.
-
-    Returns
-    -------
-    CueingPolicy
-        With alpha 0.
-
-    Examples
-    --------
-    >>> uncalibrated_policy().gamma
-    0.9
-    """
-    prior = (1.0 / (directions + 2),) * (directions + 2)
-    # Three windows in a row above .9; slope -1 and offset 0 make the risk the statistic itself.
-    return CueingPolicy(0.9, 3, 0.0, prior, PlattMap(-1.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,18 +120,12 @@ class WorldFilter:
     def statistic(self) -> float | None:
         """Statistic s of the last window, in [0, 1]; None before the first."""
         instant = self._memory.instant
-        return None if instant is None else min(instant.hidden_total, 1.0)
+        return None if instant is None else instant.hidden_total
 
     @property
     def gamma(self) -> float:
         """Threshold in force: the policy's, moved where it adapts."""
         return self.policy.gamma_at(self._memory.threshold.shift_nats)
-
-    @property
-    def log_lambda(self) -> float | None:
-        """Log Lambda of the last window, nats; None before the first."""
-        instant = self._memory.instant
-        return None if instant is None else instant.log_lambda
 
     @property
     def risk(self) -> float:
@@ -281,14 +251,13 @@ class WorldFilter:
         lag = self._lag
         past = LagRecord(
             stamp_ns=self.stamp_ns,
-            base=memory_record(lag.base),
+            base=lag.base,
             measurements=tuple(one.measurement for one in lag.arrivals),
             delivery=lag.delivery,
             late_since_ns=lag.late_since_ns,
         )
         # What was predicted since the last measurement is predicted again.
-        latest = memory_record(lag.latest)
-        return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, latest, past))
+        return encode(FilterRecord(self.context, self.policy, self.settings, self.start_ns, lag.latest, past))
 
     @classmethod
     def from_dict(cls, value: object) -> "WorldFilter":
@@ -302,12 +271,11 @@ class WorldFilter:
             If a value is missing, of the wrong type or out of range; the message says where.
         """
         kept = decode(FilterRecord, value, "checkpoint")
-        past, latest = kept.past, memory_of(kept.memory, kept)
+        past, latest = kept.past, kept.memory
         world = cls(kept.context, kept.policy, kept.settings, kept.start_ns, latest)
         if past is None:
             return world
-        base = memory_of(past.base, kept)
-        lag = restored(latest, base, past.measurements, past.delivery, past.late_since_ns)
+        lag = restored(latest, past.base, past.measurements, past.delivery, past.late_since_ns)
         world = replace(world, lag=lag)
         return world if past.stamp_ns <= latest.stamp_ns else world.predict_to(past.stamp_ns)
 

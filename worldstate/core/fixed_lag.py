@@ -110,11 +110,7 @@ def _recent(arrivals: list[Arrival], oldest_ns: int) -> tuple[Arrival, ...]:
 
 
 def restored(
-    latest: Memory,
-    base: Memory,
-    measurements: tuple[Timed, ...],
-    delivery: Delivery,
-    since_ns: int | None,
+    latest: Memory, base: Memory, measurements: tuple[Timed, ...], delivery: Delivery, since_ns: int | None
 ) -> FixedLag:
     """Return the buffer of a checkpoint: the memory before the first measurement, and after the last."""
     befores = (base, *[None] * max(len(measurements) - 1, 0))

@@ -1,6 +1,10 @@
 """The state that the filter carries from one call to the next."""
 
+import math
 from dataclasses import dataclass, field
+from typing import Annotated, TypeAlias
+
+import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
@@ -9,15 +13,17 @@ from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.ego_motion import EgoBelief
-from worldstate.belief.explanation import ExplanationBelief
+from worldstate.belief.explanation import AsLogs, ExplanationBelief
 from worldstate.belief.hidden_belief import HiddenBelief
 from worldstate.belief.track import Track
-from worldstate.ground.serialisation import ADDED, Count
+from worldstate.ground.serialisation import ADDED, Count, Keys, written_as
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 from worldstate.state import Context, Event, Priors, Relation
 
 from .sequence_memory import SequenceMemory
+
+StampNs: TypeAlias = Annotated[int | None, Keys("stamp_ns")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,35 +49,72 @@ class CountedLook:
     sector_rad: tuple[float, float] | None = None  # Where it searched; None for the view of the context
 
 
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """Posterior of one window alone, at the policy's reference prior; JSON knows no infinity."""
+
+    # (hidden_1 .. hidden_K, visible, none), null for what is impossible.
+    log_probabilities: tuple[Annotated[float | None, Keys("nats")], ...]
+    log_lambda: float | None  # None for a ratio without bound
+    log_evidence: float
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> "Instant":
+        """Return what is kept of a posterior."""
+        *logs, ratio = map(_finite, (*posterior.log_probabilities, posterior.log_lambda))
+        return cls(tuple(logs), ratio, posterior.log_evidence)
+
+    @property
+    def hidden_total(self) -> float:
+        """P(hidden), all directions together, at most one."""
+        logs = [-math.inf if nats is None else nats for nats in self.log_probabilities]
+        return min(float(np.exp(logs)[:-2].sum()), 1.0)
+
+
+def _finite(nats: float) -> float | None:
+    return nats if math.isfinite(nats) else None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Memory:
-    """State of a filter; everything else in it is configuration."""
+    """State of a filter, as checkpoints hold it; everything else in a filter is configuration."""
 
     stamp_ns: int  # Time of the belief
-    explanation: ExplanationBelief  # Which explanation holds
-    lag: BeliefLag  # Its past of one window
-    rules: tuple[SourceRule, ...]  # One of every source, sorted by its name
-    births: tuple[int, ...]  # Hidden entities born so far on each side
-    handover_ns: tuple[int | None, ...]  # Last hand-over on each side
+    explanation: AsLogs = field(metadata=written_as("log_explanations"))  # Which explanation holds
+    lag: BeliefLag = field(metadata=written_as("trail"))  # Its past of one window
+    births: tuple[Count, ...]  # Hidden entities born so far on each side
+    handover_ns: tuple[StampNs, ...]  # Last hand-over on each side
     tracks: tuple[Track, ...] = ()  # Entities
-    seq: int = 0  # Measurements so far
-    sighted: int = 0  # Entities born in view so far
-    last_ns: tuple[tuple[str, int], ...] = ()  # Last time stamp of each source
-    looks: tuple[CountedLook, ...] = ()  # Last look of every sensor, sorted by its name
+    seq: Count = 0  # Measurements so far
+    sighted: Count = 0  # Entities born in view so far
+    # Last time stamp of each source.
+    last_ns: tuple[Annotated[tuple[str, int], Keys("source", "stamp_ns")], ...] = field(
+        default=(), metadata=written_as("last")
+    )
     predicted: Priors | None = None  # Explanation priors of the last update; None before the first
-    # Posterior of the last window alone, at the policy's reference prior; None before the first.
-    instant: Posterior | None = None
-    heard_nats: float = 0.0  # Log-odds of hidden in it by sound alone
+    instant: Instant | None = None  # Of the last window; None before the first
     # How far the threshold has moved, where the policy lets it.
-    threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold)
-    bearing: Bearing | None = None  # Of the last measurement
-    domain: DomainVerdict | None = None  # Of the last measurement
-    sequence: SequenceMemory | None = None  # Who comes into view and when; None without such a model
-    no_sequence: NotUsable | None = None  # Why the last one that should have said so could not
-    advised_ns: tuple[int | None, ...] = ()  # Since when an advisory has been out on each side
-    events: tuple[Event, ...] = ()  # Of the last measurement
-    ego: EgoBelief | None = None  # By odometry; None without
-    relations: tuple[Relation, ...] = ()  # Then, with the intervals in which they have held
+    threshold: AdaptiveThreshold = field(default_factory=AdaptiveThreshold, metadata=ADDED)
+    # One of every source, sorted by its name.
+    rules: tuple[SourceRule, ...] = field(default=(), metadata=ADDED)
+    # Last look of every sensor, sorted by its name.
+    looks: tuple[CountedLook, ...] = field(default=(), metadata=ADDED)
+    bearing: Bearing | None = field(default=None, metadata=ADDED)  # Of the last measurement
+    domain: DomainVerdict | None = field(default=None, metadata=ADDED)  # Of the last measurement
+    # Who comes into view and when; None without such a model, and why the last one could not say so.
+    sequence: SequenceMemory | None = field(default=None, metadata=ADDED)
+    no_sequence: NotUsable | None = field(default=None, metadata=ADDED)
+    heard_nats: float = field(default=0.0, metadata=ADDED)  # Log-odds of hidden in `instant` by sound alone
+    # Since when an advisory has been out on each side.
+    advised_ns: tuple[StampNs, ...] = field(default=(), metadata=ADDED)
+    events: tuple[Event, ...] = field(default=(), metadata=ADDED)  # Of the last measurement
+    # Then, with the intervals in which they have held.
+    relations: tuple[Relation, ...] = field(default=(), metadata=ADDED)
+    ego: EgoBelief | None = field(default=None, metadata=ADDED)  # By odometry; None without
+
+    def __post_init__(self) -> None:
+        if not self.advised_ns:
+            object.__setattr__(self, "advised_ns", (None,) * len(self.births))
 
     @property
     def sides(self) -> HiddenBelief:
@@ -91,10 +134,8 @@ def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memor
         stamp_ns=start_ns,
         explanation=explanation,
         lag=BeliefLag(((start_ns, explanation),)),
-        rules=(),
         births=(0,) * len(directions),
         handover_ns=(None,) * len(directions),
-        advised_ns=(None,) * len(directions),
     )
 
 
@@ -110,5 +151,5 @@ def _first_explanation(context: Context) -> ExplanationBelief:
     if priors is None:
         # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
         # street.
-        return ExplanationBelief.settled(context.directions, context.rates.values_hz)
-    return ExplanationBelief.from_priors(context.directions, priors.hidden, priors.visible, priors.none)
+        return ExplanationBelief.settled(len(context.directions), context.rates.values_hz)
+    return ExplanationBelief.from_priors(len(context.directions), priors.hidden, priors.visible, priors.none)

@@ -20,12 +20,7 @@ from worldstate.abduction.sequence.sequence_chain import (
     states_of,
 )
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.sequence.sequence_model import (
-    COMING_S,
-    GROUPS,
-    SequenceAlarm,
-    SequencePosterior,
-)
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.belief.hidden_belief import HiddenBelief
@@ -217,10 +212,7 @@ def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
 
 
 def informed(
-    kept: SequenceMemory | None,
-    measurement: Measurement,
-    look: Look | None,
-    context: Context,
+    kept: SequenceMemory | None, measurement: Measurement, look: Look | None, context: Context
 ) -> SequenceMemory | None:
     """Return the belief at a measurement after its reading and its look; None before the first reading."""
     reading = measurement.sequence

@@ -18,14 +18,7 @@ from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE,
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import Track
 from worldstate.ground.values import seconds
-from worldstate.state import (
-    Classification,
-    Context,
-    Entity,
-    SearchedView,
-    SensorHealth,
-    Visibility,
-)
+from worldstate.state import Classification, Context, Entity, SearchedView, SensorHealth, Visibility
 from worldstate.state.ego import Ego
 
 from .forecast import Forecast, forecasts
@@ -69,11 +62,7 @@ def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -
 
 
 def _entity(
-    memory: Memory,
-    sides: HiddenBelief,
-    site: SiteGeometry,
-    track: Track,
-    moments: _Moments,
+    memory: Memory, sides: HiddenBelief, site: SiteGeometry, track: Track, moments: _Moments
 ) -> Entity:
     mean, std, (variance, mixed, rate_variance), forecast = moments
     share, existence = hidden_share(track, sides), existence_of(track, sides)

@@ -36,7 +36,7 @@ from worldstate.state import Context
 from worldstate.state.context import seen_from
 
 from .entity_events import HIDDEN, events_between, halves_of_one, published
-from .memory import CountedLook, Memory, SourceRule, priors_of, sides_of
+from .memory import CountedLook, Instant, Memory, SourceRule, priors_of, sides_of
 from .relations import relations_at
 from .sequence_memory import carried, informed
 
@@ -135,10 +135,7 @@ def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings
     last = _last_look(memory, sensor)
     heard_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
     looked_s = max(seconds(look_ns - (start_ns if last is None else last.stamp_ns)), 0.0)
-    return Weights(
-        min(heard_s / settings.window_s, 1.0),
-        min(looked_s / settings.look_interval_s, 1.0),
-    )
+    return Weights(min(heard_s / settings.window_s, 1.0), min(looked_s / settings.look_interval_s, 1.0))
 
 
 def counted_once(memory: Memory, measurement: Measurement) -> tuple[Memory, Measurement, bool]:
@@ -252,12 +249,7 @@ def update_sightings(
 ) -> Memory:
     """Return the memory after detections, missed detections and hand-overs."""
     seen = vision_update(
-        memory.tracks,
-        memory.explanation,
-        measurement,
-        weights.look,
-        memory.sighted,
-        model.site,
+        memory.tracks, memory.explanation, measurement, weights.look, memory.sighted, model.site
     )
     return _after_look(memory, seen, measurement.stamp_ns, model)
 
@@ -354,7 +346,7 @@ def _ruled(
     rules = (*others, SourceRule(source, rule.run, rule.alarm, stamp_ns, fault, announced))
     return replace(
         memory,
-        instant=instant,
+        instant=Instant.of(instant),
         heard_nats=posterior_of(log_prior, said, _NO_LOOK).log_lambda,
         rules=tuple(sorted(rules, key=attrgetter("source"))),
     )

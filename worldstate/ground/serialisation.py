@@ -8,17 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from operator import attrgetter
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    TypeAlias,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +115,11 @@ Count: TypeAlias = Annotated[int, Check("a count", lambda value: value >= 0, {"m
 ADDED = {"added": True}
 # Metadata of a field: the keys of its dataclass stand among those of the one that holds it.
 FLAT = {"flat": True}
+
+
+def written_as(key: str) -> dict[str, str]:
+    """Return the metadata of a field that is written under another name than its own."""
+    return {"key": key}
 
 
 class _RefusedError(Exception):
@@ -302,7 +297,8 @@ def _record(cls: Any) -> Plan:
     plans = {member.name: _plan(hints[member.name]) for member in members}
     flat = {member.name: plans.pop(member.name) for member in members if member.metadata.get("flat")}
     added = {member.name for member in members if member.metadata.get("added")}
-    write = _writer(layout, {name: write for name, (write, _) in plans.items()}, flat)
+    keys = {member.name: member.metadata.get("key", member.name) for member in members}
+    write = _writer(layout, {name: write for name, (write, _) in plans.items()}, flat, keys)
 
     def read(data: object) -> dict[str, Any]:
         entries = _object(data)
@@ -314,26 +310,28 @@ def _record(cls: Any) -> Plan:
         values = {name: read_flat(data) for name, (_, read_flat) in flat.items()}
         try:
             for name, (_, read_value) in plans.items():
-                entry = entries.get(name)
+                entry = entries.get(keys[name])
                 if entry is not None or name not in added:
                     values[name] = read_value(entry)
         except _RefusedError as error:
-            raise error.at(f".{name}") from error.__cause__
+            raise error.at(f".{keys[name]}") from error.__cause__
         return values
 
     return write, _then(read, lambda values: cls(**values))
 
 
-def _writer(layout: Layout, writers: dict[str, Write], flat: dict[str, Plan]) -> Write:
+def _writer(
+    layout: Layout, writers: dict[str, Write], flat: dict[str, Plan], keys: Mapping[str, str]
+) -> Write:
     """Return the function that writes a dataclass: fields that stand as they are first, for speed."""
     stamp = {"schema": {"name": layout.schema, "version": layout.version}} if layout.schema else {}
-    constants, names = {**stamp, **layout.constants}, (*writers, *flat)
-    changed = [(name, write) for name, write in writers.items() if write is not _as_is]
+    constants, pairs = {**stamp, **layout.constants}, [(keys[name], name) for name in (*writers, *flat)]
+    changed = [(keys[name], write) for name, write in writers.items() if write is not _as_is]
 
     def write(value: Any) -> dict[str, Any]:
-        record = constants | {name: getattr(value, name) for name in names}
-        for name, write_value in changed:
-            record[name] = write_value(record[name])
+        record = constants | {key: getattr(value, name) for key, name in pairs}
+        for key, write_value in changed:
+            record[key] = write_value(record[key])
         for name, (write_flat, _) in flat.items():
             record |= write_flat(record.pop(name))
         return record
@@ -397,13 +395,8 @@ def _sequence(hint: Hint) -> Plan:
     write, read = _plan(hint)
 
     def read_all(data: object) -> tuple[Any, ...]:
-        items, values = _items(data), []
-        try:
-            for item in items:
-                values.append(read(item))
-        except _RefusedError as error:
-            raise error.at(f"[{len(values)}]") from error.__cause__
-        return tuple(values)
+        items = _items(data)
+        return tuple(_entry(items, i, read) for i in range(len(items)))
 
     return (list if write is _as_is else lambda values: [write(value) for value in values]), read_all
 

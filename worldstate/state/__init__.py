@@ -1,30 +1,5 @@
 """S_t = {entities, relations, context, cues} as immutable values."""
 
-from .context import Context, Occluder, Priors, Rates, blind_corner
-from .cue import Advisory, EvidenceTerms, RiskCue
-from .entity import Classification, Entity, Visibility
-from .event import Event
-from .relation import Relation
-from .sensor import SearchedView, SensorHealth
-from .world_state import Delivery, WorldState, snapshot_schema
+import lazy_loader
 
-__all__ = [
-    "Advisory",
-    "Classification",
-    "Context",
-    "Delivery",
-    "Entity",
-    "Event",
-    "EvidenceTerms",
-    "Occluder",
-    "Priors",
-    "Rates",
-    "Relation",
-    "RiskCue",
-    "SearchedView",
-    "SensorHealth",
-    "Visibility",
-    "WorldState",
-    "blind_corner",
-    "snapshot_schema",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
