@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.evaluation.against import Comparison
     from worldstate.studies.evaluation.evaluation import Evaluation
+    from worldstate.studies.evaluation.operating_curve import EqualDetection
     from worldstate.studies.evaluation.scores import Score
     from worldstate.studies.signatures.signature_study import SignatureStudy
     from worldstate.studies.trials.classification import Classifiers
@@ -347,6 +348,7 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
 
 def _report(found: "Evaluation") -> dict[str, object]:
     import math
+    from dataclasses import asdict
 
     from worldstate.studies.degradation.degradation_report import degradation_record
 
@@ -362,9 +364,13 @@ def _report(found: "Evaluation") -> dict[str, object]:
         "lacking": dict(found.lacking),
         "cautions": {name: run.cautions for name, run in found.runs.items()},
         "protocols": {
-            name: {method: known(score.figures()) for method, score in scores.items()}
+            name: {
+                method: known(score.figures() | {"false_alarms_upper_90": score.poisson_upper()})
+                for method, score in scores.items()
+            }
             for name, scores in found.scores.items()
         },
+        "equal_detection": {name: [known(asdict(one)) for one in every] for name, every in found.equal.items()},
         "degradation": None if found.degradation is None else degradation_record(found.degradation),
         "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
     }
@@ -381,13 +387,23 @@ def _lines(found: "Evaluation") -> list[str]:
         head = f"{run.protocol.title}: {len(run.trials)} recordings, {hours:.3f} h of them hazard-free"
         lines += ["", head, *run.cautions]
         lines.append(
-            f"{'':36}{'lead s':>8}{'detected':>10}{'random':>8}{'FA/h':>8}{'(95 %)':>14}{'bearing deg':>13}"
+            f"{'':36}{'lead s':>8}{'detected':>10}{'random':>8}{'FA/h':>8}{'(95 %)':>14}{'< (90 %)':>10}"
+            f"{'bearing deg':>13}"
         )
         lines += [_row(name, score) for name, score in scores.items() if not name.startswith("curve")]
+        lines += [_equal_line(one) for one in found.equal.get(name, ())]
         refused = found.refused.get(name, {})
         lines += [f"{method:36}not scored" for method in refused]
         lines += [f"not scored: {why}" for why in dict.fromkeys(refused.values())]
     return lines if found.degradation is None else [*lines, *degradation_lines(found.degradation)]
+
+
+def _equal_line(one: "EqualDetection") -> str:
+    """Say what the two ways to warn cost where both detect as much, each at its best threshold."""
+    return (
+        f"where both detect {one.detected:.2f}, alarms an hour: world-state {one.ours:.0f}, "
+        f"published, sustained {one.baseline:.0f}; ratio {one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}]"
+    )
 
 
 def _row(method: str, score: "Score") -> str:
@@ -403,4 +419,5 @@ def _row(method: str, score: "Score") -> str:
         "-" if figures[name] != figures[name] else format(figures[name], form) for name, form in forms.items()
     )
     interval = f"[{low:.0f}, {high:.0f}]" if low == low else "-"
-    return f"{method:36}{lead:>8}{detected:>10}{random:>8}{alarms:>8}{interval:>14}{bearing:>13}"
+    upper = f"{score.poisson_upper():.0f}" if low == low else "-"
+    return f"{method:36}{lead:>8}{detected:>10}{random:>8}{alarms:>8}{interval:>14}{upper:>10}{bearing:>13}"

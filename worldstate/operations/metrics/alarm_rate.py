@@ -33,6 +33,18 @@ def poisson_interval(count: int, exposure: float, confidence: float = 0.95) -> t
     return low / time, float(gammaincinv(whole + 1.0, 1.0 - tail)) / time
 
 
+def poisson_upper(count: int, exposure: float, confidence: float = 0.9) -> float:
+    """Return the rate that is not exceeded with such confidence: the one-sided exact bound.
+
+    Examples
+    --------
+    >>> round(poisson_upper(0, exposure=1.0), 2)
+    2.3
+    """
+    # The upper end of a two-sided interval leaves as much beyond it on either side.
+    return poisson_interval(count, exposure, 2.0 * confidence - 1.0)[1]
+
+
 def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
     """Return the exact interval of a share.
 

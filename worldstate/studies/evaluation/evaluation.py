@@ -19,6 +19,7 @@ from worldstate.studies.trials.trial import Trial
 
 from .camera_failure import camera_failure, lacking_films
 from .front_end_study import FrontEndStudy, front_end_study
+from .operating_curve import EqualDetection, equal_detection
 from .protocol_run import ProtocolRun, run_protocol
 from .protocols import PROTOCOLS
 from .scores import Score
@@ -65,6 +66,8 @@ class Evaluation:
     settings: EvaluationSettings
     # By protocol and method that is not scored: why its model was not made for the sound of a recording.
     refused: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    # By protocol that does not leave junctions out.
+    equal: Mapping[str, Sequence[EqualDetection]] = field(default_factory=dict)
 
 
 def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
@@ -105,6 +108,10 @@ def evaluate(
         steps.advance()
     scores = _scored(runs, steps)
     rng = np.random.default_rng(settings.seeds[0])
+    drawn = {
+        name: stratified_draws([(t.label, t.site) for t in run.trials], rng, settings.draws)
+        for name, run in runs.items()
+    }
     standing = [trial for trial in trials if not trial.hops.about["moving"]]
     filmed = any(np.isfinite(trial.hops.reference_rad).any() for trial in standing)
     return Evaluation(
@@ -114,14 +121,16 @@ def evaluate(
         lacking,
         runs,
         scores,
-        {
-            name: stratified_draws([(t.label, t.site) for t in run.trials], rng, settings.draws)
-            for name, run in runs.items()
-        },
+        drawn,
         front_end_study(standing, rng, settings.draws) if filmed else None,
         _degradation(left, hearing, engine, steps, settings.degradation, lacking),
         settings,
         refused,
+        {
+            name: equal_detection(run.trials, run.decisions, drawn[name])
+            for name, run in runs.items()
+            if not run.protocol.by_junction
+        },
     )
 
 

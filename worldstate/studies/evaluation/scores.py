@@ -10,7 +10,7 @@ from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.alarm_rate import poisson_interval, random_detection
+from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper, random_detection
 from worldstate.operations.metrics.recording_draws import middle, worst_group
 from worldstate.operations.metrics.roc import rank_wins
 from worldstate.operations.metrics.weighted_figures import (
@@ -177,10 +177,19 @@ class Score:
 
     def poisson(self) -> Interval:
         """Return the exact interval of the false alarms an hour, all recordings together."""
+        onsets, hours = self._false_onsets()
+        return poisson_interval(onsets, hours) if hours else (float("nan"), float("nan"))
+
+    def poisson_upper(self) -> float:
+        """Return what the false alarms an hour do not exceed with a confidence of .9."""
+        onsets, hours = self._false_onsets()
+        return poisson_upper(onsets, hours) if hours else float("nan")
+
+    def _false_onsets(self) -> tuple[int, float]:
+        """Return alarms and hours of hazard-free time."""
         hours = float(self.counts["free_hops"].mean(axis=0).sum()) * _HOURS
         # Seeds hear the same hours: their mean count is one count, not one of S times the hours.
-        onsets = round(float(self.counts["free_onsets"].mean(axis=0).sum()))
-        return poisson_interval(onsets, hours) if hours else (float("nan"), float("nan"))
+        return round(float(self.counts["free_onsets"].mean(axis=0).sum())), hours
 
     def by_site(self) -> dict[str, dict[str, float]]:
         """Return the figures of each junction, by name."""

@@ -50,7 +50,7 @@ from .trial import (
 )
 
 # Changes whenever a pass over the same recording would give other numbers.
-VERSION = 3
+VERSION = 4
 # How the library listens: at its first guess of the site, learning the site, and hearing past the own engine.
 CHAINS = {
     "plain": ListenSettings(site_adaptation=False),
@@ -211,7 +211,9 @@ def _slim(frame: AcousticFrame) -> tuple[Any, ...]:
 def _decided(state: WorldState) -> tuple[Any, ...]:
     raised = [cue for cue in state.cues if cue.advisory]
     told = max(raised or state.cues, key=lambda cue: cue.risk, default=None)
-    score = max((cue.statistic for cue in state.cues), default=np.nan)
+    # What is held against the threshold, as a probability: another threshold would have raised by it.
+    nats = max((cue.evidence.compared_nats for cue in state.cues if cue.evidence), default=np.nan)
+    score = 1.0 / (1.0 + np.exp(-nats))
     side = SIDES.get(told.direction, NO_SIDE) if raised and told is not None else NO_SIDE
     return seconds(state.stamp_ns), bool(raised), side, _bearing(state), score, state.risk, _visible(told)
 

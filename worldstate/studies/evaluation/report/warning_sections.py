@@ -171,7 +171,28 @@ def budget_section(found: Evaluation, values: Values) -> Section:
         "calibration folds; the alarms an hour are counted on the folds that were not used. Intervals as in "
         "Table I.",
     )
-    return Section("Budget and false alarms", (), (table,))
+    return Section("Budget and false alarms", (), (table, _equal_table(found)))
+
+
+def _equal_table(found: Evaluation) -> ReportTable:
+    """Return what the world-state and the sustained baseline cost where both detect as much."""
+    rows = tuple(
+        (
+            Value(one.detected),
+            Value(one.ours, digits=0),
+            Value(one.baseline, digits=0),
+            Value(one.ratio, one.low, one.high),
+        )
+        for one in found.equal.get(STATIC.name, ())
+    )
+    return ReportTable(
+        "equal_detection",
+        "False alarms at equal detection",
+        ("detected (share)", "world-state (1/h)", "published, sustained (1/h)", "ratio"),
+        rows,
+        f"{stands_on(found, STATIC.name)}. The least false alarms at which each detects so much, over all "
+        "thresholds, which are read from these recordings, and for the baseline over its sustained hops.",
+    )
 
 
 def cueing_section(found: Evaluation, values: Values, awareness: Sequence[ReportFigure]) -> Section:
