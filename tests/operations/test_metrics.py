@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import bootstrap, poisson
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.alarm_rate import poisson_interval, random_detection
+from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper, random_detection
 from worldstate.operations.metrics.recording_draws import (
     FigureDraws,
     middle,
@@ -26,6 +26,11 @@ def test_the_interval_of_a_rate_holds_the_counts_that_are_not_surprising(count, 
     tail = (1 - confidence) / 2
     assert poisson.cdf(count, high * hours) == pytest.approx(tail, rel=1e-6)
     assert low == 0 if count == 0 else poisson.sf(count - 1, low * hours) == pytest.approx(tail, rel=1e-6)
+
+
+@pytest.mark.parametrize(("count", "hours"), [(0, 1.0), (7, 0.5), (40, 3.0)])
+def test_a_rate_at_its_upper_bound_gives_so_few_counts_once_in_ten(count, hours):
+    assert poisson.cdf(count, poisson_upper(count, hours) * hours) == pytest.approx(0.1, rel=1e-6)
 
 
 @pytest.mark.parametrize("arguments", [(-1, 1.0), (1, 0.0), (1, 1.0, 1.0)])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from worldstate.abduction.absence import default_miss_rates
 from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.audio.open_sound import open_sound
 from worldstate.adapters.camera.camera_channel import Watcher
@@ -23,7 +24,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import OvadDataset, Recording
 from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
-from worldstate.adapters.listen import measure_steps, open_source
+from worldstate.adapters.listen import listen_steps, measure_steps, open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
@@ -47,6 +48,13 @@ from worldstate.studies.degradation.looks import (
 )
 from worldstate.studies.degradation.rain import RAIN_DB, level_rms, rained
 from worldstate.studies.degradation.staged_filter import by_condition, cameras, filter_in_conditions
+from worldstate.studies.degradation.stream_sweep import (
+    STATES,
+    missed,
+    staged_advisories,
+    stream_lines,
+    stream_sweep,
+)
 from worldstate.studies.trials.engine import Engine
 from worldstate.studies.trials.pass_cache import PassCache
 
@@ -205,7 +213,9 @@ def assert_the_sound_says_the_same(source, off):
     world, presence, said = WorldFilter(context=source.context, policy=source.policy), [], []
     for _, measurement in measure_steps(replace(source, detections=None)):
         world = world.predict_to(measurement.stamp_ns).update(measurement)
-        presence.append(1.0 - world.explanation.none)
+        presence.append(
+            1.0 - np.prod([1.0 - e.existence_probability for e in world.state.entities if e.moving])
+        )
         said.append(measurement.signature.log_likelihoods)
     assert off.log_likelihoods == pytest.approx(np.array(said))
     assert off.presence == pytest.approx(np.array(presence))
@@ -234,6 +244,61 @@ def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(appr
     }
     assert np.median([b for t, b in betas.items() if t < 4_500_000_000]) < 0.4
     assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
+
+
+def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
+    box = DetectionFrame(np.array([[900.0, 500.0, 1000.0, 600.0]]), np.array([0.9]), ("car",))
+    log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates(90.0)
+    left = {
+        d: np.array(
+            [len(one.boxes_px) for one in missed(log, WHOLE, table, d, np.random.default_rng(1)).frames]
+        )
+        for d in (0.0, 0.5, 1.0)
+    }
+    assert left[0.0].all()
+    azimuth = WHOLE.sighting(box.boxes_px[0], "car", 0.9).azimuth_rad
+    for d in (0.5, 1.0):
+        # Of what a clean camera reports; four standard errors of 2000 draws.
+        expected = (1.0 - table(azimuth, d)) / (1.0 - table(azimuth))
+        assert left[d].mean() == pytest.approx(expected, abs=4 * (expected / 2000) ** 0.5)
+    assert not (left[1.0] > left[0.5]).any()
+
+
+def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
+    hops = 6000
+    onsets = dict.fromkeys((state.name for state in STATES), range(0, hops, 600))
+    onsets["lens 1"], onsets["off"] = range(0, hops, 300), ()
+    rows = []
+    for name, first in onsets.items():
+        advised = np.zeros(hops, bool)
+        for hop in first:
+            advised[hop + 5 : hop + 20] = True
+        columns = {"condition": np.full(hops, name), "time_s": 0.1 * np.arange(hops), "advised": advised}
+        rows.append(HopTable(columns))
+    sweep = stream_sweep([joined(rows)] * 3, seed=0)
+    by_name = {row.name: row for row in sweep.rows}
+    assert sweep.hours == pytest.approx(0.5)
+    assert by_name[CLEAN].onsets == 30 and by_name[CLEAN].per_hour.value == pytest.approx(60.0)
+    # An onset a minute against two, in every minute: no draw of minutes changes that.
+    assert by_name["lens 1"].ratio == pytest.approx((2.0, 2.0, 2.0))
+    assert by_name["off"].onsets == 0 and by_name["off"].upper_90 == pytest.approx(np.log(10.0) / 0.5)
+    assert any(
+        line.startswith("lens 1") and "2.00 [2.00, 2.00]" in " ".join(line.split())
+        for line in stream_lines(sweep)
+    )
+
+
+def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
+    found = staged_advisories(approach.folder, None, 0)
+    names = found.condition.tolist()
+    assert list(dict.fromkeys(names)) == [state.name for state in STATES]
+    chain = [
+        any(cue.advisory for cue in step.state.cues) for step in listen_steps(open_source(approach.folder))
+    ]
+    assert any(chain)
+    assert found.advised[found.condition == CLEAN].tolist() == chain
+    # Drops on every microphone drown the vehicle.
+    assert found.advised[found.condition == "roof 1"].sum() < sum(chain)
 
 
 def test_rain_on_the_roof_is_white_and_its_own_at_every_microphone(approach):

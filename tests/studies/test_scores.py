@@ -18,6 +18,7 @@ from worldstate.frontend.direction.gating import gating_curve
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.recording_draws import stratified_draws
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.studies.evaluation.operating_curve import BASELINE, DETECTED, OURS, equal_detection
 from worldstate.studies.evaluation.scores import Score, paired
 from worldstate.studies.trials.trial import TRUTH_COLUMNS, Trial
 
@@ -315,6 +316,36 @@ def test_false_alarms_have_their_exact_interval():
     expected = (chi2.ppf(0.025, 2 * count) / 2 / hours, chi2.ppf(0.975, 2 * count + 2) / 2 / hours)
     low_high = score.intervals(stratified_draws(score.draw_strata, np.random.default_rng(0), 5))
     assert low_high["false_alarms_per_hour_poisson"] == pytest.approx(expected)
+
+
+def scored(trial, levels):
+    """An answer of which only the score counts: a level from each start on, for half a second."""
+    time_s, score = trial.hops.time_s, np.full(len(trial.hops), 0.01)
+    for start_s, level in levels:
+        score[(time_s > start_s - 1e-6) & (time_s < start_s + 0.5 - 1e-6)] = level
+    return alarmed(trial, [], score=score)
+
+
+def test_false_alarms_are_compared_where_both_detect_as_much():
+    near = [made_up(f"a{i}", "left", t0_s=7.0) for i in range(10)]
+    calm = [made_up("c"), made_up("d")]
+    trials = [*near, *calm]
+    # Ours tells nine of ten apart from a burst of its own that is as high as the tenth, the baseline none.
+    ours = [scored(one, [(5.5, 0.9 if i else 0.2)]) for i, one in enumerate(near)]
+    ours += [scored(calm[0], [(3.0, 0.5)]), scored(calm[1], [])]
+    theirs = [scored(one, [(5.5, 0.6)]) for one in near] + [
+        scored(one, [(2.0, 0.8), (5.0, 0.8)]) for one in calm
+    ]
+    draws = stratified_draws([trial.label for trial in trials], np.random.default_rng(0), 100)
+    found = {one.detected: one for one in equal_detection(trials, {OURS: [ours], BASELINE: [theirs]}, draws)}
+    hours = 162 * 0.1 / 3600.0
+    assert tuple(found) == DETECTED
+    assert found[0.9].ours == 0.0 and found[0.9].baseline == pytest.approx(4 / hours)
+    assert found[0.9].ratio == found[0.9].low == 0.0
+    # The tenth costs the burst.
+    assert found[0.95].ours == pytest.approx(1 / hours) and found[0.95].ratio == pytest.approx(0.25)
+    assert found[0.95].low == 0.0 and found[0.95].high <= 0.5
+    assert not equal_detection(trials, {BASELINE: [theirs]}, draws)
 
 
 def test_sites_stand_beside_the_worst_of_them():

@@ -20,6 +20,9 @@ What was heard is kept in OUT/cache by the content of each recording: an interru
 stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for
 leaving junctions out two junctions that have both; what a protocol lacks is said before anything is heard.
 
+--stage-streams lets camera and rain fail on the streams of --hazard-free as well, and prints advisories an
+hour in every state beside those of the clean camera, on the same minutes: half an hour for each hour.
+
 A recording that cannot be heard is named and left out. Rows of a model that was not made for the array of the
 recordings are named and not scored.
 """
@@ -80,6 +83,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--dynamic-ids", type=Path, metavar="CSV", help="tested recordings of a moving ego")
     add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="more time without a vehicle")
     add("--hazard-free-hours", type=float, metavar="H", help="score so many hours of it (default: all)")
+    add("--stage-streams", action="store_true", help="let camera and rain fail on the streams of it, too")
     add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
     add("--idmt", type=Path, metavar="DIR", help="IDMT-Traffic, for the signature study")
@@ -119,7 +123,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
             _Bars(stack),
             EvaluationSettings(
-                seeds, arguments.hazard_free_hours, degradation=_degradation(arguments, classifiers, takes)
+                seeds,
+                arguments.hazard_free_hours,
+                degradation=_degradation(arguments, classifiers, takes),
+                stage_streams=arguments.stage_streams,
             ),
         )
     save_scores(arguments.out, found.scores, COMPARABLE)
@@ -165,16 +172,19 @@ def _degradation(
 ) -> "DegradationSettings":
     """Return the sweep over camera states; in a smoke test of one detector on small images.
 
-    It listens with --model, else with a model trained on the training windows, else with the one that ships.
+    It listens with --model, else with the model that ships, and where that was not made for this sound with
+    one that is trained on the training windows.
     """
+    from worldstate.adapters.files.model_file import read_model
     from worldstate.studies.degradation.degradation_study import DegradationSettings
     from worldstate.studies.degradation.looks import StagedDetector, motion_detectors
     from worldstate.studies.evaluation.camera_failure import whole_sweep
+    from worldstate.studies.trials.listening import model_refusal
     from worldstate.studies.trials.training_windows import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
-    filmed = any(take.filmed for take in takes.static)
-    if filmed and model is None and classifiers.windows is not None and not arguments.smoke:
+    foreign = any(model_refusal(take, read_model(None)) for take in takes.static if take.filmed)
+    if foreign and model is None and classifiers.windows is not None and not arguments.smoke:
         model = model_from_windows(classifiers.windows, arguments.out / "cache", seed)
     if arguments.smoke:
         return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
@@ -351,6 +361,7 @@ def _report(found: "Evaluation") -> dict[str, object]:
     from dataclasses import asdict
 
     from worldstate.studies.degradation.degradation_report import degradation_record
+    from worldstate.studies.degradation.stream_sweep import stream_record
 
     def known(values: "dict[str, float]") -> dict[str, float | None]:
         return {name: value if math.isfinite(value) else None for name, value in values.items()}
@@ -370,14 +381,18 @@ def _report(found: "Evaluation") -> dict[str, object]:
             }
             for name, scores in found.scores.items()
         },
-        "equal_detection": {name: [known(asdict(one)) for one in every] for name, every in found.equal.items()},
+        "equal_detection": {
+            name: [known(asdict(one)) for one in every] for name, every in found.equal.items()
+        },
         "degradation": None if found.degradation is None else degradation_record(found.degradation),
+        "staged_streams": None if found.staged is None else stream_record(found.staged),
         "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
     }
 
 
 def _lines(found: "Evaluation") -> list[str]:
     from worldstate.studies.degradation.degradation_report import degradation_lines
+    from worldstate.studies.degradation.stream_sweep import stream_lines
 
     lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
@@ -395,7 +410,8 @@ def _lines(found: "Evaluation") -> list[str]:
         refused = found.refused.get(name, {})
         lines += [f"{method:36}not scored" for method in refused]
         lines += [f"not scored: {why}" for why in dict.fromkeys(refused.values())]
-    return lines if found.degradation is None else [*lines, *degradation_lines(found.degradation)]
+    lines += [] if found.degradation is None else degradation_lines(found.degradation)
+    return lines if found.staged is None else [*lines, *stream_lines(found.staged)]
 
 
 def _equal_line(one: "EqualDetection") -> str:

@@ -1,5 +1,6 @@
 """Filter one recording in every condition: its sound heard dry and in the rain, its camera as it was seen."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -24,7 +25,7 @@ from .looks import READINGS, StagedDetector, degradation_in, detections_in
 from .rain import level_rms, rained
 
 # Changes whenever the same sound and looks would give other beliefs.
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +65,9 @@ def filter_in_conditions(
 ) -> dict[str, HopTable]:
     """Return what the filter made of one recording with each detector, all conditions end to end.
 
-    Columns are those of a hop stream and `condition`; `degradation`, d as it was estimated; `presence`,
-    P(hidden) + P(visible) of the filter; and `found`, whether a moving object that is in view was detected,
-    where `seen` takes any detection.
+    Columns are those of a hop stream and `condition`; `degradation`, d as it was estimated; `presence`, the
+    chance that anybody is there, hidden or visible, by the entities that the filter publishes; and `found`,
+    whether a moving object that is in view was detected, where `seen` takes any detection.
     """
     rms = level_rms(source)
 
@@ -140,9 +141,14 @@ def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Seque
 
 
 def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float]:
-    """P(hidden) + P(visible) of the filter at every hop."""
+    r"""Return the chance that anybody is there at every hop, :math:`1 - \prod_i (1 - r_i)`.
+
+    Of the entities, not of the explanations: what the camera has shown, or the sequence has told, stays in
+    them while the window at hand tells nothing.
+    """
     world, presence = WorldFilter(context=source.context, policy=source.policy), []
     for measurement in measurements:
         world = world.predict_to(measurement.stamp_ns).update(measurement)
-        presence.append(1.0 - world.explanation.none)
+        absent = (1.0 - one.existence_probability for one in world.state.entities if one.moving)
+        presence.append(1.0 - math.prod(absent))
     return presence

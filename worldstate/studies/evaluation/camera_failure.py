@@ -1,12 +1,14 @@
-"""The degradation sweep on the recordings of an evaluation that were filmed."""
+"""The degradation sweep on the recordings of an evaluation that were filmed, and on its streams."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.files.model_file import model_to_dict, read_model
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.studies.degradation.degradation_study import (
     DegradationSettings,
     DegradationStudy,
@@ -14,11 +16,19 @@ from worldstate.studies.degradation.degradation_study import (
     Tables,
     degradation_study,
 )
+from worldstate.studies.degradation.stream_sweep import (
+    VERSION,
+    StreamSweep,
+    staged_advisories,
+    states_told,
+    stream_sweep,
+)
 from worldstate.studies.degradation.sweep_data import sweep_data
 from worldstate.studies.trials.engine import Engine, Failed
+from worldstate.studies.trials.hearing import Hearing
 from worldstate.studies.trials.listening import model_refusal
 from worldstate.studies.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
-from worldstate.studies.trials.takes import TakeList
+from worldstate.studies.trials.takes import Take, TakeList
 
 Begin = Callable[[str, int], None]
 
@@ -58,6 +68,44 @@ def camera_failure(
     return degradation_study(
         _filmed(takes), settings, over=over, keep=PassCache(cache).tables, fingerprint=named
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Staged:
+    """Work on one stream, in any process."""
+
+    hearing: Hearing
+    seed: int
+
+    def __call__(self, take: Take) -> HopTable:
+        """Return the advisories of every state of the camera, or what an earlier run found."""
+        folder, model = self.hearing.folder, self.hearing.model
+        mark = fingerprint(take.path, FingerprintMemo(folder / "fingerprints"))
+        key = [VERSION, mark, states_told(), model_to_dict(read_model(model)), self.seed]
+
+        def make() -> dict[str, HopTable]:
+            return {"advised": staged_advisories(take.path, model, self.seed)}
+
+        return PassCache(folder).tables("staged-streams", key, make)["advised"]
+
+
+def staged_streams(
+    takes: Sequence[Take],
+    hearing: Hearing,
+    engine: Engine,
+    seed: int,
+    begin: Begin,
+    advance: Callable[[], None],
+) -> StreamSweep:
+    """Stage every state of camera and roof on streams that nobody comes out of a hidden arm in."""
+    begin("staging camera and rain on streams", len(takes))
+    found = []
+    for one in engine.over(_Staged(hearing, seed), takes, lambda take: take.name):
+        if isinstance(one, Failed):
+            raise InvalidArgumentError(f"{one.name}: {one.problem}")
+        found.append(one)
+        advance()
+    return stream_sweep(found, seed)
 
 
 def _filmed(takes: TakeList) -> list[Recording]:

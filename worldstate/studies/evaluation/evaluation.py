@@ -10,6 +10,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import IndexArray
 from worldstate.operations.metrics.recording_draws import DRAWS, stratified_draws
 from worldstate.studies.degradation.degradation_study import DegradationSettings, DegradationStudy
+from worldstate.studies.degradation.stream_sweep import StreamSweep
 from worldstate.studies.methods.table_rows import methods_for, refused_methods
 from worldstate.studies.trials.classification import Classifiers
 from worldstate.studies.trials.engine import Engine, Failed
@@ -17,7 +18,7 @@ from worldstate.studies.trials.hearing import Hearing, hear, within_hours
 from worldstate.studies.trials.takes import Take, TakeList
 from worldstate.studies.trials.trial import Trial
 
-from .camera_failure import camera_failure, lacking_films
+from .camera_failure import camera_failure, lacking_films, staged_streams
 from .front_end_study import FrontEndStudy, front_end_study
 from .operating_curve import EqualDetection, equal_detection
 from .protocol_run import ProtocolRun, run_protocol
@@ -48,6 +49,7 @@ class EvaluationSettings:
     hazard_free_hours: float | None = None  # Of hazard-free time that is scored; all where not given
     draws: int = DRAWS  # Samples of recordings that intervals are read from
     degradation: DegradationSettings | None = None  # Of the camera; not swept where not given
+    stage_streams: bool = False  # Whether camera and rain are staged on hazard-free streams as well
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +70,7 @@ class Evaluation:
     refused: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     # By protocol that does not leave junctions out.
     equal: Mapping[str, Sequence[EqualDetection]] = field(default_factory=dict)
+    staged: StreamSweep | None = None  # Camera and rain on hazard-free streams
 
 
 def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
@@ -131,6 +134,7 @@ def evaluate(
             for name, run in runs.items()
             if not run.protocol.by_junction
         },
+        _staged(left, trials, hearing, engine, steps, settings),
     )
 
 
@@ -175,3 +179,21 @@ def _degradation(
         # Broken videos may leave it fewer recordings than it needs: no reason to lose all other figures.
         lacking["degradation sweep"] = str(error)
         return None
+
+
+def _staged(
+    takes: TakeList,
+    trials: Sequence[Trial],
+    hearing: Hearing,
+    engine: Engine,
+    steps: Steps,
+    settings: EvaluationSettings,
+) -> StreamSweep | None:
+    if not settings.stage_streams:
+        return None
+    names = {str(trial.hops.about["stream"]) for trial in trials if "stream" in trial.hops.about}
+    streams = [take for take in takes.static if take.name in names]
+    if not streams:
+        wanted = "expected streams of two minutes and more with --hazard-free"
+        raise InvalidArgumentError(f"--stage-streams: {wanted}, got none")
+    return staged_streams(streams, hearing, engine, settings.seeds[0], steps.begin, steps.advance)

@@ -19,8 +19,9 @@ from .reduction import alarm_counts
 
 BASELINE, OURS = "published, sustained", "world-state advisory"
 DETECTED = (0.8, 0.85, 0.9, 0.95)
-# Quantiles of the hazard-free scores: where few alarms are left, each of them is a threshold of its own.
-_SHARES = np.geomspace(1e-5, 0.5, 60)
+# Shares of the hazard-free scores above a threshold, where few alarms are left each of them by itself; and
+# of the scores before T0, beside the highest one of each approach, above which it is missed.
+_CALM_SHARES, _NEAR_SHARES = np.geomspace(1e-5, 0.5, 60), np.linspace(0.0, 1.0, 30)
 _COUNTS = ("approaches", "detected", "free_hops", "free_onsets")
 # From a score and a threshold to the alarm of a recording.
 Rule = Callable[[FloatArray, float], BoolArray]
@@ -59,16 +60,24 @@ def operating_curve(
     trials: Sequence[Trial], said: Sequence[Decisions], rules: Iterable[Rule]
 ) -> OperatingCurve:
     """Return the curve of some rules over all thresholds of their score."""
-    calm = [one.score for trial, one in zip(trials, said, strict=True) if trial.hazard_free]
-    levels = np.unique(np.quantile(np.concatenate(calm), 1.0 - _SHARES, method="higher"))
-    # Above every hazard-free score: no false alarm, and what is detected then.
-    levels = np.append(levels, np.nextafter(levels[-1], np.inf))
+    levels = _levels(trials, said)
     rows = [
         [_counted(trial, one, rule(one.score, level)) for trial, one in zip(trials, said, strict=True)]
         for rule in rules
-        for level in levels.tolist()
+        for level in levels
     ]
     return OperatingCurve({name: np.array([[one[name] for one in row] for row in rows]) for name in _COUNTS})
+
+
+def _levels(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[float]:
+    """Return thresholds from where half of the hazard-free hops are above to where none is."""
+    pairs = list(zip(trials, said, strict=True))
+    calm = np.concatenate([one.score for trial, one in pairs if trial.hazard_free])
+    near = [one.score[trial.hops.before_sight()] for trial, one in pairs if not trial.hazard_free]
+    found = [np.quantile(calm, 1.0 - _CALM_SHARES, method="higher"), [np.nextafter(calm.max(), np.inf)]]
+    found += [[one.max() for one in near if one.size]]
+    found += [np.quantile(np.concatenate(near), 1.0 - _NEAR_SHARES, method="higher")]
+    return [float(level) for level in np.unique(np.concatenate(found))]
 
 
 def equal_detection(

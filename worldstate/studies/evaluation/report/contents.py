@@ -41,7 +41,9 @@ def evaluation_document(
         study.front_end_section(found, values),
         study.approach_rate_section(values),
         study.transfer_section(found, values),
-        degradation_section(found.degradation, found.lacking.get("degradation sweep", "not asked for")),
+        degradation_section(
+            found.degradation, found.lacking.get("degradation sweep", "not asked for"), found.staged
+        ),
         *((study.ablation_section(found, values),) if static else ()),
         study.signature_section(signatures),
         *((warning.tracking_section(found, values),) if static else ()),

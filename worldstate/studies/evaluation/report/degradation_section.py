@@ -8,6 +8,7 @@ from worldstate.studies.degradation.awareness import AwarenessRow, Estimate
 from worldstate.studies.degradation.beta_curves import Band
 from worldstate.studies.degradation.conditions import FAMILIES, OFF
 from worldstate.studies.degradation.degradation_study import DegradationStudy, DetectorSweep
+from worldstate.studies.degradation.stream_sweep import StreamSweep
 from worldstate.studies.evaluation.paper_values import COMMANDS, paper_value
 
 from .cueing_panels import awareness_figure
@@ -63,11 +64,14 @@ def awareness_figures(study: DegradationStudy) -> tuple[ReportFigure, ...]:
     return tuple(figures)
 
 
-def degradation_section(study: DegradationStudy | None, lacking: str) -> Section:
+def degradation_section(
+    study: DegradationStudy | None, lacking: str, staged: StreamSweep | None = None
+) -> Section:
     """Return miss rates and awareness of every detector, or what is lacking and what would fill them."""
-    title = "Vision degradation"
+    title, streams = "Vision degradation", () if staged is None else (_streams(staged),)
     if study is None:
-        return Section(title, (f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it.",))
+        told = f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it."
+        return Section(title, (told,), streams)
     names = " and ".join(sweep.detector for sweep in study.sweeps)
     model = study.settings.model
     heard = "the model that ships" if model is None else f"the model {model.name}"
@@ -84,7 +88,29 @@ def degradation_section(study: DegradationStudy | None, lacking: str) -> Section
             f"{study.largest_awareness_difference:.3f}, beta by {study.beta_shift:+.3f} in the mean."
         )
     parts = tuple(_detector_section(sweep, number) for number, sweep in enumerate(study.sweeps, start=1))
-    return Section(title, tuple(text), (), parts)
+    return Section(title, tuple(text), streams, parts)
+
+
+def _streams(sweep: StreamSweep) -> ReportTable:
+    rows = tuple(
+        (
+            row.name,
+            Value(row.onsets, digits=0),
+            replace(_value(row.per_hour), digits=1),
+            Value(row.upper_90, digits=1),
+            _value(row.ratio),
+        )
+        for row in sweep.rows
+    )
+    return ReportTable(
+        "staged_streams",
+        "Advisories where nobody comes, while the camera fails and it rains",
+        ("state", "onsets", "an hour", "at most (90 %)", "to the clean camera"),
+        rows,
+        f"On {sweep.hours:.2f} h of streams without hazards; the boxes of the camera are left out as often "
+        "as the table of miss rates says, and it states how degraded it is. Ratios draw minutes, the same "
+        "for both.",
+    )
 
 
 def _detector_section(sweep: DetectorSweep, number: int) -> Section:
