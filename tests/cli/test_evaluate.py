@@ -105,6 +105,8 @@ def test_partial_data_are_refused_with_what_is_missing(smoke, tmp_path, capsys):
     assert said.count("out_multi.wav") == 4 and "4 things are missing" in said
     assert main(["evaluate", str(tmp_path), "--out", str(tmp_path / "no")]) == 2
     assert "DataLog.csv" in capsys.readouterr().err
+    assert main(["evaluate", str(broken), "--stage-streams", "--out", str(tmp_path / "no")]) == 2
+    assert "expected streams with --hazard-free" in capsys.readouterr().err
     assert time.monotonic() - started < 10.0
     assert not (tmp_path / "no" / "cache").exists()
 

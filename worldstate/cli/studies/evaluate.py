@@ -203,6 +203,8 @@ def _check(arguments: argparse.Namespace) -> None:
     in_range("--jobs", arguments.jobs, 1, 256)
     if (arguments.engine == "dask") != (arguments.scheduler is not None):
         raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
+    if arguments.stage_streams and not arguments.hazard_free:
+        raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
         raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
 

@@ -98,6 +98,8 @@ def staged_streams(
     advance: Callable[[], None],
 ) -> StreamSweep:
     """Stage every state of camera and roof on streams that nobody comes out of a hidden arm in."""
+    if not takes:
+        raise InvalidArgumentError("needs a stream of two minutes or more without hazards, found none")
     begin("staging camera and rain on streams", len(takes))
     found = []
     for one in engine.over(_Staged(hearing, seed), takes, lambda take: take.name):

@@ -100,9 +100,10 @@ def _compared(
     detected: float, ours: OperatingCurve, baseline: OperatingCurve, weights: FloatArray
 ) -> EqualDetection:
     a, b = (curve.alarms_per_hour(detected, weights) for curve in (ours, baseline))
-    # Neither alarm nor threshold: nothing to compare on that draw.
+    # On a draw without alarms, or that one of them cannot detect so much of, there is nothing to compare.
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = a / b
+    shares[1:][np.isinf(shares[1:])] = np.nan
     return EqualDetection(detected, float(a[0]), float(b[0]), float(shares[0]), *middle(shares[1:]))
 
 
