@@ -12,6 +12,7 @@ from worldstate.abduction.road_users import ClassShares, RoadUserModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral
 from worldstate.abduction.signature.model_domain import ModelDomain
+from worldstate.adapters.camera.several_cameras import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.direct_sound import direct_probability
@@ -276,13 +277,14 @@ def asked_again(
 ) -> Measurement:
     """Return a measurement with the answers of a camera, or of none; what was heard stays as it is."""
     if vision is None:
-        return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None)
+        return replace(measurement, co_evidence=Unqueried("no camera"), sightings=(), look=None, further=())
     stamp_ns = measurement.stamp_ns
     return replace(
         measurement,
         co_evidence=_answer(measurement, vision, settings or AcousticSettings()),
         sightings=vision.sightings(stamp_ns),
         look=vision.last_look(stamp_ns),
+        further=vision.looks(stamp_ns)[1:] if isinstance(vision, SeveralCameras) else (),
     )
 
 

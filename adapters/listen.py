@@ -1,6 +1,5 @@
 """The whole chain over a recording: sound in, one world-state a hop out."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -707,7 +706,4 @@ def unoccluded_sector(context: Context) -> Sector:
     >>> bool(sector.touches(0.5)), bool(sector.touches(0.7))
     (True, False)
     """
-    edges = [occluder.edge_azimuth_rad for occluder in context.occluders]
-    left = min((edge for edge in edges if edge > 0), default=math.pi / 2)
-    right = max((edge for edge in edges if edge < 0), default=-math.pi / 2)
-    return Sector.between(right, left)
+    return Sector.in_sight(occluder.edge_azimuth_rad for occluder in context.occluders)

@@ -138,7 +138,7 @@ class VisionQuery:
         self.settings = settings or VisionSettings()
         self._degradation = degradation
         self._last: tuple[int, tuple[Sighting, ...]] = (-1, ())
-        self._view = Sector.between(*camera.view_rad)
+        self.view = Sector.between(*camera.view_rad)
         self._line_of_sight = line_of_sight
         self._clutter = clutter
         # As background subtraction does: asked for a truck it would never find one.
@@ -183,12 +183,10 @@ class VisionQuery:
             return Unqueried("no detections file")
         if self._frame(stamp_ns) is None:
             return Unqueried(f"no frame at {seconds(stamp_ns):.3f} s")
-        kept, labels = self.settings.keep.labels, expected_labels
-        if labels is None or (labels and self._calls_all_cars):
-            labels = kept
-        if not any(label in kept for label in labels):
+        labels = self._asked_for(expected_labels)
+        if not any(label in self.settings.keep.labels for label in labels):
             return Unqueried("the signature predicts no class that a camera would see")
-        sector = self._sector(bearing, side)
+        sector = self.sector(bearing, side)
         d = self._degraded(stamp_ns)
         beta = self._expected_miss_rate(sector, d, labels)
         if beta is None:
@@ -249,7 +247,7 @@ class VisionQuery:
         if frame is None or self.detections is None:
             return None
         d = self._degraded(stamp_ns)
-        beta = self._expected_miss_rate(self._view, d, self.settings.keep.labels)
+        beta = self._expected_miss_rate(self.view, d, self.settings.keep.labels)
         moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
         answer = (Present if moving else Absent)(1.0 if beta is None else beta, self._clutter_rate(d))
         return Look(SENSOR, int(self.detections.stamps_ns[frame]), answer)
@@ -273,7 +271,17 @@ class VisionQuery:
             for i, stood in zip(kept, still.tolist(), strict=True)
         )
 
-    def _sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:
+    def miss_rate_over(self, sector: Sector, stamp_ns: int, labels: Collection[str] | None) -> float:
+        """Return the expected miss rate in a sector, 1 where nothing of it is in view."""
+        beta = self._expected_miss_rate(sector, self._degraded(stamp_ns), self._asked_for(labels))
+        return 1.0 if beta is None else beta
+
+    def _asked_for(self, expected: Collection[str] | None) -> Collection[str]:
+        if expected is None or (expected and self._calls_all_cars):
+            return self.settings.keep.labels
+        return expected
+
+    def sector(self, bearing: Bearing | NotUsable, side: Side | None) -> Sector:
         """Return the sector in which a visible source would explain the sound."""
         if side is not None or isinstance(bearing, NotUsable):
             sector = WHOLE_SIDES[side]
@@ -285,7 +293,7 @@ class VisionQuery:
 
     def _expected_miss_rate(self, sector: Sector, d: float, labels: Collection[str]) -> float | None:
         """Return beta over the sector, None where nothing of it is in view."""
-        in_view = sector.overlap(self._view)
+        in_view = sector.overlap(self.view)
         if in_view is None:
             return None
         angles = self.camera.off_axis(in_view.midpoints(SAMPLES))

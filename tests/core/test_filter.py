@@ -560,7 +560,7 @@ def test_risk_rises_with_the_posterior_and_equals_the_map_of_the_statistic(first
         m = measured(1.0, (share / 2, share / 2, (1 - share) / 2, (1 - share) / 2), answer=Absent(0.2))
         world = WorldFilter(still(Priors(0.5, 0.25, 0.25)), policy).update(m)
         s = statistic(m.signature, m.co_evidence, policy.reference_prior)
-        assert (world.statistic, world.risk) == pytest.approx((s, policy.risk_map(s)))
+        assert (world.state.cues[0].statistic, world.risk) == pytest.approx((s, policy.risk_map(s)))
         risks.append(world.risk)
     assert (risks[0] < risks[1]) == (first < second) or risks[0] == pytest.approx(risks[1])
 

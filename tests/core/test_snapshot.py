@@ -124,7 +124,7 @@ contexts = st.builds(
         occluders, min_size=1, max_size=3, unique_by=(lambda o: o.id, lambda o: o.direction)
     ).map(tuple),
     priors=maybe(priors()),
-    ego_speed_mps=maybe(number),
+    ego_speed_mps=maybe(st.floats(-100, 100)),
     degradation=maybe(unit),
     site=maybe(name),
     view_half_angle_rad=st.floats(0, 3),

@@ -160,3 +160,49 @@ def test_options_that_say_two_things(tmp_path, capsys, words, said):
 def test_a_name_without_a_car(capsys):
     assert main(["run", "street.wav", "--camera-name", "rear"]) == 2
     assert "--camera-name: expected --car" in capsys.readouterr().err
+
+
+def boxes(folder: Path, name: str, columns_px: list[float]) -> str:
+    frames = [{"boxes": [[x - 15.0, 100.0, x + 15.0, 300.0]], "scores": [0.9], "classes_str": ["car"]}
+              for x in columns_px]  # fmt: skip
+    path = folder / f"{name}.json"
+    path.write_text(json.dumps({"detections_per_frame": frames}))
+    return f"{name}={path}"
+
+
+def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path):
+    """Where both see it: left in the image of the front camera, right in that of the left one."""
+    soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
+    wide = [FRONT | {"horizontal_fov_deg": 90.0}, LEFT | {"horizontal_fov_deg": 90.0}]
+    car, out = written(tmp_path, CAR | {"cameras": wide}), tmp_path / "states.jsonl"
+    sensors, azimuths = read_car(car).cameras, np.radians(26.0 + 0.5 * np.arange(15))
+    told = [boxes(tmp_path, name, sensors[name].column(azimuths).tolist()) for name in ("front", "left")]
+    words = ["--car", str(car), "--camera-detections", *told, "--uncalibrated", "--out", str(out)]
+    assert main(["run", str(tmp_path / "street.wav"), *words]) == 0
+    last = json.loads(out.read_text().splitlines()[-1])
+    assert [(one["sensor"], one["found"]) for one in last["searched"]] == [("front", True), ("left", True)]
+    seen = [one for one in last["entities"] if one["status"] == "visible"]
+    assert len(seen) == 1 and seen[0]["azimuth_rad"] == pytest.approx(azimuths[-1], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--car", "CAR", "--camera-name", "left", "--camera-detections", "front=a.json"],
+            "--camera-detections: expected --car with it, and neither --detections nor --camera-name",
+        ),
+        (["--car", "CAR", "--camera-detections", "a.json"], "expected NAME=PATH of different cameras"),
+        (
+            ["--car", "CAR", "--camera-detections", "rear=a.json"],
+            "camera: expected one of front, left, got rear",
+        ),
+        (["--car", "CAR", "--camera-detections", "left=a.json"], "a.json"),
+    ],
+)
+def test_what_is_wrong_with_the_boxes_of_several_cameras_is_said(tmp_path, capsys, words, said):
+    soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
+    car = str(written(tmp_path, CAR))
+    given = [car if word == "CAR" else word for word in words]
+    assert main(["run", str(tmp_path / "street.wav"), "--uncalibrated", *given]) == 2
+    assert said in capsys.readouterr().err

@@ -11,6 +11,7 @@ from worldstate.abduction.road_users import SEEN_AS
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import Sighting
+from worldstate.measurement.sector import Sector
 
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
@@ -47,7 +48,9 @@ class Association:
         return {before[i].side: max(settings.handover_residual, 1.0 - self.chances[i]) for i in emerged}
 
 
-def associated(tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], site: SiteGeometry) -> Association:
+def associated(
+    tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], view: Sector, site: SiteGeometry
+) -> Association:
     r"""Return whose the sightings are.
 
     Every sighting is one of an entity in view, a hidden one that comes past an edge, or a vehicle that nobody
@@ -62,7 +65,7 @@ def associated(tracks: tuple[Track, ...], sightings: tuple[Sighting, ...], site:
     """
     if not tracks or not sightings:
         return Association({}, [0.0] * len(tracks))
-    unheard = math.log(site.settings.unheard_probability / (2.0 * site.view_half_angle_rad))
+    unheard = math.log(site.settings.unheard_probability / (2.0 * view.half_width_rad))
     detected = np.array([track.detected for track in tracks])
     scores = _scores(tracks, sightings, detected, site)
     return joint_association(np.where(scores > FORBIDDEN, scores - unheard, FORBIDDEN), detected)

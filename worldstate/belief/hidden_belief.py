@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from .explanation import ExplanationBelief
-
 
 @dataclass(frozen=True, slots=True)
 class HiddenBelief:
@@ -18,11 +16,6 @@ class HiddenBelief:
 
     hidden: tuple[float, ...]
     emerged: tuple[float, ...]
-
-    @classmethod
-    def of_explanation(cls, explanation: ExplanationBelief) -> "HiddenBelief":
-        """Return the sides of explanations that exclude each other, where no sequence is read."""
-        return cls(explanation.hidden, explanation.emerged)
 
     def existence(self, side: int) -> float:
         """Return the probability that there is such a vehicle."""

@@ -127,12 +127,15 @@ def _cartesian(tracks: list[Track], z: FloatArray, noise: FloatArray) -> FloatAr
     places = [track.place for track in tracks if track.place is not None]
     residual = z[:, None] - np.array([place.mean for place in places])
     spread = noise[:, None] + np.array([place.covariance for place in places])
-    distance = np.einsum("ijk,ijk->ij", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
-    density = -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
-    anybody = noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2)
-    usual = np.einsum("ik,ik->i", z[:, 2:], np.linalg.solve(anybody, z[:, 2:, None])[..., 0])
-    usual = -0.5 * (usual + np.linalg.slogdet(2.0 * math.pi * anybody)[1])
+    distance, density = _log_normal(residual, spread)
+    _, usual = _log_normal(z[:, 2:], noise[:, 2:, 2:] + _SPEED_STD**2 * np.eye(2))
     return np.where(distance > _GATE, FORBIDDEN, density - usual[:, None])
+
+
+def _log_normal(residual: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return squared Mahalanobis distance and log density of residuals, shape (..., n) both without n."""
+    distance = np.einsum("...k,...k->...", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
+    return distance, -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
 
 
 def _polar(

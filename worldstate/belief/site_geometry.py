@@ -1,9 +1,12 @@
 """Geometry of the site: where hidden vehicles are, where they come into view, and what the camera sees."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.ground.values import wrap_angle
+from worldstate.measurement.measurement import CameraLook, Look
+from worldstate.measurement.sector import Sector
 
 from .kinematics.motion import MotionBelief
 from .settings import FilterSettings
@@ -76,9 +79,27 @@ class SiteGeometry:
         side = max(range(len(chances)), key=chances.__getitem__)
         return side, chances[side]
 
-    def in_view(self, azimuth_rad: float) -> bool:
-        """Tell whether an azimuth is in the field of view of the co-evidence channel."""
-        return abs(azimuth_rad) <= self.view_half_angle_rad
+    def view(self, look: Look) -> Sector:
+        """Return where a look has searched."""
+        told = look.sector_rad
+        return Sector(0.0, self.view_half_angle_rad) if told is None else Sector.between(*told)
+
+    def in_sight(self, seen: CameraLook) -> Look:
+        r"""Return a look as one at all that is in line of sight: of where it did not search, it missed all.
+
+        .. math:: \beta \leftarrow s\, \beta + (1 - s)
+
+        with the share s of the line of sight that it searched. One that names no sector has searched it all.
+        """
+        look, answer = seen.look, seen.look.answer
+        if look.sector_rad is None or isinstance(answer, Unqueried):
+            return look
+        sight = Sector.in_sight(side.edge_azimuth_rad for side in self.sides)
+        both = sight.overlap(self.view(look))
+        share = 0.0 if both is None else both.half_width_rad / sight.half_width_rad
+        found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
+        miss = share * answer.miss_rate + (1.0 - share)
+        return replace(look, answer=(Present if found else Absent)(miss, answer.clutter_rate))
 
 
 def normal_share(deviations: float) -> float:

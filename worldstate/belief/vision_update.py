@@ -9,7 +9,8 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.ground.typing import FloatArray
-from worldstate.measurement.measurement import Measurement, Sighting
+from worldstate.measurement.measurement import CameraLook, Look, Measurement, Sighting
+from worldstate.measurement.sector import Sector
 
 from .association import associated
 from .existence import after_empty_look, after_sighting
@@ -53,21 +54,27 @@ def vision_update(
     tracks: tuple[Track, ...],
     explanation: ExplanationBelief,
     measurement: Measurement,
+    seen: CameraLook,
     weight: float,
     born: int,
     site: SiteGeometry,
+    others: Sequence[Sector] = (),
 ) -> VisionUpdate:
-    """Return tracks and explanations after one look; `born` counts the entities born in view so far."""
+    """Return tracks and explanations after one look; `born` counts the entities born in view so far.
+
+    Of who stands where only `others` have looked, their answer holds.
+    """
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
-    sightings = tuple(sorted(measurement.sightings, key=_BY_ALL))
-    whose = associated(tracks, sightings, site)
+    sightings, view = tuple(sorted(seen.sightings, key=_BY_ALL)), site.view(seen.look)
+    whose = associated(tracks, sightings, view, site)
     found, after = whose.found, []
     turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence, site.settings)
     for i, track in enumerate(tracks):
-        answer = _searched(track, measurement, site)
+        answer = _searched(track, measurement, seen.look, view)
         existence = _existence(track, whose.chances[i], answer, weight, rates)
         if i not in found:
-            after.append(_not_sighted(track, existence, answer))
+            held = answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others)
+            after.append(track if held else _not_sighted(track, existence, answer))
         elif track.seen:
             after.append(_sighted(turned[i], sightings[found[i]], existence, measurement, site))
         else:
@@ -175,7 +182,7 @@ def _turned(
     return turned
 
 
-def _searched(track: Track, measurement: Measurement, site: SiteGeometry) -> CoEvidence:
+def _searched(track: Track, measurement: Measurement, look: Look, view: Sector) -> CoEvidence:
     """Return the answer that speaks of a track: of the sector of a sound, or of all that the sensor sees.
 
     Of whoever is in view the look itself: by the miss rate of a sector half outside the image, vehicles that
@@ -184,9 +191,9 @@ def _searched(track: Track, measurement: Measurement, site: SiteGeometry) -> CoE
     if not track.detected:
         return measurement.co_evidence
     # What stands outside the field of view was not looked for.
-    if not site.in_view(track.motion.azimuth_rad):
+    if not view.touches(track.motion.azimuth_rad):
         return _OUTSIDE
-    return measurement.co_evidence if measurement.look is None else measurement.look.answer
+    return look.answer
 
 
 def _existence(

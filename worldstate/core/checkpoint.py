@@ -29,7 +29,7 @@ class LagRecord:
 class FilterRecord:
     """All of a filter, as it is written."""
 
-    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.3.0")
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.4.0")
 
     context: Context
     policy: CueingPolicy

@@ -19,7 +19,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable, integer_ns, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, Look, Measurement
+from worldstate.measurement.measurement import Approach, Bearing, CameraLook, Look, Measurement, Sighting
 from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
@@ -35,8 +35,8 @@ from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
 
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
-_FASTEST_EGO_MPS = 100.0
 _ABOVE_ZERO = math.ulp(0.0)
+MOST_FURTHER = 32  # Cameras of a car
 _KINDS: dict[str, Any] = {
     "signature": SignatureEvidence,
     "co_evidence": CoEvidence,
@@ -95,10 +95,6 @@ class WorldFilter:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_ns", integer_ns("start_ns", self.start_ns))
-        speed_mps = self.context.ego_speed_mps or 0.0
-        if not abs(speed_mps) <= _FASTEST_EGO_MPS:  # NaN compares false
-            wanted = f"expected a number within +-{_FASTEST_EGO_MPS}"
-            raise InvalidArgumentError(f"context.ego_speed_mps: {wanted}, got {speed_mps}")
         expected = len(self.context.directions) + 2
         if len(self.policy.reference_prior) != expected:
             got = len(self.policy.reference_prior)
@@ -115,12 +111,6 @@ class WorldFilter:
     def explanation(self) -> ExplanationBelief:
         """Filtered probabilities of the explanations."""
         return self._memory.explanation
-
-    @property
-    def statistic(self) -> float | None:
-        """Statistic s of the last window, in [0, 1]; None before the first."""
-        instant = self._memory.instant
-        return None if instant is None else instant.hidden_total
 
     @property
     def gamma(self) -> float:
@@ -222,14 +212,14 @@ class WorldFilter:
         if isinstance(measurement, PositionScan):
             return step.chronicled(before, carried, step.update_positions(memory, measurement, model), model)
         measurement = step.where_nobody_hides(measurement, model.context)
-        weights = step.weights_of(memory, measurement, self.start_ns, self.settings)
-        memory, measurement, looked = step.counted_once(memory, measurement)
+        weight = step.sound_weight(memory, measurement, self.start_ns, self.settings)
+        memory, measurement, looks = step.new_looks(memory, measurement, self.start_ns, self.settings)
         # Evidence first: association and births need the explanations of this very window.
-        memory = step.update_evidence(memory, measurement, weights, model)
-        if looked:
-            memory = step.update_sightings(memory, measurement, weights, model)
+        memory = step.update_evidence(memory, measurement, weight, model)
+        for seen, look_weight in looks:
+            memory = step.update_sightings(memory, measurement, seen, look_weight, model)
         memory = step.update_advisories(memory, measurement, model)
-        memory = step.update_sequence(memory, measurement, looked, model)
+        memory = step.update_sequence(memory, measurement, [seen for seen, _ in looks], model)
         return step.chronicled(before, carried, step.update_entities(memory, measurement, model), model)
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
@@ -309,17 +299,26 @@ def _checked(measurement: Timed, context: Context) -> Timed:
     if isinstance(measurement.sequence, SequenceReading) and context.directions != SIDES:
         raise InvalidArgumentError(f"sequence: expected the directions {SIDES}, got {context.directions}")
     stamp_ns = integer_ns("stamp_ns", measurement.stamp_ns)
-    if measurement.look is not None:
-        integer_ns("look.stamp_ns", measurement.look.stamp_ns)
+    further = measurement.further
+    if len(further) > MOST_FURTHER or not all(isinstance(one, CameraLook) for one in further):
+        wanted = f"expected at most {MOST_FURTHER} CameraLook"
+        raise InvalidArgumentError(f"further: {wanted}, got {further!r:.40}")
+    for look in (measurement.look, *(one.look for one in further)):
+        if look is not None:
+            integer_ns("look.stamp_ns", look.stamp_ns)
     for name, value, low, high in _numbers(measurement):
         # NaN compares false, and what is no number does not compare.
         if not isinstance(value, int | float | np.number) or not low <= value <= high:
             raise InvalidArgumentError(f"{name}: expected a number in [{low}, {high}], got {value!r:.40}")
-    sightings = tuple(
-        one if type(one.score) is float else replace(one, score=float(one.score))
-        for one in measurement.sightings
+    further = tuple(replace(one, sightings=_with_floats(one.sightings)) for one in further)
+    sightings = _with_floats(measurement.sightings)
+    return replace(measurement, stamp_ns=stamp_ns, sightings=sightings, further=further)
+
+
+def _with_floats(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
+    return tuple(
+        one if type(one.score) is float else replace(one, score=float(one.score)) for one in sightings
     )
-    return replace(measurement, stamp_ns=stamp_ns, sightings=sightings)
 
 
 def _numbers(measurement: Measurement) -> Iterator[tuple[str, float, float, float]]:
@@ -331,7 +330,14 @@ def _numbers(measurement: Measurement) -> Iterator[tuple[str, float, float, floa
     if isinstance(approach, Approach):
         yield "approach.inverse_tta_hz", approach.inverse_tta_hz, -1e3, 1e3
         yield "approach.std_hz", approach.std_hz, _ABOVE_ZERO, 1e6
-    for i, sighting in enumerate(measurement.sightings):
-        yield f"sightings[{i}].azimuth_rad", sighting.azimuth_rad, -math.pi, math.pi
-        yield f"sightings[{i}].std_rad", sighting.std_rad, _ABOVE_ZERO, 1e3
-        yield f"sightings[{i}].score", sighting.score, 0.0, 1.0
+    named = [(f"sightings[{i}]", one) for i, one in enumerate(measurement.sightings)]
+    for i, further in enumerate(measurement.further):
+        named += [(f"further[{i}].sightings[{k}]", one) for k, one in enumerate(further.sightings)]
+        yield from (
+            (f"further[{i}].look.sector_rad", end, -math.tau, math.tau)
+            for end in further.look.sector_rad or ()
+        )
+    for name, sighting in named:
+        yield f"{name}.azimuth_rad", sighting.azimuth_rad, -math.pi, math.pi
+        yield f"{name}.std_rad", sighting.std_rad, _ABOVE_ZERO, 1e3
+        yield f"{name}.score", sighting.score, 0.0, 1.0

@@ -124,7 +124,7 @@ class Memory:
 
 def sides_of(explanation: ExplanationBelief, sequence: SequenceMemory | None) -> HiddenBelief:
     """Return the sides as a sequence has them; without one, as explanations that exclude each other."""
-    return HiddenBelief.of_explanation(explanation) if sequence is None else sequence.hidden
+    return HiddenBelief(explanation.hidden, explanation.emerged) if sequence is None else sequence.hidden
 
 
 def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:

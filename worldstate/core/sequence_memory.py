@@ -1,7 +1,7 @@
 """What the filter believes of who comes into view and when: the sequence's reading with everything else."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
@@ -196,7 +196,7 @@ def carried(kept: SequenceMemory, stamp_ns: int, step_ns: int, context: Context)
     chain = np.array([state_transition(one, step_ns) for one in kept.prior(context)])
     looks = tuple(look for look in kept.looks if stamp_ns - look.stamp_ns <= _LOOK_NS)
     sides, unseen = next_belief(kept.sides, None, chain), _unseen(kept, step_ns)
-    watched = any(not isinstance(look.answer, Unqueried) for look in looks)
+    watched = any(not isinstance(look.answer, Unqueried) and look.answer.miss_rate < 1.0 for look in looks)
     arrivals = tuple(rate.later(seconds(step_ns), watched) for rate in kept.arrivals)
     return replace(kept, sides=sides, looks=looks, unseen=unseen, arrivals=arrivals, stamp_ns=stamp_ns)
 
@@ -212,9 +212,9 @@ def _unseen(kept: SequenceMemory, step_ns: int) -> tuple[float, ...]:
 
 
 def informed(
-    kept: SequenceMemory | None, measurement: Measurement, look: Look | None, context: Context
+    kept: SequenceMemory | None, measurement: Measurement, looks: Sequence[Look], context: Context
 ) -> SequenceMemory | None:
-    """Return the belief at a measurement after its reading and its look; None before the first reading."""
+    """Return the belief at a measurement after its reading and new looks; None before the first reading."""
     reading = measurement.sequence
     said = None
     if isinstance(reading, SequenceReading):
@@ -227,14 +227,17 @@ def informed(
         return None
     # The chain of the hops since then was taken when the belief was carried here.
     sides = next_belief(kept.sides, said, np.eye(len(STATES)))
-    looks = kept.looks
-    if look is not None:
-        looks = (*(one for one in looks if one.sensor != look.sensor), look)
-        if not isinstance(look.answer, Unqueried):
-            # Whoever has come into view is seen there but for a miss; who is seen was handed over.
-            kept = replace(kept, unseen=tuple(chance * look.answer.miss_rate for chance in kept.unseen))
-    looks = tuple(sorted(looks, key=attrgetter("sensor")))
-    return _alerted(replace(kept, sides=sides, looks=looks, stamp_ns=measurement.stamp_ns), context)
+    # Whoever has come into view is seen there but for a miss; who is seen was handed over.
+    missed = math.prod(look.answer.miss_rate for look in looks if not isinstance(look.answer, Unqueried))
+    held = {look.sensor: look for look in (*kept.looks, *looks)}
+    kept = replace(
+        kept,
+        sides=sides,
+        looks=tuple(sorted(held.values(), key=attrgetter("sensor"))),
+        unseen=tuple(chance * missed for chance in kept.unseen),
+        stamp_ns=measurement.stamp_ns,
+    )
+    return _alerted(kept, context)
 
 
 def _alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:

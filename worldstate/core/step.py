@@ -1,7 +1,7 @@
 """One step of the filter as pure functions: evidence, sightings, advisories, entities."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -29,9 +29,10 @@ from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Track, predict_tracks, turned
 from worldstate.belief.vision_update import VisionUpdate, log_co_evidence, surviving, vision_update
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
-from worldstate.measurement.measurement import Look, Measurement
+from worldstate.measurement.measurement import CameraLook, Measurement
 from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
+from worldstate.measurement.sector import Sector
 from worldstate.state import Context
 from worldstate.state.context import seen_from
 
@@ -56,14 +57,6 @@ class FilterModel:
     context: Context
     policy: CueingPolicy
     site: SiteGeometry
-
-
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """Overlap discounts for the acoustic and the visual likelihood, in [0, 1]."""
-
-    sound: float
-    look: float
 
 
 def site_geometry_of(
@@ -125,41 +118,40 @@ def where_nobody_hides(measurement: Measurement, context: Context) -> Measuremen
     return replace(measurement, sequence=replace(reading, groups=groups))
 
 
-def weights_of(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> Weights:
-    r"""Return the overlap discounts from the time since the source's last measurement.
+def sound_weight(memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings) -> float:
+    r"""Return the overlap discount of a window from the time since the source's last measurement.
 
-    .. math:: \kappa = \min(dt / T, 1), \quad T = window for the sound, look interval for the look
+    .. math:: \kappa = \min(dt / T, 1), \quad T = window
     """
     before_ns = dict(memory.last_ns).get(measurement.source, start_ns)
-    sensor, look_ns = _searched(measurement)
-    last = _last_look(memory, sensor)
-    heard_s = max(seconds(measurement.stamp_ns - before_ns), 0.0)
-    looked_s = max(seconds(look_ns - (start_ns if last is None else last.stamp_ns)), 0.0)
-    return Weights(min(heard_s / settings.window_s, 1.0), min(looked_s / settings.look_interval_s, 1.0))
+    return min(max(seconds(measurement.stamp_ns - before_ns), 0.0) / settings.window_s, 1.0)
 
 
-def counted_once(memory: Memory, measurement: Measurement) -> tuple[Memory, Measurement, bool]:
-    """Return the memory that knows of a look, the measurement, and whether its look is a new one.
+def new_looks(
+    memory: Memory, measurement: Measurement, start_ns: int, settings: FilterSettings
+) -> tuple[Memory, Measurement, list[tuple[CameraLook, float]]]:
+    r"""Return the memory that knows of the looks of a measurement, it, and the new ones, weighed.
 
-    A look belongs to the sensor that looked. Carried by a second source, or delivered again, it says nothing
-    new; the source that carried it first keeps its answer, since each of its windows is weighed anew.
+    .. math:: \kappa = \min(dt / T, 1), \quad T = look interval
+
+    by the time since the last look of the sensor. A look belongs to the sensor that looked. Carried by a
+    second source, or delivered again, it says nothing new; the source that carried it first keeps its answer,
+    since each of its windows is weighed anew.
     """
-    sensor, stamp_ns = _searched(measurement)
-    last = _last_look(memory, sensor)
-    if last is None or stamp_ns > last.stamp_ns:
-        look = measurement.look
-        said = measurement.co_evidence if look is None else look.answer
-        looks = _with_look(memory, CountedLook(sensor, stamp_ns, measurement.source, said))
-        return replace(memory, looks=looks), measurement, True
-    own = last.source == measurement.source
-    answer = measurement.co_evidence if own else Unqueried(f"this look of {sensor} was counted before")
-    return memory, replace(measurement, co_evidence=answer, sightings=(), look=None), False
-
-
-def _searched(measurement: Measurement) -> tuple[str, int]:
-    """Return whose look a measurement carries, and when it was made; of none, the source's own now."""
-    look = measurement.look
-    return (measurement.source, measurement.stamp_ns) if look is None else (look.sensor, look.stamp_ns)
+    new = []
+    for one in measurement.looks:
+        look, last = one.look, _last_look(memory, one.look.sensor)
+        if last is None or look.stamp_ns > last.stamp_ns:
+            since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
+            new.append((one, min(max(since_s, 0.0) / settings.look_interval_s, 1.0)))
+            counted = CountedLook(
+                look.sensor, look.stamp_ns, measurement.source, look.answer, look.sector_rad
+            )
+            memory = replace(memory, looks=_with_look(memory, counted))
+        elif last.source != measurement.source:
+            said = Unqueried(f"this look of {look.sensor} was counted before")
+            measurement = replace(measurement, co_evidence=said)
+    return memory, measurement, new
 
 
 def _with_look(memory: Memory, look: CountedLook) -> tuple[CountedLook, ...]:
@@ -204,7 +196,7 @@ def _places_passed(before: Sequence[Track], memory: Memory, model: FilterModel) 
     return _after_look(memory, look, memory.stamp_ns, model)
 
 
-def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel) -> Memory:
+def update_evidence(memory: Memory, measurement: Measurement, weight: float, model: FilterModel) -> Memory:
     """Return the memory after the signature with its co-evidence, the bearing and the approach rate."""
     settings, source, stamp_ns = model.site.settings, measurement.source, measurement.stamp_ns
     window_ns = nanoseconds(settings.window_s)
@@ -225,7 +217,7 @@ def update_evidence(memory: Memory, measurement: Measurement, weights: Weights, 
             measurement,
             sides_of(explanation, memory.sequence),
             explanation.visible,
-            weights.sound,
+            weight,
             settings,
         ),
         predicted=priors_of(prior),
@@ -245,13 +237,16 @@ def _with_hand_overs(
 
 
 def update_sightings(
-    memory: Memory, measurement: Measurement, weights: Weights, model: FilterModel
+    memory: Memory, measurement: Measurement, seen: CameraLook, weight: float, model: FilterModel
 ) -> Memory:
-    """Return the memory after detections, missed detections and hand-overs."""
-    seen = vision_update(
-        memory.tracks, memory.explanation, measurement, weights.look, memory.sighted, model.site
-    )
-    return _after_look(memory, seen, measurement.stamp_ns, model)
+    """Return the memory after detections, missed detections and hand-overs of one camera."""
+    others = list[Sector]()
+    if seen.look.sector_rad is not None:
+        recent = (one for one in memory.looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
+        others = [Sector.between(*one.sector_rad) for one in recent if one.sector_rad is not None]
+    known = memory.tracks, memory.explanation
+    update = vision_update(*known, measurement, seen, weight, memory.sighted, model.site, others)
+    return _after_look(memory, update, measurement.stamp_ns, model)
 
 
 def _after_look(memory: Memory, seen: VisionUpdate, stamp_ns: int, model: FilterModel) -> Memory:
@@ -352,15 +347,16 @@ def _ruled(
     )
 
 
-def update_sequence(memory: Memory, measurement: Measurement, looked: bool, model: FilterModel) -> Memory:
-    """Return the memory after what a sequence model and the camera say of who comes into view, and when."""
-    said, answer, look = measurement.sequence, measurement.co_evidence, measurement.look
-    if look is None and looked and not isinstance(answer, Unqueried):
-        look = Look(measurement.source, measurement.stamp_ns, answer)
+def update_sequence(
+    memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
+) -> Memory:
+    """Return the memory after what a sequence model and the cameras say of who comes into view, and when."""
+    said, site = measurement.sequence, model.site
+    told = [site.in_sight(one) for one in looks if not isinstance(one.look.answer, Unqueried)]
     refused = said if isinstance(said, NotUsable) else None
     return replace(
         memory,
-        sequence=informed(memory.sequence, measurement, look, model.context),
+        sequence=informed(memory.sequence, measurement, told, model.context),
         # Other sources do not speak of it: what was said last holds.
         no_sequence=memory.no_sequence if said is None else refused,
     )

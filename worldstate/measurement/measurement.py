@@ -1,14 +1,15 @@
 """Measurements: evidence of one modality at one instant."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import ClassVar
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
+from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import ClassShares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import DomainVerdict
-from worldstate.ground.serialisation import Layout
+from worldstate.ground.serialisation import ADDED, Layout
 from worldstate.ground.values import NotUsable
 
 
@@ -100,18 +101,47 @@ class Look:
         Name of the sensor that looked.
     stamp_ns : int
         When it looked, nanoseconds on the stream's clock: of an image, when it was taken.
-    answer : Present or Absent
+    answer : Present, Absent or Unqueried
         Whether anything that moves is in view, with the miss and the clutter rate of the whole view.
+    sector_rad : (float, float) or None
+        Where it looked: from this azimuth to the left until that one. None for the view of the context.
 
     Examples
     --------
+    >>> from worldstate.abduction import Absent
     >>> Look("camera", 100_000_000, Absent(miss_rate=0.06)).sensor
     'camera'
     """
 
     sensor: str
     stamp_ns: int
-    answer: Present | Absent
+    answer: CoEvidence
+    sector_rad: tuple[float, float] | None = field(default=None, metadata=ADDED)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLook:
+    """A look with all that it has found: of one camera of a car that has several.
+
+    Parameters
+    ----------
+    look : Look
+        The search, with its own sector.
+    sightings : tuple of Sighting
+        All that the camera reports.
+
+    Examples
+    --------
+    >>> from worldstate.abduction import Absent
+    >>> CameraLook(Look("left", 100_000_000, Absent(0.06), (0.4, 1.9))).sightings
+    ()
+    """
+
+    look: Look
+    sightings: tuple[Sighting, ...] = ()
+
+
+_BY_SENSOR = attrgetter("look.sensor")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +163,9 @@ class Measurement:
     look : Look or None
         The search that co-evidence and sightings come from; None takes them for one of the source's own, made
         at the stamp.
+    further : tuple of CameraLook
+        Looks of further cameras, each with its own sector; the co-evidence is then what all of them say
+        together of the sector of the sound.
     domain : Familiar, Foreign, WarningSignal or None
         Whether the model was made for what was heard; None where nothing tells.
     kinds : tuple of (str, float)
@@ -171,3 +204,10 @@ class Measurement:
     # count as one that repeats itself.
     source: str = "acoustic"
     fault: str | None = None
+    further: tuple[CameraLook, ...] = field(default=(), metadata=ADDED)
+
+    @property
+    def looks(self) -> tuple[CameraLook, ...]:
+        """All looks in the order of their sensors, its own first among equals; order carries no meaning."""
+        own = self.look or Look(self.source, self.stamp_ns, self.co_evidence)
+        return tuple(sorted((CameraLook(own, self.sightings), *self.further), key=_BY_SENSOR))

@@ -1,6 +1,7 @@
 """Azimuth sectors that a co-evidence channel is asked about."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,21 @@ class Sector:
         """Return the sector that runs from `right_rad` to the left until `left_rad`."""
         half = (left_rad - right_rad) % (2.0 * math.pi) / 2.0
         return cls(wrap_angle(right_rad + half), half)
+
+    @classmethod
+    def in_sight(cls, edges_rad: Iterable[float]) -> "Sector":
+        """Return the directions ahead that occluders with these edges leave free.
+
+        Examples
+        --------
+        >>> sector = Sector.in_sight([0.56, -0.56])
+        >>> sector.touches(0.5), sector.touches(0.7)
+        (True, False)
+        """
+        edges = tuple(edges_rad)
+        left = min((edge for edge in edges if edge > 0), default=math.pi / 2)
+        right = max((edge for edge in edges if edge < 0), default=-math.pi / 2)
+        return cls.between(right, left)
 
 
 # Ahead only: the front-end's default grid ends at 90 deg, and so do the views of the cameras asked.

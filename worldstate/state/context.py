@@ -8,7 +8,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
-_LEAST_STD_RAD, _FASTEST_HZ = 1e-4, 100.0
+_LEAST_STD_RAD, _FASTEST_HZ, _FASTEST_EGO_MPS = 1e-4, 100.0, 100.0
 _PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: who comes past it is in view
 
 
@@ -321,7 +321,7 @@ class Context:
     Raises
     ------
     InvalidArgumentError
-        Without an occluder, or if two share an id or a direction.
+        Without an occluder, if two share an id or a direction, or if a number is out of range.
 
     Examples
     --------
@@ -345,6 +345,8 @@ class Context:
             if not names or len(set(names)) != len(names):
                 raise InvalidArgumentError(f"occluders: expected different ids and directions, got {names}")
         in_range("view_half_angle_rad", self.view_half_angle_rad, 0.0, math.pi)
+        if self.ego_speed_mps is not None:
+            in_range("ego_speed_mps", self.ego_speed_mps, -_FASTEST_EGO_MPS, _FASTEST_EGO_MPS)
 
     @property
     def directions(self) -> tuple[str, ...]:

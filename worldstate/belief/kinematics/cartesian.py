@@ -8,18 +8,16 @@ is white noise of density q, as in filterpy's `Q_continuous_white_noise`.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
-from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.position import Position
 
-from .motion import MotionBelief, checked_covariance
+from .gaussian import GaussianBelief
+from .motion import MotionBelief
 from .polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 
 # A lane and a half: of a position that is less sure, a number would be taken for more than it says.
@@ -35,25 +33,8 @@ _IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CartesianBelief:
-    """Gaussian over (x, y, vx, vy), m and m/s.
-
-    Shapes: mean (4,), covariance (4, 4), or with a leading axis of many entities to predict them at once.
-    """
-
-    # shape (4,)
-    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]
-    # shape (4, 4): Symmetric positive definite
-    covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, checked_covariance)]
-
-    @classmethod
-    def stacked(cls, beliefs: Sequence["CartesianBelief"]) -> "CartesianBelief":
-        """Return many beliefs as one with a leading axis."""
-        return cls(np.array([one.mean for one in beliefs]), np.array([one.covariance for one in beliefs]))
-
-    def each(self) -> "list[CartesianBelief]":
-        """Return the beliefs that were stacked."""
-        return list(map(CartesianBelief, self.mean, self.covariance))
+class CartesianBelief(GaussianBelief):
+    """Gaussian over (x, y, vx, vy), m and m/s."""
 
     @property
     def position_std_m(self) -> float:

@@ -1,17 +1,14 @@
 """The motion belief of one entity: an extended Kalman filter in modified polar coordinates."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
+from .gaussian import GaussianBelief
 from .polar import AZIMUTH, LOG_RANGE, RADIAL_RATE, jacobian, process_noise, propagate
 
 # Range only scales the angular noise of an acceleration, and bearings from a standing ego do not measure it:
@@ -25,26 +22,12 @@ _CLOSEST_SHARE = 0.5
 _LEAST_STD, _LARGEST_STD = 1e-4, 1e2
 
 
-def checked_covariance(row: FloatArray) -> FloatArray:
-    """Return the covariance that a checkpoint holds as one row."""
-    covariance = row.reshape(4, 4)
-    if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise InvalidArgumentError("expected it symmetric and positive definite")
-    return covariance
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class MotionBelief:
+class MotionBelief(GaussianBelief):
     """Gaussian over (theta, theta_dot, rho, log r), the modified polar coordinates of `polar`.
 
-    Shapes: mean (4,), covariance (4, 4), or with leading axes of many entities for the functions below: with
-    twenty entities a step takes half the time when all are predicted and updated at once.
+    Theta is wrapped into (-pi, pi].
     """
-
-    # shape (4,): theta wrapped into (-pi, pi]
-    mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(4))]
-    # shape (4, 4): Symmetric positive definite
-    covariance: Annotated[FloatArray, Via(FloatArray, np.ravel, checked_covariance)]
 
     @classmethod
     def around(
@@ -52,15 +35,6 @@ class MotionBelief:
     ) -> "MotionBelief":
         """Return independent components."""
         return cls(np.array(mean), np.diag(np.square(np.clip(std, _LEAST_STD, _LARGEST_STD))))
-
-    @classmethod
-    def stacked(cls, beliefs: Sequence["MotionBelief"]) -> "MotionBelief":
-        """Return many beliefs as one with a leading axis."""
-        return cls(np.array([one.mean for one in beliefs]), np.array([one.covariance for one in beliefs]))
-
-    def each(self) -> "list[MotionBelief]":
-        """Return the beliefs that were stacked."""
-        return list(map(MotionBelief, self.mean, self.covariance))
 
     @property
     def azimuth_rad(self) -> float:

@@ -8,6 +8,7 @@ from .array_options import given_array
 
 if TYPE_CHECKING:
     from worldstate.adapters.camera.pinhole import PinholeCamera
+    from worldstate.adapters.listen import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 HELP = """\
@@ -23,6 +24,31 @@ def add_car_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("vehicle").add_argument
     add("--car", type=Path, metavar="FILE", help="array and cameras, where they are mounted")
     add("--camera-name", metavar="NAME", help="which of its cameras is asked (default: the first)")
+
+
+def add_several_cameras(parser: argparse.ArgumentParser) -> None:
+    """Declare --camera-detections."""
+    told = "what each of several cameras of --car reported, in place of --detections: all are asked"
+    parser.add_argument("--camera-detections", nargs="+", default=[], metavar="NAME=PATH", help=told)
+
+
+def with_several_cameras(arguments: argparse.Namespace, source: "Source") -> "Source":
+    """Return what is listened to with the cameras that --camera-detections names, as it is without."""
+    from worldstate.adapters.vehicle.car_file import read_car
+    from worldstate.ground.errors import InvalidArgumentError
+    from worldstate.operations.recordings.car_cameras import with_cameras
+
+    pairs = [text.partition("=")[::2] for text in arguments.camera_detections]
+    if not pairs:
+        return source
+    if arguments.car is None or arguments.detections is not None or arguments.camera_name is not None:
+        problem = "expected --car with it, and neither --detections nor --camera-name"
+        raise InvalidArgumentError(f"--camera-detections: {problem}")
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names) or not all(name and path for name, path in pairs):
+        got = " ".join(arguments.camera_detections)
+        raise InvalidArgumentError(f"--camera-detections: expected NAME=PATH of different cameras, got {got}")
+    return with_cameras(source, read_car(arguments.car), {name: Path(path) for name, path in pairs})
 
 
 def given_sensors(

@@ -29,7 +29,12 @@ from worldstate.cli.common.array_options import (
 )
 from worldstate.cli.common.bag_options import add_topic_options, topics_of
 from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
-from worldstate.cli.common.car_options import add_car_options, given_sensors
+from worldstate.cli.common.car_options import (
+    add_car_options,
+    add_several_cameras,
+    given_sensors,
+    with_several_cameras,
+)
 from worldstate.cli.common.detector_options import (
     MOVING,
     add_detector_options,
@@ -71,6 +76,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_listen_options(parser)
     _add_recording_options(parser)
     add_camera_options(parser)
+    add_several_cameras(parser)
     add_detector_options(parser, default=None)
     add_topic_options(parser)
     _add_output_options(parser)
@@ -146,7 +152,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
     detector = None if arguments.detector is None else detector_maker(arguments)()
     given, camera = given_sensors(arguments)
     sound, array, detections, ego = _input(arguments, given)
-    return open_source(
+    source = open_source(
         sound,
         array=array,
         detections=detections,
@@ -162,6 +168,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         engine=_engine(arguments),
         settings=settings,
     )
+    return with_several_cameras(arguments, source)
 
 
 def _input(

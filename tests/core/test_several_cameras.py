@@ -1,0 +1,172 @@
+"""Several cameras at one hop: each searches its own view, and one vehicle stays one."""
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldstate import Absent, Measurement, NotUsable, Present, Sighting, SignatureEvidence, WorldFilter
+from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement.measurement import CameraLook, Look
+
+SILENT, EVEN = NotUsable("-"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+FRONT, LEFT, REAR = (-0.6, 0.6), (0.3, 1.5), (2.4, -2.4)
+SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
+
+
+def car(azimuth_rad, std_rad=0.02, score=0.9):
+    return Sighting(azimuth_rad, std_rad, "car", score, 0.05)
+
+
+def camera(name, time_s, sector_rad, *sightings, miss_rate=0.05):
+    answer = Present(miss_rate, 0.01) if sightings else Absent(miss_rate, 0.01)
+    return CameraLook(Look(name, round(time_s * 1e9), answer, sector_rad), sightings)
+
+
+def measured(time_s, first, *further, source="acoustic", sequence=None):
+    stamp_ns, answer = round(time_s * 1e9), first.look.answer
+    seen = first.sightings, first.look
+    return Measurement(
+        stamp_ns, EVEN, answer, SILENT, SILENT, *seen, sequence=sequence, source=source, further=further
+    )
+
+
+def after(*measurements):
+    world = WorldFilter()
+    for one in measurements:
+        world = world.update(one)
+    return world
+
+
+def reading(rng):
+    return SequenceReading(rng.dirichlet(np.full(len(GROUPS), 0.5), 2), SHARE, 0.2, SequenceAlarm(1.0, 20.0))
+
+
+def test_boxes_of_two_cameras_in_the_overlap_are_of_one_vehicle_that_both_place() -> None:
+    hops = (1.0, 1.1, 1.2)
+    both = after(*(measured(t, camera("front", t, FRONT, car(0.45)), camera("left", t, LEFT, car(0.46)))
+                   for t in hops))  # fmt: skip
+    alone = after(*(measured(t, camera("front", t, FRONT, car(0.45))) for t in hops))
+    (entity,), (other,) = both.state.entities, alone.state.entities
+    assert other.azimuth_rad < entity.azimuth_rad < 0.46
+    assert entity.azimuth_std_rad < other.azimuth_std_rad
+    assert [one.sensor for one in both.state.searched] == ["front", "left"]
+    assert both.state.searched[1].sector_rad == LEFT
+
+
+def test_two_vehicles_are_two_for_either_camera() -> None:
+    boxes = car(0.35), car(0.55)
+    one = measured(1.0, camera("front", 1.0, FRONT, *boxes), camera("left", 1.0, LEFT, *boxes))
+    assert len(after(one).state.entities) == 2
+
+
+def test_the_order_of_cameras_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    hops, readings = [], [reading(rng) for _ in range(8)]
+    for hop, heard in enumerate(readings, 10):
+        at = 0.1 * hop
+        boxes = [tuple(car(rng.uniform(*ends), score=rng.uniform(0.5, 1.0)) for _ in range(2))
+                 for ends in (FRONT, LEFT)]  # fmt: skip
+        hops.append((at, heard, [camera("front", at, FRONT, *boxes[0]), camera("left", at, LEFT, *boxes[1]),
+                                 camera("rear", at, REAR)]))  # fmt: skip
+    said = {
+        after(*(replace(measured(at, cameras[0], sequence=heard), look=cameras[i].look,
+                        sightings=cameras[i].sightings, further=(cameras[j], cameras[k]))
+                for at, heard, cameras in hops)).state.to_json()
+        for i, j, k in itertools.permutations(range(3))
+    }  # fmt: skip
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("boxes", [(), (car(2.9),), (car(2.9), car(-2.6))])
+def test_a_camera_that_looks_elsewhere_changes_nothing_of_what_is_ahead(boxes) -> None:
+    rng, times = np.random.default_rng(4), [1.0 + 0.1 * hop for hop in range(10)]
+    readings = [reading(rng) for _ in times]
+
+    def ahead(*, rear):
+        hops = []
+        for at, heard in zip(times, readings, strict=True):
+            seen = (car(0.5 - 0.05 * (at - 1.0)),) if at < 1.55 else ()
+            others = (camera("rear", at, REAR, *boxes),) if rear else ()
+            hops.append(measured(at, camera("front", at, FRONT, *seen), *others, sequence=heard))
+        state = after(*hops).state
+        near = [one for one in state.entities if abs(one.azimuth_rad) < 1.5]
+        cues = [(cue.risk, *(cue.within or {}).values(), cue.hypotheses.visible) for cue in state.cues]
+        return [(one.existence_probability, one.azimuth_rad, one.azimuth_std_rad) for one in near], cues
+
+    for told, alone in zip(ahead(rear=True), ahead(rear=False), strict=True):
+        np.testing.assert_allclose(told, alone, rtol=0.0, atol=1e-12)
+
+
+def test_a_miss_of_both_weighs_as_the_product_of_their_rates() -> None:
+    begun = after(measured(1.0, camera("front", 1.0, FRONT, car(0.45))))
+    alive = begun.predict_to(1_400_000_000).state.entities[0].existence_probability
+    both = measured(1.4, camera("front", 1.4, FRONT, miss_rate=0.3), camera("left", 1.4, LEFT, miss_rate=0.2))
+    missed = 0.3 * 0.2
+    expected = alive * missed / (1.0 - alive + alive * missed)
+    (entity,) = begun.update(both).state.entities
+    assert entity.existence_probability == pytest.approx(expected, rel=1e-9)
+
+
+def test_an_absence_where_nobody_is_in_sight_says_less_than_one_of_all_that_is() -> None:
+    """A camera that searches half of the line of sight refutes a vehicle in view by that much."""
+    rng = np.random.default_rng(5)
+    heard = reading(rng)
+    half = (math.radians(-64.0), math.radians(0.0))  # Half of the 64 degrees between the corners
+
+    def seen_nobody(sector):
+        world = after(measured(1.0, camera("one", 1.0, sector), sequence=heard))
+        terms = world.state.cues[0].evidence.terms_nats
+        return abs(terms["look one"])
+
+    assert seen_nobody(REAR) == pytest.approx(0.0, abs=1e-12)
+    assert 0.0 < seen_nobody(half) < seen_nobody(FRONT)
+
+
+def test_a_look_counts_once_for_its_camera_whoever_carries_it() -> None:
+    begun = after(measured(1.0, camera("front", 1.0, FRONT, car(0.45))))
+    looks = camera("front", 1.4, FRONT, miss_rate=0.3), camera("left", 1.4, LEFT, miss_rate=0.2)
+    once = begun.update(measured(1.4, *looks))
+    again = once.update(measured(1.4, *looks, source="second"))
+    assert again.state.entities == once.state.entities
+    # The second camera alone has not been counted yet.
+    half = begun.update(measured(1.4, looks[0])).update(measured(1.4, *looks, source="second"))
+    assert half.state.entities[0].existence_probability == pytest.approx(
+        once.state.entities[0].existence_probability, rel=1e-9
+    )
+
+
+def test_who_drives_from_one_view_into_another_is_seen_on() -> None:
+    path = [(1.0 + 0.1 * hop, 0.5 + 0.04 * hop) for hop in range(12)]
+    world = after(*(
+        measured(at, camera("front", at, FRONT, *[car(az)] * (az < 0.58)),
+                 camera("left", at, LEFT, *[car(az)] * (az > 0.32)))
+        for at, az in path
+    ))  # fmt: skip
+    (entity,) = world.state.entities
+    assert (entity.visibility.answer, entity.status) == ("visible", "visible")
+    assert entity.azimuth_rad == pytest.approx(path[-1][1], abs=0.03)
+    # Only the front camera has a new image: what the left one has said of its view stands.
+    (entity,) = world.update(measured(2.15, camera("front", 2.15, FRONT))).state.entities
+    assert entity.visibility.answer == "visible"
+
+
+def test_a_checkpoint_holds_the_looks_of_all_cameras() -> None:
+    at = measured(1.0, camera("front", 1.0, FRONT, car(0.45)), camera("left", 1.0, LEFT, car(0.46)))
+    world = after(at)
+    copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict(), allow_nan=False)))
+    late = measured(0.9, camera("front", 0.9, FRONT, car(0.44)), camera("left", 0.9, LEFT))
+    assert copy.update(late).state == world.update(late).state
+
+
+def test_what_a_further_camera_cannot_have_seen_is_refused() -> None:
+    front = camera("front", 1.0, FRONT)
+    with pytest.raises(InvalidArgumentError, match=r"further\[0\].sightings\[0\].azimuth_rad: .* got 4.0"):
+        after(measured(1.0, front, camera("left", 1.0, LEFT, car(4.0))))
+    with pytest.raises(InvalidArgumentError, match="further: expected at most 32 CameraLook"):
+        after(measured(1.0, front, *[camera("left", 1.0, LEFT)] * 33))
