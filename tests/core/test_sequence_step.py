@@ -72,6 +72,22 @@ def test_without_anything_else_it_believes_what_the_sequence_says(seed: int) -> 
         np.testing.assert_allclose(belief(world), one.groups, rtol=1e-6, atol=1e-9)
 
 
+def test_the_other_side_is_named_beside_the_likelier_one_only_if_two_come() -> None:
+    alarm = SequenceAlarm(-2.0, 20.0)
+
+    def told(alone: float) -> list[str]:
+        """Return the sides of the advisories; `alone` is how likely only the other one comes."""
+        groups = np.full((2, len(GROUPS)), 1e-3)
+        groups[:, GROUPS.index("coming_2s")] = 0.5, 0.45
+        groups[:, GROUPS.index("other")] = alone
+        said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, alarm)
+        state = run(WorldFilter(), [heard(hop, said) for hop in range(8)])[-1].state
+        return [cue.direction for cue in state.cues if cue.advisory is not None]
+
+    assert told(alone=0.45) == ["left"]
+    assert told(alone=0.1) == ["left", "right"]
+
+
 @given(SEEDS, st.floats(0.0, 1.0))
 @settings(max_examples=3)
 def test_a_context_moves_the_odds_of_those_who_come_and_never_far(seed: int, hidden: float) -> None:
