@@ -24,7 +24,7 @@ from .array_match import array_difference, microphone_order
 from .model_file import Model
 
 # Only `run` goes on with a model of another array; the other commands have no such option to name.
-TRAIN = "Train a model for it (extract-features, train)"
+TRAIN = "Make a model for it (commission, from simulated streets; extract-features and train, from recordings)"
 WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
 
 UNFIT = "the model says that it is unfit for use"
@@ -97,7 +97,7 @@ def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> boo
         _LOG.warning("the model was made for a %s ego, this one %s: no budget is stated", made_for, does)
         return False
     if not model.provenance.fit_for_use:
-        _LOG.warning("%s: no budget is stated", UNFIT)
+        _LOG.warning("%s: no budget is stated, its sequence is not used, advisories are rare", UNFIT)
     return model.provenance.fit_for_use
 
 

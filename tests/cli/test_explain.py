@@ -93,6 +93,21 @@ def test_it_says_what_raised_and_what_holds_an_advisory(time, said, states, caps
     assert capsys.readouterr().out == said
 
 
+def test_without_a_time_all_are_listed_and_the_first_is_explained(states, capsys):
+    assert main(["explain", str(states)]) == 0
+    listed, explained = capsys.readouterr().out.split("\n\n")
+    assert listed.splitlines() == [
+        "advisories", "  left   0.70 to 1.50 s", "  at the first onset, another by --time",
+    ]  # fmt: skip
+    assert explained.startswith("time  0.70 s\nleft: advisory raised")
+    assert main(["explain", str(states), "--side", "right", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["advisories"] == []
+    snapshots = [json.loads(line) for line in states.read_text().splitlines()]
+    riskiest = max(snapshots, key=lambda snapshot: snapshot["cues"][1]["risk"])
+    assert told["time_s"] == riskiest["stamp_ns"] / 1e9
+
+
 def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, capsys):
     assert main(["explain", str(states), "--time", "0.58", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

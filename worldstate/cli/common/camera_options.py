@@ -9,10 +9,15 @@ from .array_options import given_array
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
+    from worldstate.adapters.camera.pinhole import PinholeCamera
     from worldstate.adapters.listen import Source
 
 DETECTIONS_HELP = """\
---detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text."""
+--detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the number
+of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the first sample
+of the sound, --image-rate a second; classes are numbered as COCO numbers them (car is 3) and as YOLO does (car
+is 2). An image up to the last with a box, of which nothing is listed, was searched in vain; what comes after
+that was not asked."""
 LENS_HELP = """\
 --camera takes JSON:
 {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
@@ -21,10 +26,12 @@ the field of view; optional "yaw_deg" (left), "pitch_deg" (up), "roll_deg" (left
 
 
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --detections, --camera, --miss-rates and which boxes count."""
+    """Declare --detections, --image-rate, --camera, --miss-rates and which boxes count."""
     parser.description = f"{parser.description}\n\n{DETECTIONS_HELP} {LENS_HELP}"
     group = parser.add_argument_group("camera")
     group.add_argument("--detections", type=Path, metavar="PATH", help="what its detector reported")
+    rate = "images a second, where they carry no stamp (default: 10)"
+    group.add_argument("--image-rate", type=float, metavar="HZ", help=rate)
     add_lens_options(group)
 
 
@@ -46,6 +53,23 @@ def boxes_of(arguments: argparse.Namespace) -> "DetectionFilter":
     return DetectionFilter(frozenset(arguments.classes), arguments.min_score, arguments.min_box_px)
 
 
+def given_detections(
+    arguments: argparse.Namespace, camera: "Path | PinholeCamera | None"
+) -> "Path | DetectionLog | None":
+    """Return what --detections names, read where --image-rate says how fast its images came."""
+    from worldstate.adapters.camera.detection_formats import read_any_detections
+    from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
+    from worldstate.ground.errors import InvalidArgumentError
+
+    path: Path | None = arguments.detections
+    if arguments.image_rate is None:
+        return path
+    if path is None:
+        raise InvalidArgumentError("--image-rate: expected --detections with it")
+    lens = read_camera(camera) if isinstance(camera, Path) else camera or PinholeCamera()
+    return read_any_detections(path, arguments.image_rate, (lens.width_px, lens.height_px))
+
+
 def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[Source, DetectionLog]":
     """Return a recording of which boxes and camera are used, and no model has to fit the array; the boxes.
 
@@ -60,7 +84,7 @@ def camera_source(arguments: argparse.Namespace, sound: "SoundInput") -> "tuple[
     source = open_source(
         sound,
         array=given_array(arguments),
-        detections=arguments.detections,
+        detections=given_detections(arguments, arguments.camera),
         camera=arguments.camera,
         settings=ListenSettings(boxes=boxes_of(arguments), uncalibrated=True),
     )

@@ -3,15 +3,24 @@
 Say of the snapshot nearest to a time what raised or holds the advisory of each side, or why there is none:
 what prior, sequence or window, looks and a vehicle that has just come into view add to the log-odds that
 the alarm goes by, then and when the advisory began; the entity; the sensors; whether the sound was foreign.
+
+Without --time all advisories are listed and the first one is explained, or the highest risk where there is
+none.
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate.cli.common.output import CommandResult
 
+if TYPE_CHECKING:
+    from worldstate.state import WorldState
+
 EXAMPLE = """\
 examples:
+  worldstate explain states.jsonl
   worldstate explain states.jsonl --time 5.2
   worldstate explain out/demo/states.jsonl --time 5.2 --side left --json"""
 
@@ -20,32 +29,46 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("states", type=Path, metavar="JSONL", help="snapshots, as `worldstate run --out` writes them")
-    add("--time", type=float, required=True, metavar="S", help="seconds on the states' clock")
+    add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the first advisory)")
     add("--side", help="of this side only, such as left (default: every side)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     from worldstate.adapters.files.states_file import read_state_near
+    from worldstate.adapters.state_log import read_log
     from worldstate.ground.checks import in_range
-    from worldstate.ground.errors import InvalidArgumentError
     from worldstate.ground.values import nanoseconds, seconds
     from worldstate.operations.recordings.evidence_report import common_lines, evidence_report
+    from worldstate.operations.recordings.told_advisories import told_advisories
 
-    stamp_ns = nanoseconds(in_range("--time", arguments.time, -9e9, 9e9))
+    listed, told = list[str](), {}
+    if arguments.time is None:
+        found = told_advisories((state for _, state in read_log(arguments.states)), arguments.side)
+        stamp_ns, listed = found.explained_ns, [*found.lines(), ""]
+        told = {"advisories": [asdict(one) for one in found.advisories]}
+    else:
+        stamp_ns = nanoseconds(in_range("--time", arguments.time, -9e9, 9e9))
     state = read_state_near(arguments.states, stamp_ns)
-    sides = [cue.direction for cue in state.cues]
-    if arguments.side not in (None, *sides):
-        raise InvalidArgumentError(f"--side: expected one of {', '.join(sides)}, got {arguments.side}")
+    _check_side(state, arguments.side)
     begun = {cue.direction: cue.advisory.since_ns for cue in state.cues if cue.advisory is not None}
     onsets = {side: read_state_near(arguments.states, since_ns) for side, since_ns in begun.items()}
     reports = evidence_report(state, onsets, arguments.side)
     now_s = seconds(state.stamp_ns)
-    told = state.to_dict()
-    common = {key: told[key] for key in ("sensors", "searched", "events", "domain", "no_sequence")}
+    written = state.to_dict()
+    common = {key: written[key] for key in ("sensors", "searched", "events", "domain", "no_sequence")}
     lines = [line for report in reports.values() for line in report.lines(now_s)]
+    sides = {side: one.to_dict() for side, one in reports.items()}
     return CommandResult(
-        {"time_s": now_s, "sides": {side: one.to_dict() for side, one in reports.items()}} | common,
-        table={"time": f"{now_s:.2f} s"},
-        lines=[*lines, *common_lines(state)],
+        told | {"time_s": now_s, "sides": sides} | common,
+        table={},
+        lines=[*listed, f"time  {now_s:.2f} s", *lines, *common_lines(state)],
     )
+
+
+def _check_side(state: "WorldState", side: str | None) -> None:
+    from worldstate.ground.errors import InvalidArgumentError
+
+    sides = [cue.direction for cue in state.cues]
+    if side not in (None, *sides):
+        raise InvalidArgumentError(f"--side: expected one of {', '.join(sides)}, got {side}")

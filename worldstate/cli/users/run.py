@@ -28,7 +28,7 @@ from worldstate.cli.common.array_options import (
     stance,
 )
 from worldstate.cli.common.bag_options import add_topic_options, topics_of
-from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of
+from worldstate.cli.common.camera_options import add_camera_options, box_counts, boxes_of, given_detections
 from worldstate.cli.common.car_options import (
     add_car_options,
     add_several_cameras,
@@ -151,7 +151,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
     settings = replace(listen_settings(arguments), mask_dead=arguments.mask_dead, boxes=boxes)
     detector = None if arguments.detector is None else detector_maker(arguments)()
     given, camera = given_sensors(arguments)
-    sound, array, detections, ego = _input(arguments, given)
+    sound, array, detections, ego = _input(arguments, given, given_detections(arguments, camera))
     source = open_source(
         sound,
         array=array,
@@ -172,7 +172,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
 
 
 def _input(
-    arguments: argparse.Namespace, array: "MicrophoneArray | None"
+    arguments: argparse.Namespace, array: "MicrophoneArray | None", seen: "Path | DetectionLog | None"
 ) -> "tuple[SoundInput, MicrophoneArray | None, Path | DetectionLog | None, OdometryLog | None]":
     """Return sound, array, detections and odometry: options, or what a bag holds."""
     from worldstate.adapters.files.odometry_file import read_odometry
@@ -182,11 +182,11 @@ def _input(
     bag = bag_of(arguments)
     if bag is None:
         told = None if arguments.odometry is None else read_odometry(arguments.odometry)
-        return sound_of(arguments), array, arguments.detections, told
+        return sound_of(arguments), array, seen, told
     if arguments.start:
         raise InvalidArgumentError("--start: expected none with a bag, whose messages have stamps")
     held = read_bag(bag, topics_of(arguments))
-    seen = arguments.detections or held.detections
+    seen = held.detections if seen is None else seen
     return held.sound, needed_array(bag, array or held.array), seen, held.ego
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, add_search_options, search_of
-from worldstate.cli.common.camera_options import add_camera_options, boxes_of
+from worldstate.cli.common.camera_options import add_camera_options, boxes_of, given_detections
 from worldstate.cli.common.car_options import add_car_options, given_sensors
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
@@ -79,6 +79,6 @@ def _source(arguments: argparse.Namespace, path: Path) -> "Source":
         path,
         array=array,
         camera=camera,
-        detections=arguments.detections,
+        detections=given_detections(arguments, camera),
         settings=replace(search_of(arguments), boxes=boxes_of(arguments), uncalibrated=True, mask_dead=True),
     )
