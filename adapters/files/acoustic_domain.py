@@ -24,7 +24,7 @@ from .array_match import array_difference, microphone_order
 from .model_file import Model
 
 # Only `run` goes on with a model of another array; the other commands have no such option to name.
-TRAIN = "Make a model for it (commission, from simulated streets; extract-features and train, from recordings)"
+TRAIN = "Make a model for it (commission; of recordings extract-features, train)"
 WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (uncalibrated=True)"
 
 UNFIT = "the model says that it is unfit for use"

@@ -13,11 +13,10 @@ if TYPE_CHECKING:
     from worldstate.adapters.listen import Source
 
 DETECTIONS_HELP = """\
---detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the number
-of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the first sample
-of the sound, --image-rate a second; classes are numbered as COCO numbers them (car is 3) and as YOLO does (car
-is 2). An image up to the last with a box, of which nothing is listed, was searched in vain; what comes after
-that was not asked."""
+--detections takes OVAD's JSON, a COCO results list (JSON) or a folder of YOLO text. In the two last the
+number of an image ("image_id", or the number that the name of a text file ends in) counts from 0 at the first
+sample of the sound, --image-rate a second; classes have COCO's numbers (car is 3) and YOLO's (car is 2). Up
+to the last image with a box, one that lists nothing was searched in vain; later ones were not asked."""
 LENS_HELP = """\
 --camera takes JSON:
 {"width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90}, or "fx" and "cx" of a calibration in place of
