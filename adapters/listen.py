@@ -1,7 +1,8 @@
 """The whole chain over a recording: sound in, one world-state a hop out."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
@@ -31,6 +32,7 @@ from worldstate.adapters.files.engine_file import EngineSpeed, read_engine
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
+from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, feature_nfft
@@ -190,6 +192,8 @@ class Source:
     others : tuple of callables
         What other sensors measured, odometry too, each returning it in the order of stamps on the clock of
         the sound.
+    told : callable or None
+        Asked once a hop what sensors that run have told up to its stamp.
 
     Examples
     --------
@@ -227,6 +231,7 @@ class Source:
     history: SequenceHistory | None = None
     co_evidence: CoEvidenceChannel | None = None
     others: tuple[OtherModality, ...] = ()
+    told: Callable[[int], Iterable[Timed]] | None = None
 
     def world(self) -> WorldFilter:
         """Return the belief before the first hop."""
@@ -306,6 +311,11 @@ class Step:
     def state(self) -> WorldState:
         """The snapshot after the hop."""
         return self.world.state
+
+    @property
+    def checkpoint(self) -> Checkpoint:
+        """What another run goes on from."""
+        return Checkpoint(self.world, self.site, self.history)
 
 
 def open_source(
@@ -617,7 +627,8 @@ def listen_steps(source: Source) -> Iterator[Step]:
     waiting = Waiting(source.others, source.start_ns - 1 if source.resume is None else world.stamp_ns)
     measured = measure_steps(source, lambda: world.explanation.none, signature, reader)
     for frame, measurement in measured:
-        for other in waiting.until(measurement.stamp_ns):
+        running = () if source.told is None else source.told(measurement.stamp_ns)
+        for other in chain(waiting.until(measurement.stamp_ns), running):
             world = world.update(other)
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         site = signature.estimate if isinstance(signature, SiteSignature) else None

@@ -88,6 +88,8 @@ class LiveSound(Audio):
 
     Attributes
     ----------
+    start_ns : int
+        Time of the first sample on the stream's clock: not 0 where a belief is resumed.
     lost_samples : int
         Samples a channel that were lost on the way and are zeros in what `blocks` gave.
     """
@@ -97,7 +99,7 @@ class LiveSound(Audio):
         self.sample_rate_hz, self.channels = feed.sample_rate_hz, feed.channels
         # Known only after a second; the front-end leaves out a channel that is silent.
         self.silent_channels = ()
-        self.lost_samples = 0
+        self.lost_samples, self.start_ns = 0, 0
         self._feed, self._keep = feed, keep
         self._channel: BoundedChannel[SoundBlock] = BoundedChannel(int(LONGEST_WAIT_S * BLOCKS_PER_SECOND))
         self._captured_s = time.monotonic()
@@ -148,7 +150,7 @@ class LiveSound(Audio):
         late after a day.
         """
         since_s = (captured_s - self._captured_s) * self._feed.speed
-        return nanoseconds(self.frames / self.sample_rate_hz + since_s)
+        return self.start_ns + nanoseconds(self.frames / self.sample_rate_hz + since_s)
 
     def _gap(self, first: int) -> Iterator[Float32Array]:
         """Yield zeros, at most a second at a time, in place of what was lost before a block."""

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -173,29 +174,69 @@ def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys)
     assert "camera" in looked_at(states)
 
 
-def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
-    states = tmp_path / "states.jsonl"
+def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+        return free.getsockname()[1]
+
+
+@contextmanager
+def sending(port: int, *datagrams: bytes):
+    """Send these again and again while the block runs."""
     stopped = threading.Event()
 
-    def detect():
-        empty = json.dumps({"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}).encode()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as detector:
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             while not stopped.wait(0.05):
-                for datagram in (empty, b"nonsense"):
-                    detector.sendto(datagram, ("127.0.0.1", port))
+                for datagram in datagrams:
+                    sender.sendto(datagram, ("127.0.0.1", port))
 
-    detecting = threading.Thread(target=detect, daemon=True)
-    detecting.start()
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
     try:
-        asked = "--detections", f"127.0.0.1:{port}", "--out", states, "--json"
-        assert main(command(street, *asked)) == 0
+        yield
     finally:
         stopped.set()
-        detecting.join()
+        thread.join()
+
+
+def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
+    states, port = tmp_path / "states.jsonl", free_port()
+    empty = json.dumps({"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}).encode()
+    with sending(port, empty, b"nonsense"):
+        asked = "--detections", f"127.0.0.1:{port}", "--out", states, "--json"
+        assert main(command(street, *asked)) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["detections_refused"] > 0
     assert "expected" in report["last_refusal"] or "JSON" in report["last_refusal"]
     assert "camera" in looked_at(states)
+
+
+def test_odometry_that_is_told_moves_the_ego(street, tmp_path, capsys):
+    states, port = tmp_path / "states.jsonl", free_port()
+    driving = json.dumps({"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}).encode()
+    with sending(port, driving, b'{"speed_mps": 900}', b'{"speed_mps": 1, "x_m": 3}'):
+        asked = "--odometry", f"127.0.0.1:{port}", "--out", states, "--json"
+        assert main(command(street, *asked)) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["odometry_refused"] > 0
+    assert "speed_mps" in report["last_odometry_refusal"] or "together" in report["last_odometry_refusal"]
+    ego = json.loads(states.read_text().splitlines()[-1])["ego"]
+    assert ego["speed_mps"] == pytest.approx(5.0, abs=0.2)
+    assert ego["position_m"][0] > 1.0
+
+
+def test_what_was_saved_is_gone_on_from(street, tmp_path):
+    """Live and `run` take the same options and give the same states, and the clock goes on."""
+    saved = {}
+    for name in ("live", "run"):
+        state, half, rest = (tmp_path / f"{name}{end}" for end in (".json", "1.jsonl", "2.jsonl"))
+        words = command(street, "--speed", 20) if name == "live" else ["run", *command(street)[2:]]
+        assert main([*words, "--save-state", str(state), "--out", str(half)]) == 0
+        start = [] if name == "live" else ["--start", "2"]
+        assert main([*words, "--resume", str(state), *start, "--out", str(rest)]) == 0
+        saved[name] = state.read_text(), half.read_text(), rest.read_text()
+    assert saved["live"] == saved["run"]
+    stamps = [json.loads(line)["stamp_ns"] for text in saved["live"][1:] for line in text.splitlines()]
+    assert stamps[0] == 10**9 and stamps[-1] == 4 * 10**9
+    assert stamps == sorted(stamps)

@@ -37,6 +37,15 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
     add("--street", type=Path, metavar="JSON", help=street)
 
 
+def add_memory_options(parser: argparse.ArgumentParser, start: str) -> None:
+    """Declare --resume, --start and --save-state; `start` says what counts without --start."""
+    add = parser.add_argument
+    add("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
+    first = f"time of the first sample on the states' clock (default: {start})"
+    add("--start", type=float, metavar="S", help=first)
+    add("--save-state", type=Path, metavar="STATE", help="keep belief and site for --resume")
+
+
 def listen_settings(arguments: argparse.Namespace) -> "ListenSettings":
     """Return how it is listened to, boxes and silent channels by default."""
     from dataclasses import replace

@@ -41,7 +41,12 @@ from worldstate.cli.common.detector_options import (
     detector_filter,
     detector_maker,
 )
-from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
+from worldstate.cli.common.listen_options import (
+    add_listen_options,
+    add_memory_options,
+    given_context,
+    listen_settings,
+)
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
@@ -74,6 +79,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_car_options(parser)
     add_search_options(parser)
     add_listen_options(parser)
+    add_memory_options(parser, "0")
     _add_recording_options(parser)
     add_camera_options(parser)
     add_several_cameras(parser)
@@ -96,14 +102,11 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     add("--engine-lines", type=float, default=2.0, metavar="N", help=firings)
     other = "what another sensor recorded, by a reader that an installed package brings; may be repeated"
     add("--measurements", action="append", default=[], metavar="NAME=FILE", help=other)
-    add("--resume", type=Path, metavar="STATE", help="go on from what --save-state wrote")
-    add("--start", type=float, default=0.0, metavar="S", help="time of the first sample")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    add("--save-state", type=Path, metavar="STATE", help="keep belief and site for --resume")
     add("--figure", type=Path, metavar="PNG", help="draw the timeline")
     add("--gating", type=Path, metavar="PNG", help="bearing error against the share kept by prominence")
 
@@ -162,7 +165,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         model=arguments.model,
         context=given_context(arguments),
         resume=arguments.resume,
-        start_s=arguments.start,
+        start_s=arguments.start or 0.0,
         detector=detector,
         others=[other_modality("--measurements", text) for text in arguments.measurements],
         engine=_engine(arguments),

@@ -10,6 +10,14 @@ silence. Ctrl-C ends the run, and what it wrote is complete.
 --detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
 with "age_s" from the capture of the image to the sending; an image without boxes is sent, too.
+
+--odometry HOST:PORT takes how the car moves in the same way, as often as it is known:
+  {"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}
+with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. The model of a moving ego is taken
+where --model or --context says so.
+
+--save-state keeps belief and site at the end, --resume goes on from them: from the time at which they end, or
+by --start from a later one.
 """
 
 import argparse
@@ -24,7 +32,12 @@ from worldstate.cli.common.array_options import add_array_options, add_search_op
 from worldstate.cli.common.camera_options import LENS_HELP, add_lens_options, boxes_of
 from worldstate.cli.common.car_options import add_car_options, given_sensors
 from worldstate.cli.common.detector_options import add_detector_options, detector_filter, detector_maker
-from worldstate.cli.common.listen_options import add_listen_options, given_context, listen_settings
+from worldstate.cli.common.listen_options import (
+    add_listen_options,
+    add_memory_options,
+    given_context,
+    listen_settings,
+)
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
@@ -54,6 +67,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     _add_sound_options(parser)
     add_search_options(parser)
     add_listen_options(parser)
+    add_memory_options(parser, "the end of STATE")
+    told = "listen there to how the car moves"
+    parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
     _add_camera_options(parser)
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
@@ -87,22 +103,28 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.live.live_sound import LiveSound
     from worldstate.adapters.live.sound_keeping import kept_sound
 
-    check_outputs(arguments, "out", "keep_sound", *LOG_FILES)
+    check_outputs(arguments, "out", "keep_sound", "save_state", *LOG_FILES)
     with ExitStack() as opened:
         recorded = None if arguments.play is None else _source(arguments, arguments.play)
         feed = _microphones(arguments) if recorded is None else _played(arguments, recorded)
         keep = opened.enter_context(kept_sound(arguments.keep_sound, feed.sample_rate_hz, feed.channels))
         sound = LiveSound(feed, keep)
         source = _source(arguments, sound) if recorded is None else replace(recorded, sound=sound)
+        sound.start_ns = source.start_ns
         source, camera_losses = _with_camera(arguments, source, sound, opened)
-        figures = _listen(arguments, source, sound)
-        return CommandResult(figures | camera_losses() | {"array": stance(source.array)})
+        source, odometry_losses = _with_odometry(arguments, source, sound, opened)
+        figures = _listen(arguments, source, sound) | camera_losses() | odometry_losses()
+        return CommandResult(figures | {"array": stance(source.array)})
 
 
 def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source":
+    from worldstate.adapters.files.checkpoint_file import read_checkpoint
     from worldstate.adapters.listen import open_source
+    from worldstate.ground.values import seconds
 
     array, camera = given_sensors(arguments)
+    before = None if arguments.resume is None else read_checkpoint(arguments.resume)
+    ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
     moving = arguments.camera_device is not None
     boxes = detector_filter(arguments) if moving else boxes_of(arguments)
     return open_source(
@@ -112,6 +134,8 @@ def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source
         miss_rates=arguments.miss_rates,
         model=arguments.model,
         context=given_context(arguments),
+        resume=before,
+        start_s=ended_s if arguments.start is None else arguments.start,
         # A channel that is silent is told by the front-end, which leaves it out.
         settings=replace(listen_settings(arguments), mask_dead=True, boxes=boxes),
     )
@@ -179,8 +203,25 @@ def _with_device(
     return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
 
 
+def _with_odometry(
+    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
+    """Return the source with the odometry that was asked for, and what tells what was lost of it."""
+    from worldstate.adapters.live.odometry_socket import OdometrySocket
+
+    if arguments.odometry is None:
+        return source, dict
+    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
+    return replace(source, told=told.until), lambda: {
+        "odometry_dropped": told.dropped,
+        "odometry_refused": told.refused,
+        "last_odometry_refusal": told.problem or None,
+    }
+
+
 def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound") -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
+    from worldstate.adapters.files.checkpoint_file import save_checkpoint
     from worldstate.adapters.files.states_file import states_writer
     from worldstate.adapters.live.live_listening import live_steps
     from worldstate.ground.values import seconds
@@ -190,6 +231,7 @@ def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound")
 
     shown = sys.stderr.isatty() if arguments.view is None else arguments.view
     report, notice = LiveReport(source), loss_notices()
+    start_s, last = seconds(source.start_ns), None
     with (
         states_writer(arguments.out) as write,
         log_hops(arguments, source, paced=False) as log,
@@ -201,6 +243,12 @@ def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound")
             log(live.step)
             for watcher in (report.add, show, notice):
                 watcher(live)
-            if arguments.duration is not None and seconds(live.step.state.stamp_ns) >= arguments.duration:
+            last = live.step
+            if (
+                arguments.duration is not None
+                and seconds(last.state.stamp_ns) - start_s >= arguments.duration
+            ):
                 break
+    if arguments.save_state is not None and last is not None:
+        save_checkpoint(arguments.save_state, last.checkpoint)
     return report.to_dict(sound)

@@ -139,7 +139,7 @@ def run_recording(
             write(step.state.to_json())
             log.add(step)
             on_hop(step)
-            end = Checkpoint(step.world, step.site, step.history)
+            end = step.checkpoint
     elapsed_s, start_s = time.perf_counter() - started, seconds(source.start_ns)
     hops = HopTable.of_rows(_COLUMNS, log.rows)
     return RecordingReport(

@@ -1,0 +1,122 @@
+"""What another program sends as UDP datagrams: each with the time of its capture."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Generic, Self, TypeVar
+
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode_json
+
+from .bounded_channel import BoundedChannel
+
+T = TypeVar("T")
+# A second of images of a fast camera; what a stalled machine finds there beyond is too old to be of use.
+WAITING_DATAGRAMS = 64
+# The largest datagram that IP carries.
+_LARGEST_BYTES = 1 << 16
+# How soon a socket that is no longer listened to is noticed.
+_POLL_S = 0.2
+# Nothing older than this is used: see VisionSettings.max_frame_age_s and the lag of the filter.
+_OLDEST_S = 10.0
+
+
+class DatagramSocket(Generic[T]):
+    """Records that arrive as UDP datagrams of one JSON object, with ``"age_s"`` from capture to sending.
+
+    Parameters
+    ----------
+    address : str
+        HOST:PORT to listen at.
+    stamp_ns : callable
+        From the time of capture to the stream's clock: `LiveSound.stamp_ns`.
+    decode : callable
+        From the object without its age to what it stands for.
+    option : str
+        That named the address, for messages.
+
+    Attributes
+    ----------
+    refused : int
+        Datagrams that could not be read.
+    problem : str
+        What was wrong with the last of them.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If the address is none, or taken.
+    """
+
+    def __init__(
+        self, address: str, stamp_ns: Callable[[float], int], decode: Callable[[object], T], option: str
+    ) -> None:
+        self._socket, self._stamp_ns = _bound_socket(address, option), stamp_ns
+        self._decode = decode
+        self._datagrams: BoundedChannel[tuple[float, bytes]] = BoundedChannel(WAITING_DATAGRAMS)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self.refused, self.problem = 0, ""
+
+    @property
+    def dropped(self) -> int:
+        """Datagrams that nobody took in time."""
+        return self._datagrams.dropped
+
+    @property
+    def port(self) -> int:
+        """The port that is listened at, where 0 was given the one that was free."""
+        return int(self._socket.getsockname()[1])
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+        self._socket.close()
+
+    def __call__(self) -> Iterator[tuple[int, T]]:
+        """Yield what waits, each with the time of its capture on the stream's clock, nanoseconds."""
+        for arrived_s, datagram in self._datagrams.take_all():
+            try:
+                age_s, told = self._read_one(datagram)
+            except InvalidArgumentError as error:
+                self.refused, self.problem = self.refused + 1, str(error)
+                continue
+            yield self._stamp_ns(arrived_s - age_s), told
+
+    def _read_one(self, datagram: bytes) -> tuple[float, T]:
+        try:
+            record = decode_json(datagram.decode(), "datagram")
+        except UnicodeDecodeError as error:
+            raise InvalidArgumentError("datagram: expected UTF-8") from error
+        age_s = record.pop("age_s", 0.0) if isinstance(record, dict) else 0.0
+        return in_range("age_s", age_s, 0.0, _OLDEST_S), self._decode(record)
+
+    def _read(self) -> None:
+        self._socket.settimeout(_POLL_S)
+        while not self._stopped.is_set():
+            try:
+                datagram = self._socket.recv(_LARGEST_BYTES)
+            except TimeoutError:
+                continue
+            self._datagrams.put((time.monotonic(), datagram))
+
+
+def _bound_socket(address: str, option: str) -> socket.socket:
+    """Return a socket for datagrams at HOST:PORT."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) >= 1 << 16:
+        raise InvalidArgumentError(f"{option}: expected HOST:PORT to listen at, got {address}")
+    listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        listening.bind((host, int(port)))
+    except OSError as error:
+        listening.close()
+        problem = f"expected a free address, got {address} ({error})"
+        raise InvalidArgumentError(f"{option}: {problem}") from error
+    return listening
