@@ -48,6 +48,7 @@ COMMANDS = (
     "studies.ablations",
     "studies.identifiability",
     "users.bench",
+    "completion",
 )
 
 EPILOG = """\

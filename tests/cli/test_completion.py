@@ -1,0 +1,56 @@
+"""The script of `worldstate completion`, as a real bash runs it."""
+
+import shutil
+import subprocess
+
+import pytest
+
+from worldstate.cli.completion import bash_script
+from worldstate.cli.main import COMMANDS, build_parser, main
+
+BASH = shutil.which("bash")
+ASK = """
+COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+_worldstate; printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.fixture(scope="module")
+def script():
+    return bash_script(build_parser())
+
+
+def complete(script: str, *words: str) -> list[str]:
+    asked = script + ASK.format(words=" ".join(f"'{word}'" for word in words))
+    answer = subprocess.run([BASH, "--norc", "-c", asked], capture_output=True, text=True, timeout=20)
+    assert answer.stderr == ""
+    return answer.stdout.split()
+
+
+@pytest.mark.skipif(BASH is None, reason="there is no bash here")
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["worldstate", "evaluate-s"], ["evaluate-signatures", "evaluate-streams"]),
+        (["worldstate", "run", "a.wav", "--uncal"], ["--uncalibrated"]),
+        (["worldstate", "run", "--format", "s"], ["s16", "s24", "s32"]),
+        (["worldstate", "completion", ""], ["bash"]),
+        (["worldstate", "live", "--uncalibrated", "--save-s"], ["--save-state"]),
+        # Left to the completion of files.
+        (["worldstate", "run", "some"], []),
+        (["worldstate", "run", "--array", "mi"], []),
+    ],
+)
+def test_bash_completes(script, words, found):
+    assert complete(script, *words) == found
+
+
+@pytest.mark.skipif(BASH is None, reason="there is no bash here")
+def test_every_command_is_completed(script):
+    names = {name.split(".")[-1].replace("_", "-") for name in COMMANDS}
+    assert set(complete(script, "worldstate", "")) == names | {"--help", "--version"}
+
+
+def test_it_is_printed_alone_so_that_a_shell_can_read_it(script, capsys):
+    assert main(["completion", "bash"]) == 0
+    assert capsys.readouterr().out == script + "\n"
