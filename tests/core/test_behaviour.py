@@ -237,3 +237,21 @@ def test_a_certain_entity_survives_a_checkpoint():
         certain = SignatureEvidence(("left", "right"), (float(rng.uniform(8, 40)), 0.0), 3.0, 0.0)
         world = after(world, measured(hop / 10, certain))
         assert WorldFilter.from_dict(world.to_dict()).state == world.state
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "rate", "answer"), [(0.42, 0.4, "unqueried"), (0.42, -0.4, "absent"), (0.0, 0.4, "absent")]
+)
+def test_who_has_driven_to_the_edge_ahead_is_out_of_sight_rather_than_missed(azimuth, rate, answer):
+    """Its box ends where the corner begins; no box any more says that it has gone, not that it is in view."""
+    hops = [(1.0 + 0.1 * hop, azimuth + 0.1 * rate * (hop - 9)) for hop in range(10)]
+    boxes = [replace(car(at), width_rad=0.25) for _, at in hops]
+    world = after(WorldFilter(), *[measured(t, FRONT, box) for (t, _), box in zip(hops, boxes, strict=True)])
+    (entity,) = after(world, measured(2.0, FRONT, answer=Absent(0.1))).state.entities
+    assert (entity.status, entity.visibility.answer) == ("visible", answer)
+    # Found once more, it is in view again.
+    again = replace(car(azimuth + 0.2 * rate), width_rad=0.25)
+    (entity,) = after(
+        world, measured(2.0, FRONT, answer=Absent(0.1)), measured(2.1, FRONT, again)
+    ).state.entities
+    assert entity.visibility.answer == "visible"

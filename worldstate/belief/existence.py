@@ -1,6 +1,4 @@
-"""Bernoulli existence updates for detection, missed detection and elapsed time."""
-
-import math
+"""Bernoulli existence updates for detection and missed detection."""
 
 
 def after_empty_look(existence: float, miss_rate: float) -> float:
@@ -22,16 +20,3 @@ def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> f
     # A look finds something where the entity is detected or, if it is missed, where there is clutter.
     found = existence * (1.0 - miss_rate * (1.0 - clutter_rate))
     return found / (found + (1.0 - existence) * clutter_rate)
-
-
-def after_time(existence: float, step_s: float, mean_life_s: float) -> float:
-    r"""Return the existence after a time without looks.
-
-    .. math:: r \leftarrow r\, e^{-dt / \tau}
-
-    Examples
-    --------
-    >>> round(after_time(0.9, 10.0, 10.0), 3)
-    0.331
-    """
-    return existence * math.exp(-step_s / mean_life_s)

@@ -51,7 +51,7 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     >>> near[0] = far[5] = 1.0
     >>> side = SideGeometry("left", 0.56, 0.96, 0.35)
     >>> [round(math.degrees(value)) for value in (*hidden_bearing(near, side), *hidden_bearing(far, side))]
-    [37, 5, 63, 6]
+    [37, 5, 63, 5]
     """
     along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
     sign, edge_rad = math.copysign(1.0, along_rad), abs(along_rad)

@@ -12,7 +12,6 @@ from worldstate.abduction.road_users import ClassShares
 from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
-from .existence import after_time
 from .kinematics.cartesian import CartesianBelief, polar_motion, predict_place
 from .kinematics.motion import MotionBelief, predict, relax
 from .kinematics.polar import AZIMUTH_RATE
@@ -23,7 +22,7 @@ from .site_geometry import SiteGeometry
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
 # At a score of .9 three sightings in a row outvote a label held with certainty; with a gain of 1 every
 # misread image would rename the entity.
-_LABEL_GAIN = 0.3
+LABEL_GAIN = 0.3
 # Hops share nineteen twentieths of the two seconds that they are classified by.
 _HEARD_GAIN = 0.2
 # m^2/s^3 where moving vehicles have 2: a parked one must not drift with its boxes, but stay updatable.
@@ -62,6 +61,7 @@ class Track:
     was_hidden: bool = False
     place: CartesianBelief | None = field(default=None, metadata=ADDED)  # Then `motion` follows from it
     behind: Probability = field(default=1.0, metadata=ADDED)  # P(behind its side's occluder), by that place
+    width_rad: float = field(default=0.0, metadata=ADDED)  # Of its last box
 
     @property
     def detected(self) -> bool:
@@ -144,7 +144,7 @@ def _relaxed(
     for track, moved in zip(tracks, relaxed.each(), strict=True):
         existence = track.existence
         if track.seen:
-            existence = after_time(existence, step_s, settings.visible_life_s)
+            existence *= math.exp(-step_s / settings.visible_life_s)
         yield replace(track, motion=moved, existence=existence)
 
 
@@ -163,7 +163,9 @@ def _followed(track: Track, motion: MotionBelief, site: SiteGeometry) -> Track:
     return replace(track, motion=motion, behind=behind)
 
 
-def relabelled(labels: tuple[Label, ...], seen_as: ClassShares) -> tuple[Label, ...]:
+def relabelled(
+    labels: tuple[Label, ...], seen_as: ClassShares, gain: float = LABEL_GAIN
+) -> tuple[Label, ...]:
     """Return class probabilities after one detection, an exponential average over detections.
 
     Examples
@@ -171,21 +173,17 @@ def relabelled(labels: tuple[Label, ...], seen_as: ClassShares) -> tuple[Label, 
     >>> relabelled((("car", 0.9),), (("truck", 0.8),))
     (('car', 0.63), ('truck', 0.24))
     """
-    return _averaged(labels, seen_as, _LABEL_GAIN)
+    kept = {label: probability * (1.0 - gain) for label, probability in labels}
+    for label, probability in seen_as:
+        kept[label] = kept.get(label, 0.0) + gain * probability
+    return tuple(sorted((label, round(p, 12)) for label, p in kept.items() if p > 1e-3))
 
 
 def heard_as(track: Track, kinds: ClassShares) -> tuple[Label, ...]:
     """Return class probabilities after one more hop; what a detector once said, the ear does not change."""
     if not kinds or track.last_seen_ns is not None:
         return track.labels
-    return _averaged(track.labels, kinds, _HEARD_GAIN)
-
-
-def _averaged(labels: tuple[Label, ...], others: tuple[Label, ...], gain: float) -> tuple[Label, ...]:
-    kept = {label: probability * (1.0 - gain) for label, probability in labels}
-    for label, probability in others:
-        kept[label] = kept.get(label, 0.0) + gain * probability
-    return tuple(sorted((label, round(p, 12)) for label, p in kept.items() if p > 1e-3))
+    return relabelled(track.labels, kinds, _HEARD_GAIN)
 
 
 def merged(sources: tuple[str, ...], source: str) -> tuple[str, ...]:

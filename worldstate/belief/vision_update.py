@@ -1,5 +1,6 @@
 """Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -9,6 +10,7 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import CameraLook, Look, Measurement, Sighting
 from worldstate.measurement.sector import Sector
 
@@ -17,7 +19,7 @@ from .existence import after_empty_look, after_sighting
 from .explanation import ExplanationBelief
 from .kinematics.cartesian import update_bearing
 from .kinematics.motion import MotionBelief, update_azimuth
-from .kinematics.polar import LOG_RANGE, RADIAL_RATE
+from .kinematics.polar import AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, follow_places, merged, relabelled
@@ -72,13 +74,14 @@ def vision_update(
     for i, track in enumerate(tracks):
         answer = _searched(track, measurement, seen.look, view)
         existence = _existence(track, whose.chances[i], answer, weight, rates)
-        if i not in found:
-            held = answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others)
-            after.append(track if held else _not_sighted(track, existence, answer))
-        elif track.seen:
-            after.append(_sighted(turned[i], sightings[found[i]], existence, measurement, site))
+        if i in found:
+            update = _sighted if track.seen else _handed_over
+            after.append(update(turned[i], sightings[found[i]], existence, measurement, site))
+        elif answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others):
+            after.append(track)
         else:
-            after.append(_handed_over(turned[i], sightings[found[i]], measurement, site))
+            left = _has_left(track, answer, measurement.stamp_ns, site)
+            after.append(_not_sighted(track, existence, _OUTSIDE if left else answer))
     handed_over = whose.handed_over(tracks, after, site.settings)
     for side, residual in handed_over.items():
         explanation = explanation.emerge(side, residual)
@@ -121,13 +124,14 @@ def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:
 
 
 def _found(
-    track: Track, existence: float, measurement: Measurement, settings: FilterSettings, **changes: Any
+    track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry, **changes: Any
 ) -> Track:
-    """Return an associated track with existence, sources and time stamps updated, and more changes."""
-    miss, _ = _rates(measurement.co_evidence, settings)
+    """Return an associated track with width, sources and time stamps updated, and more changes."""
+    miss, _ = _rates(measurement.co_evidence, site.settings)
     return replace(
         track,
-        existence=existence,
+        moving=sighting.moving,
+        width_rad=sighting.width_rad,
         sources=merged(track.sources, "vision"),
         updated_ns=measurement.stamp_ns,
         last_seen_ns=measurement.stamp_ns,
@@ -141,21 +145,17 @@ def _sighted(
     track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
 ) -> Track:
     labels = relabelled(track.labels, ((sighting.label, sighting.score),))
-    return _found(track, existence, measurement, site.settings, labels=labels, moving=sighting.moving)
+    return _found(track, sighting, measurement, site, existence=existence, labels=labels)
 
 
-def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
+def _handed_over(
+    track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
+) -> Track:
     """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
-    existence = max(track.existence, site.settings.sighting_existence)
-    return _found(
-        track,
-        after_sighting(existence, *_rates(measurement.co_evidence, site.settings)),
-        measurement,
-        site.settings,
-        seen=True,
-        side=site.nearest_side(sighting.azimuth_rad),
-        labels=((sighting.label, sighting.score),),
-    )
+    known = max(track.existence, site.settings.sighting_existence)
+    existence = after_sighting(known, *_rates(measurement.co_evidence, site.settings))
+    changes = {"side": site.nearest_side(sighting.azimuth_rad), "labels": ((sighting.label, sighting.score),)}
+    return _found(track, sighting, measurement, site, existence=existence, seen=True, **changes)
 
 
 def _turned(
@@ -194,6 +194,25 @@ def _searched(track: Track, measurement: Measurement, look: Look, view: Sector) 
     if not view.touches(track.motion.azimuth_rad):
         return _OUTSIDE
     return look.answer
+
+
+def _has_left(track: Track, answer: CoEvidence, stamp_ns: int, site: SiteGeometry) -> bool:
+    r"""Tell whether the likelier reason of a miss is that its leading end has passed the edge ahead of it.
+
+    .. math:: p \ge (1 - p)\, \beta^{\min(t / T, 1)}
+
+    with the chance p of that, the time t since its last box and the interval T of looks. Boxes end as soon as
+    a vehicle is partly hidden: stated in view until its existence has fallen, it would be for half a second.
+    """
+    if not (track.seen and track.moving) or isinstance(answer, Unqueried):
+        return False
+    way = math.copysign(1.0, track.motion.mean[AZIMUTH_RATE])
+    past = site.past_edge(
+        track.motion.azimuth_rad + 0.5 * way * track.width_rad, track.motion.azimuth_std_rad, way
+    )
+    unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
+    missed = math.pow(answer.miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
+    return past >= (1.0 - past) * missed
 
 
 def _existence(
@@ -235,7 +254,7 @@ def _born(sighting: Sighting, measurement: Measurement, number: int, site: SiteG
         updated_ns=measurement.stamp_ns,
     )
     existence = after_sighting(existence, *_rates(measurement.co_evidence, site.settings))
-    return _found(unseen, existence, measurement, site.settings)
+    return _found(unseen, sighting, measurement, site, existence=existence)
 
 
 def _motion_at(sighting: Sighting, before: MotionBelief | None) -> MotionBelief:

@@ -147,9 +147,9 @@ def priors_of(explanation: ExplanationBelief) -> Priors:
 
 
 def _first_explanation(context: Context) -> ExplanationBelief:
-    priors = context.priors
+    k, priors = len(context.directions), context.priors
+    # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
+    # street.
     if priors is None:
-        # Without priors the filter starts as if it had waited for ever: neither alarmed nor sure of an empty
-        # street.
-        return ExplanationBelief.settled(len(context.directions), context.rates.values_hz)
-    return ExplanationBelief.from_priors(len(context.directions), priors.hidden, priors.visible, priors.none)
+        return ExplanationBelief.settled(k, context.rates.values_hz)
+    return ExplanationBelief.from_priors(k, priors.hidden, priors.visible, priors.none)

@@ -2,7 +2,7 @@
 
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -38,13 +38,8 @@ _DIGITS = 9
 _MOSTLY_MISSED = 0.5
 
 
-class _Moments(NamedTuple):
-    """Mean and deviations of a track's motion, and what follows from them, as Python numbers."""
-
-    mean: list[float]
-    std: list[float]
-    azimuth_covariance: list[float]
-    forecast: Forecast
+# Mean and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
+_Moments: TypeAlias = tuple[list[float], list[float], list[float], Forecast]
 
 
 def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -> tuple[Entity, ...]:
@@ -56,7 +51,7 @@ def entities_of(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -
     covariances = np.array([track.motion.covariance for track in tracks])
     stds = np.sqrt(covariances.diagonal(axis1=1, axis2=2))
     lists = (array.round(_DIGITS).tolist() for array in (means, stds, covariances[:, *_UPPER]))
-    moments = map(_Moments, *lists, forecasts(tracks, means, covariances, site.settings))
+    moments = zip(*lists, forecasts(tracks, means, covariances, site.settings), strict=True)
     build = partial(_entity, memory, memory.sides, site)
     return tuple(map(build, tracks, moments))
 

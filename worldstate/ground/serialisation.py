@@ -476,18 +476,8 @@ def _whole(data: object) -> int:
     raise _refused("a whole number of 64 bits", data)
 
 
-def _text(data: object) -> str:
-    if isinstance(data, str):
-        return data
-    raise _refused("text", data)
-
-
-def _flag(data: object) -> bool:
-    if isinstance(data, bool):
-        return data
-    raise _refused("true or false", data)
-
-
+_text = _checked(_as_is, Check("text", lambda value: isinstance(value, str)))
+_flag = _checked(_as_is, Check("true or false", lambda value: isinstance(value, bool)))
 _SCALARS: dict[Hint, Read] = {float: _finite, int: _whole, str: _text, bool: _flag}
 
 

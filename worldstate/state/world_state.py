@@ -16,8 +16,7 @@ from .cue import RiskCue
 from .ego import Ego
 from .entity import Entity
 from .event import Event
-from .graph import scene_graph
-from .relation import Relation
+from .relation import EGO, Relation
 from .sensor import SearchedView, SensorHealth
 
 if TYPE_CHECKING:
@@ -142,12 +141,29 @@ class WorldState:
     def graph(self) -> "nx.MultiDiGraph[str]":
         """Return the scene graph: nodes are the ego vehicle, entities and occluders, edges the relations.
 
+        Nodes are keyed by id and carry ``type`` (``"ego"``, ``"occluder"`` or ``"entity"``) and the object as
+        ``value``; edges are keyed by kind, with ``probability``, ``stamp_ns``, ``since_ns`` and ``until_ns``.
+
         Examples
         --------
-        >>> sorted(WorldState(0, 0).graph().nodes)
-        ['corner_left', 'corner_right', 'ego']
+        >>> from worldstate.state import Relation
+        >>> graph = WorldState(0, 0, relations=(Relation("corner_left", "ego", "left_of", 1.0, 0),)).graph()
+        >>> sorted(graph.nodes), graph.edges["corner_left", "ego", "left_of"]["probability"]
+        (['corner_left', 'corner_right', 'ego'], 1.0)
         """
-        return scene_graph(self.entities, self.relations, self.context)
+        # Imported here: whoever never asks for a graph does not wait for networkx.
+        import networkx as nx
+
+        graph = nx.MultiDiGraph()
+        graph.add_node(EGO, type="ego", value=self.context)
+        for occluder in self.context.occluders:
+            graph.add_node(occluder.id, type="occluder", value=occluder)
+        for entity in self.entities:
+            graph.add_node(entity.id, type="entity", value=entity)
+        for edge in self.relations:
+            names = ("probability", "stamp_ns", "since_ns", "until_ns")
+            graph.add_edge(edge.src, edge.dst, key=edge.kind, **{name: getattr(edge, name) for name in names})
+        return graph
 
     def to_dict(self) -> dict[str, Any]:
         """Return the snapshot as JSON-able values; unknown is None."""
