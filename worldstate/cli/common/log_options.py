@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 
 FOXGLOVE_PORT = 8765
 # The options that name files to write.
-LOG_FILES = ("mcap", "osi", "autoware")
+LOG_FILES = ("mcap", "rerun", "osi", "autoware")
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --mcap, --live, --osi, --autoware, --odas, --ros-bag, --export and --crossing."""
+    """Declare --mcap, --rerun, --live, --osi, --autoware, --odas, --ros-bag, --export and --crossing."""
     add = parser.add_argument_group("viewers, logs and other stacks").add_argument
     add("--mcap", type=Path, metavar="FILE", help="write snapshots and scene for Foxglove")
+    add("--rerun", type=Path, metavar="FILE", help="write the same for the Rerun viewer (extra `rerun`)")
     live = "serve the same on a Foxglove websocket, in real time (default port: 8765)"
     add("--live", type=int, nargs="?", const=FOXGLOVE_PORT, metavar="PORT", help=live)
     add("--osi", type=Path, metavar="FILE", help="write a trace of ASAM OSI SensorData")
@@ -70,6 +71,10 @@ def open_logs(arguments: argparse.Namespace, *, paced: bool = True) -> Iterator[
             from worldstate.adapters.export.mcap_file import mcap_file
 
             logs.viewers.append(opened.enter_context(mcap_file(arguments.mcap)))
+        if arguments.rerun is not None:
+            from worldstate.adapters.export.rerun_file import rerun_file
+
+            logs.viewers.append(opened.enter_context(rerun_file(arguments.rerun)))
         if arguments.live is not None:
             from worldstate.adapters.export.live_server import live_server
 
