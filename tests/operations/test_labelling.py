@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.labelling.box_tracks import box_tracks
+from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
 from worldstate.operations.labelling.label_files import file_below, open_label, window_rows
 from worldstate.operations.labelling.pass_labels import label_passes
 
@@ -56,6 +57,24 @@ def test_who_drives_ahead_or_stands_comes_out_of_no_arm():
     tracks = box_tracks(DetectionLog.at_rate(frames, 10.0), CAMERA, DetectionFilter())
     assert [one.arm for one in tracks] == [None]
     assert label_passes(tracks) == []
+
+
+def test_who_overtakes_and_drives_away_comes_out_of_no_arm():
+    # Beside the ego at first, 3 m to the left of it, then back in its lane and 30 m ahead.
+    ahead_m, left_m = np.linspace(6.0, 30.0, 24), np.linspace(3.0, -0.5, 24)
+    time_s, edges = np.arange(24) / 10.0, (left_m + np.array([[0.9], [-0.9]])) / ahead_m
+    overtaking = BoxTrack(time_s, *np.arctan(edges), 1.55 / ahead_m, "car")
+    assert overtaking.arm is None
+    assert replace(overtaking, height_rad=np.full(24, 0.15)).arm == "left"
+    assert label_passes([overtaking]) == []
+
+
+def test_nobody_is_about_to_be_seen_after_an_empty_window():
+    time_s = np.arange(10, 600) / 10.0
+    seen = (time_s >= 24.0) & (time_s <= 27.0)
+    ends = [row[5] for row in window_rows([], seen, time_s, "Sown", "street.wav")]
+    assert ends
+    assert all(end_s + 5.0 < 24.0 or end_s - 3.0 > 26.9 for end_s in ends)
 
 
 def test_open_label_holds_every_pass_with_its_hidden_phase(labelled):

@@ -21,6 +21,11 @@ _LONGEST_GAP_S = 0.8  # Eight images: of 86 % detected each, one gap in ten mill
 _LEAST_BOXES = 4
 # Who turns less than this while in view drives along the ego's own street, and comes out of no arm.
 _LEAST_TURN_RAD = math.radians(8.0)
+# Who crosses keeps its distance ahead. From the first quarter of the boxes to the last, those of 519 of 520
+# simulated passes shrink to .966 or less far, those of 47 cars that overtook to .914 or farther: these come
+# into view beside the ego, and were taken for passes out of the left arm. At drawn junctions that were not
+# looked at for this, 8 of 2158 passes are lost, and 5 of 88 cars stay.
+_LEAST_GROWTH = 0.94
 # Nearer to the edge of the image than this a box ends with the image, not with the vehicle.
 _BORDER_PX = 8.0
 _SPAN = 4  # Boxes whose motion predicts the next one
@@ -38,12 +43,20 @@ class BoxTrack:
 
     @property
     def arm(self) -> str | None:
-        """Side that it came from, None where it drives along the ego's street."""
+        """Side that it came from, None where it drives along the ego's street or away from the ego."""
         middle = 0.5 * (self.left_rad + self.right_rad)
         middle = middle[np.isfinite(middle)]
-        if middle.size < _LEAST_BOXES or abs(middle[-1] - middle[0]) < _LEAST_TURN_RAD:
+        if middle.size < _LEAST_BOXES or abs(middle[-1] - middle[0]) < _LEAST_TURN_RAD or self._recedes:
             return None
         return "left" if middle[-1] < middle[0] else "right"
+
+    @property
+    def _recedes(self) -> bool:
+        whole = self.height_rad[np.isfinite(self.height_rad)]
+        if not whole.size:
+            return False
+        quarter = max(1, whole.size // 4)
+        return bool(np.median(whole[-quarter:]) < _LEAST_GROWTH * np.median(whole[:quarter]))
 
     @property
     def leading_rad(self) -> FloatArray:

@@ -89,7 +89,8 @@ def window_rows(
     last = -np.inf
     for end_s in time_s.tolist():
         coming = ((entries >= end_s - 1.0) & (entries <= end_s + CALM_S)).any()
-        busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s)].any()
+        # Whoever is about to be seen may be heard already, even where no pass was made of it.
+        busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s + CALM_S)].any()
         if end_s - last >= NONE_EVERY_S and end_s <= time_s[-1] - CALM_S and not (coming or busy):
             rows.append((*_window("none", environment, file, f"{end_s:.0f}", "s", end_s), "", ""))
             last = end_s
