@@ -1,6 +1,6 @@
 """T0 and hidden places of smoothed passes on simulated streams, beside what the filter said at the time.
 
-Run: python benchmarks/bench_labels.py streams/*-approaches-*.npz [--passes 30] [--json]
+Run: python benchmarks/bench_labels.py streams/*-approaches-*.npz [--passes 30] [--figure PNG] [--json]
 
 Boxes are drawn from the truth of the streams, with misses. T0 against that of the simulation, places of the
 front's middle against its path, in the three seconds before T0 ("hidden": all of their hops). The filter is
@@ -21,9 +21,14 @@ import numpy as np
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.simulation.scene.kinds import vehicle_kind
 from worldstate.belief.kinematics import motion
+from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.operations.commissioning.heard_stream import HeardStream
+from worldstate.operations.figure_style import RED, figure_file, legend_beside
 from worldstate.operations.labelling.box_tracks import box_tracks
+from worldstate.operations.labelling.pass_figure import draw_passes, draw_track
 from worldstate.operations.labelling.pass_labels import PassLabel, label_passes, start_of
+from worldstate.operations.recordings.true_track import TrueTrack
+from worldstate.smoothing.smoothed_track import SmoothedTrack
 from worldstate.studies.passes.stream_camera import stream_detections
 from worldstate.studies.passes.world_exam import EVERYBODY
 
@@ -34,54 +39,37 @@ METHODS = ("smoothed", "filter")
 PLACE = [0, 3]  # Azimuth and logarithm of the range, of a state
 
 
-def stream_errors(path: Path, passes: int, seed: int = 0) -> tuple[list[dict[str, list[float]]], int]:
-    """Errors of every labelled pass, and how many vehicles came out of an arm."""
+def stream_passes(path: Path, passes: int, seed: int = 0) -> tuple[HeardStream, list[PassLabel], int]:
+    """A stream, the labels of its first passes, and how many vehicles came out of an arm until then."""
     stream, camera = HeardStream.load(path), PinholeCamera()
     log = stream_detections(stream, np.random.default_rng(seed), camera)
     tracks = [one for one in box_tracks(log, camera, EVERYBODY) if one.arm is not None][:passes]
     until_s = float(tracks[-1].time_s[0]) + SAME_PASS_S
-    found = [_errors(stream, one) for one in label_passes(tracks, camera.position_m[0])]
     vehicles = stream.vehicles
     came = vehicles.hazard & (vehicles.entry_s > 0.0) & (vehicles.entry_s < until_s)
-    return [one for one in found if one], int(came.sum())
+    return stream, label_passes(tracks, camera.position_m[0]), int(came.sum())
 
 
-def _errors(stream: HeardStream, one: PassLabel) -> dict[str, list[float]]:
+def true_track(stream: HeardStream, one: PassLabel) -> tuple[float, TrueTrack] | None:
+    """T0 and path of the vehicle that a label is of, None where none came out of that arm at that time."""
     vehicles = stream.vehicles
     near = np.where(vehicles.arm == one.arm, np.abs(vehicles.entry_s - one.t0.time_s), np.inf)
     near[~vehicles.hazard] = np.inf
     row = int(np.nanargmin(near))
     if near[row] > SAME_PASS_S:
-        return {}
-    entry_s, side = float(vehicles.entry_s[row]), 1.0 if one.arm == "left" else -1.0
+        return None
     mine = stream.rows.vehicle == vehicles.vehicle[row]
-    time_s, x, y = (column[mine] for column in (stream.rows.time_s, stream.rows.x_m, stream.rows.y_m))
+    time_s, x, y, seen = (stream.rows.columns[name][mine] for name in ("time_s", "x_m", "y_m", "in_view"))
     # Rows hold the front axle; boxes show the bumper ahead of it.
-    y = y - side * vehicle_kind(str(vehicles.kind[row])).axles_m[0]
-    hop = np.round(10.0 * (entry_s - LEADS_S)).astype(int)
-    seen = dict(zip(np.round(10.0 * time_s).astype(int).tolist(), (x + 1j * y).tolist(), strict=True))
-    true = np.array([seen.get(at, math.nan + 0j) for at in hop.tolist()])
-    smoothed, rows = one.track.motion, np.searchsorted(one.track.time_s, entry_s - LEADS_S - 0.5 * HOP_S)
-    means = {"smoothed": smoothed.mean[rows]}
-    spreads = {"smoothed": smoothed.covariance[rows]}
-    means["filter"], spreads["filter"] = _filtered(stream, one, entry_s)
-    told = {"t0_s": [one.t0.time_s - entry_s], "t0_std_s": [one.t0.std_s]}
-    for name in METHODS:
-        said = np.exp(means[name][:, 3] + 1j * means[name][:, 0])
-        off = np.stack([np.angle(said * true.conj()), np.log(np.abs(said) / np.abs(true))], axis=1)
-        spread = spreads[name][:, PLACE][:, :, PLACE]
-        told[f"{name}_m"] = np.abs(said - true).tolist()
-        told[f"{name}_deg"] = np.degrees(np.abs(off[:, 0])).tolist()
-        told[f"{name}_nees"] = (np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off) / 2.0).tolist()
-    return told
+    y = y - (1.0 if one.arm == "left" else -1.0) * vehicle_kind(str(vehicles.kind[row])).axles_m[0]
+    return float(vehicles.entry_s[row]), TrueTrack(time_s, np.arctan2(y, x), seen, np.stack([x, y], axis=1))
 
 
-def _filtered(stream: HeardStream, one: PassLabel, entry_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance that a filter would have said at every lead, NaN where it had not begun."""
-    hops, belief = stream.hops, start_of(one.arm)
-    means, spreads = np.full((LEADS_S.size, 4), math.nan), np.tile(np.eye(4), (LEADS_S.size, 1, 1))
-    first = int(np.searchsorted(hops.time_s, one.track.time_s[0]))
-    for hop in range(first, int(np.searchsorted(hops.time_s, entry_s))):
+def filtered_track(stream: HeardStream, one: PassLabel) -> SmoothedTrack:
+    """What a filter would have said at every hop until T0."""
+    hops, belief, said = stream.hops, start_of(one.arm), []
+    first, last = np.searchsorted(hops.time_s, [one.track.time_s[0], one.t0.time_s]).tolist()
+    for hop in range(first, last):
         belief = motion.predict(belief, HOP_S, 1.0)
         bearing = float(hops.bearing_rad[hop])
         # Images on the other side say nothing of this one.
@@ -90,9 +78,37 @@ def _filtered(stream: HeardStream, one: PassLabel, entry_s: float) -> tuple[np.n
         if np.isfinite(hops.looming_hz[hop]):
             rate, std = float(hops.looming_hz[hop]), float(hops.looming_std_hz[hop])
             belief = motion.update_approach(belief, rate, math.hypot(std, 0.3), 1.0)
-        near = np.abs(hops.time_s[hop] - (entry_s - LEADS_S)) <= 0.5 * HOP_S
-        means[near], spreads[near] = belief.mean, belief.covariance
-    return means, spreads
+        said.append(belief)
+    stamps = np.round(1e9 * hops.time_s[first:last]).astype(np.int64)
+    return SmoothedTrack("filter", stamps, MotionBelief.stacked(said), np.zeros(2))
+
+
+def pass_errors(stream: HeardStream, one: PassLabel) -> dict[str, list[float]]:
+    """Errors of T0 and of what smoother and filter say at every lead; none where the label is of nobody."""
+    found = true_track(stream, one)
+    if found is None:
+        return {}
+    entry_s, vehicle = found
+    true = _at(vehicle.time_s, vehicle.position_m @ np.array([1.0, 1j]), entry_s)
+    told = {"t0_s": [one.t0.time_s - entry_s]}
+    for name, track in zip(METHODS, (one.track, filtered_track(stream, one)), strict=True):
+        mean = _at(track.time_s, track.motion.mean, entry_s)
+        spread = _at(track.time_s, track.motion.covariance, entry_s)[:, PLACE][:, :, PLACE]
+        said = np.exp(mean[:, 3] + 1j * mean[:, 0])
+        off = np.stack([np.angle(said * true.conj()), np.log(np.abs(said) / np.abs(true))], axis=1)
+        told[f"{name}_m"] = np.abs(said - true).tolist()
+        told[f"{name}_deg"] = np.degrees(np.abs(off[:, 0])).tolist()
+        told[f"{name}_nees"] = (0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)).tolist()
+    return told
+
+
+def _at(time_s: np.ndarray, rows: np.ndarray, entry_s: float) -> np.ndarray:
+    """Rows at every lead, linear between two, NaN beyond the first and the last by more than half a hop."""
+    asked_s = entry_s - LEADS_S
+    columns = [np.interp(asked_s, time_s, column) for column in rows.reshape(len(rows), -1).T]
+    found = np.stack(columns, axis=1).reshape(LEADS_S.size, *rows.shape[1:])
+    found[(asked_s < time_s[0] - 0.5 * HOP_S) | (asked_s > time_s[-1] + 0.5 * HOP_S)] = math.nan
+    return found
 
 
 def figures(found: list[dict[str, list[float]]], came: int, rng: np.random.Generator) -> dict[str, object]:
@@ -144,17 +160,33 @@ def _interval(
     return [round(float(value), 2) for value in (measure(*kept), low, high)]
 
 
+def write_figure(path: Path, one: PassLabel, stream: HeardStream) -> None:
+    """Draw a pass from above: smoother and filter, the edge as learned, and the true track."""
+    _, vehicle = true_track(stream, one)
+    track = filtered_track(stream, one)
+    with figure_file(path, 8.5, 3.4) as figure:
+        axes = figure.add_subplot()
+        draw_track(axes, track, np.ones(len(track.stamps_ns), bool), RED, f"{one.arm}, filter")
+        draw_passes(axes, [one], [vehicle])
+        legend_beside(axes)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("streams", type=Path, nargs="+", metavar="NPZ")
     parser.add_argument("--passes", type=int, default=30, help="of every stream, the first so many")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the pass of the median hidden error")
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     found, came = [], 0
     for path in options.streams:
-        errors, vehicles = stream_errors(path, options.passes)
-        found, came = found + errors, came + vehicles
-    told = figures(found, came, np.random.default_rng(0))
+        stream, passes, vehicles = stream_passes(path, options.passes)
+        found += [(one, stream, errors) for one in passes if (errors := pass_errors(stream, one))]
+        came += vehicles
+    told = figures([errors for *_, errors in found], came, np.random.default_rng(0))
+    if options.figure:
+        hidden_m = [_rms(np.array(errors["smoothed_m"])) for *_, errors in found]
+        write_figure(options.figure, *found[int(np.argsort(hidden_m)[len(found) // 2])][:2])
     print(json.dumps(told, indent=2) if options.json else "\n".join(f"{k:26s} {v}" for k, v in told.items()))
 
 

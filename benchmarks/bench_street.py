@@ -21,18 +21,21 @@ from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.simulation.scene.settings import rate_for
+from worldstate.adapters.simulation.stream.drawn_stream import draw_stream
 from worldstate.adapters.simulation.stream.settings import StreamSettings
 from worldstate.adapters.simulation.stream.traffic import traffic_named
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.values import wrap_angle
-from worldstate.operations.commissioning.heard_stream import HeardStream, unheard_stream
+from worldstate.operations.commissioning.heard_stream import HeardStream, vehicle_rows, vehicle_table
 from worldstate.operations.commissioning.plan import junction_named
 from worldstate.operations.commissioning.stream_exam import alarm_outcomes, approaches
 from worldstate.operations.commissioning.stream_labels import stream_truth
 from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.street_passes import seen_edge, streets_after
 from worldstate.operations.recordings.advisories import rising_edges
+from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.smoothing.learned_edge import LearnedEdge
 from worldstate.smoothing.learned_street import LearnedStreet
 from worldstate.smoothing.street_context import context_of
@@ -58,6 +61,18 @@ def edges_of(name: str, seed: int) -> Edges:
         (one.arm, seen_edge(one.arm, one.edge_rad)) for one in box_tracks(log, camera, EVERYBODY) if one.arm
     ]
     return [(arm, edge_rad) for arm, edge_rad in told if edge_rad is not None]
+
+
+def unheard_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream:
+    """Who comes in a stream of which no sound is rendered: its hops hold times only."""
+    stream = draw_stream(settings, array)
+    hops = HopTable(
+        {"time_s": np.arange(HOP_S, settings.duration_s, HOP_S)},
+        name=settings.name,
+        about={"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
+    )
+    silence = {one.number: np.zeros(len(one.time_s)) for one in stream.vehicles}
+    return HeardStream(hops, vehicle_table(stream.vehicles), vehicle_rows(stream.vehicles, silence))
 
 
 def corners_of(name: str) -> dict[str, float]:

@@ -34,7 +34,9 @@ def timeline():
         sighting_time_s=np.empty(0),
         sighting_azimuth_rad=np.empty(0),
         t0_s=2.2,
-        truth=(TrueTrack(TIME_S, 0.02 * np.arange(40), (TIME_S > 2.15) & (TIME_S < 3.65)),),
+        truth=(
+            TrueTrack(TIME_S, 0.02 * np.arange(40), (TIME_S > 2.15) & (TIME_S < 3.65), np.zeros((40, 2))),
+        ),
         title="",
     )
 

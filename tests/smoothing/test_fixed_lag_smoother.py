@@ -127,6 +127,27 @@ def test_an_outlier_among_bearings_costs_little():
     assert np.abs(final(1.0) - final(0.0)).max() < 0.02
 
 
+def test_who_stops_at_once_in_view_drove_on_before_it():
+    # Hidden for 2.5 s at 8 m/s, then seen, and at a walk from 2.8 s on.
+    rng, time_s = np.random.default_rng(0), np.arange(45) * 0.1
+    true_y = 26.0 - np.concatenate([[0.0], np.cumsum(np.where(time_s < 2.8, 0.8, 0.05))[:-1]])
+    noise_m, noise_rad = rng.normal(0.0, 0.6, 45), rng.normal(0.0, 0.01, 45)
+
+    def hidden_error_m(manoeuvre_k: float | None) -> float:
+        settings = SmoothingSettings(lag_s=30.0, relinearize_every=1000, manoeuvre_k=manoeuvre_k)
+        smoother = FixedLagSmoother(settings)
+        smoother.begin("car", 0, PRIOR)
+        for hop, y in enumerate(true_y.tolist()):
+            seen = [
+                Bearing(math.atan2(y, 9.0) + noise_rad[hop], 0.01),
+                Range(math.hypot(y, 9.0) + noise_m[hop], 0.6),
+            ]
+            smoother.update(hop * HOP_NS, {"car": seen if hop >= 25 else []})
+        return float(np.abs(smoother.track("car").states[:25, 1] - true_y[:25]).max())
+
+    assert hidden_error_m(1.0) < 0.5 * hidden_error_m(None)
+
+
 def test_a_wall_is_learned_from_images_and_a_height_from_boxes():
     rng = np.random.default_rng(1)
     smoother = FixedLagSmoother()

@@ -20,8 +20,9 @@ class SmoothingSettings:
         Residual in standard deviations from which on the Huber loss of bearings, approach rates and boxes
         grows linearly.
     manoeuvre_k : float or None
-        The same of the motion between two states, of which the whitened norm is 2 in the mean: braking and
-        turning off then cost less than as white acceleration. None for a Gaussian.
+        Scale of the Cauchy loss of the motion between two states, whose whitened norm is 2 in the mean.
+        A driver then keeps the pace most of the time, and now and then brakes, accelerates or turns off,
+        at a lower cost than as white acceleration. None for a Gaussian.
     range_m, range_log_std : float
         Prior of the distance at which an entity is first observed, and its deviation as a factor's logarithm.
     edge_std_rad : float

@@ -55,6 +55,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
     from worldstate.operations.labelling.pass_figure import write_pass_figure
     from worldstate.operations.labelling.pass_labels import label_passes
+    from worldstate.operations.recordings.true_track import read_true_tracks
 
     check_outputs(arguments, "out", "windows", figures=("figure",))
     source, detections = camera_source(arguments, sound_of(arguments))
@@ -64,7 +65,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         passes = label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
     write_open_label(arguments.out, source.audio_path.name, passes)
     if arguments.figure is not None:
-        write_pass_figure(passes, arguments.figure, source.audio_path.name)
+        truth = read_true_tracks(source.audio_path.parent)
+        write_pass_figure(passes, arguments.figure, source.audio_path.name, truth)
     summary: dict[str, object] = {"out": str(arguments.out), "n_tracks": len(tracks), "n_passes": len(passes)}
     if passes:
         summary["t0_std_s"] = float(np.median([one.t0.std_s for one in passes]))

@@ -26,7 +26,6 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, Float32Array, FloatArray
-from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 
 HOPS, VEHICLES, ROWS = "hops", "vehicles", "rows"
@@ -79,7 +78,10 @@ def hear_stream(
     with closing(stream.blocks()) as blocks:
         samples = _recorded(stream, blocks, loudness)
         told = _heard_hops(samples, believed or [array], settings.sample_rate_hz, settings.name, about)
-    return [HeardStream(one, _vehicles(stream.vehicles), _rows(stream.vehicles, loudness)) for one in told]
+    return [
+        HeardStream(one, vehicle_table(stream.vehicles), vehicle_rows(stream.vehicles, loudness))
+        for one in told
+    ]
 
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
@@ -88,19 +90,7 @@ def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))
         (hops,) = _heard_hops(blocks, [array], audio.sample_rate_hz, sound.name, about)
-    return HeardStream(hops, _vehicles(()), _rows((), {}))
-
-
-def unheard_stream(settings: StreamSettings, array: MicrophoneArray) -> HeardStream:
-    """Return who comes in a stream of which no sound is rendered: its hops hold times only."""
-    stream = draw_stream(settings, array)
-    hops = HopTable(
-        {"time_s": np.arange(HOP_S, settings.duration_s, HOP_S)},
-        name=settings.name,
-        about={"site": settings.site.name, "traffic": settings.traffic.name, "seed": settings.seed},
-    )
-    silence = {one.number: np.zeros(len(one.time_s)) for one in stream.vehicles}
-    return HeardStream(hops, _vehicles(stream.vehicles), _rows(stream.vehicles, silence))
+    return HeardStream(hops, vehicle_table(()), vehicle_rows((), {}))
 
 
 def _recorded(
@@ -169,7 +159,8 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
     return np.array([pcm[end - length : end] for end in ends], np.int16)
 
 
-def _vehicles(every: Sequence[VehicleTruth]) -> HopTable:
+def vehicle_table(every: Sequence[VehicleTruth]) -> HopTable:
+    """Return one row a vehicle, as `HeardStream.vehicles`."""
     # Typed column by column: of no vehicles at all rows would make columns of floats.
     motions = [one.event.manoeuvre for one in every]
     return HopTable(
@@ -184,7 +175,8 @@ def _vehicles(every: Sequence[VehicleTruth]) -> HopTable:
     )
 
 
-def _rows(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> HopTable:
+def vehicle_rows(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> HopTable:
+    """Return one row a vehicle and tenth of a second, as `HeardStream.rows`."""
     azimuth, distance = (_joined([getattr(one, name) for one in every]) for name in ("axle_rad", "axle_m"))
     return HopTable(
         {

@@ -45,11 +45,15 @@ def write_street_figure(
             )
 
 
+def draw_edge(axes: "Axes", one: Occluder, color: str = BLUE) -> None:
+    """Draw the line of sight past an edge as it is believed, two deviations either way."""
+    low, high = (_aside_m(one.edge_azimuth_rad + k * one.edge_std_rad) for k in (-2.0, 2.0))
+    axes.fill([0.0, low, high], [0.0, _LANE_M, _LANE_M], color=color, alpha=0.25, linewidth=0.0)
+    axes.plot([0.0, _aside_m(one.edge_azimuth_rad)], [0.0, _LANE_M], color=color, label="edge, as learned")
+
+
 def _draw_learned(axes: "Axes", one: Occluder, pace_spread: float) -> None:
-    edge_rad, std_rad = one.edge_azimuth_rad, one.edge_std_rad
-    low, high = (_aside_m(edge_rad + k * std_rad) for k in (-2.0, 2.0))
-    axes.fill([0.0, low, high], [0.0, _LANE_M, _LANE_M], color=BLUE, alpha=0.25, linewidth=0.0)
-    axes.plot([0.0, _aside_m(edge_rad)], [0.0, _LANE_M], color=BLUE)
+    draw_edge(axes, one)
     for row, time_s in enumerate(_BEFORE_S, start=1):
         ahead_m = _LANE_M + _APART_M * row
         factors = math.exp(-pace_spread), 1.0, math.exp(pace_spread)

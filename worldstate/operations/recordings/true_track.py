@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,12 @@ from worldstate.ground.typing import BoolArray, FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueTrack:
-    """True azimuth of one vehicle over time, and when it was in line of sight."""
+    """True azimuth and place of one vehicle over time, and when it was in line of sight."""
 
     time_s: FloatArray  # shape (n,): Camera frames, seconds from the start of the recording
     azimuth_rad: FloatArray  # shape (n,): Left positive
     in_view: BoolArray  # shape (n,): Line of sight between camera and vehicle
+    position_m: FloatArray  # shape (n, 2): Middle of its front, x ahead and y left of the array
 
     @property
     def visible_s(self) -> tuple[float, float] | None:
@@ -39,7 +41,7 @@ def read_true_tracks(folder: Path) -> tuple[TrueTrack, ...]:
         raise InputFileError(path, f"expected the truth of a simulated recording: {error!r}") from error
 
 
-def _track(rows: list[dict[str, float]]) -> TrueTrack:
+def _track(rows: list[dict[str, Any]]) -> TrueTrack:
     columns = [[row[key] for row in rows] for key in ("time_s", "azimuth_rad", "line_of_sight")]
     time_s, azimuth_rad, in_view = np.array(columns, dtype=np.float64)
-    return TrueTrack(time_s, azimuth_rad, in_view > 0.5)
+    return TrueTrack(time_s, azimuth_rad, in_view > 0.5, np.array([row["position_m"] for row in rows]))
