@@ -86,8 +86,8 @@ def motion_noise(settings: SmoothingSettings, step_s: float) -> NoiseModel:
     plain = gtsam.noiseModel.Gaussian.Covariance(settings.acceleration_psd * unit)
     if settings.manoeuvre_k is None:
         return plain
-    # Redescending, as a mixture of keeping the pace and of manoeuvres is: hidden places are off by 1.54 m, with
-    # Huber's loss, which grows on linearly, by 1.85 m (rms).
+    # Redescending, as a mixture of keeping the pace and of manoeuvres is: hidden places are off by 1.54 m,
+    # and by 1.85 m with Huber's loss, which grows on linearly.
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(settings.manoeuvre_k)
     return gtsam.noiseModel.Robust.Create(loss, plain)
 
