@@ -19,7 +19,7 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
-from worldstate.measurement import Look
+from worldstate.measurement import Bearing, Look
 from worldstate.state import Priors, blind_corner
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -363,3 +363,19 @@ def test_a_street_on_which_nobody_comes_is_watched_and_expected_to_stay_so() -> 
     assert [one.watched_s for one in watched.arrivals] == pytest.approx([553.0] * 2, abs=5.0)
     assert moved[:, 0] - moved[:, -1] == pytest.approx([-0.5, -0.5], abs=1e-9)
     assert WorldFilter.from_dict(world.to_dict()).state == world.state
+
+
+def test_who_came_into_view_unseen_is_where_it_sounds() -> None:
+    coming, seen = (np.full((2, len(GROUPS)), 1e-3) for _ in range(2))
+    coming[0, GROUPS.index("coming_0.5s")] = seen[0, GROUPS.index("seen")] = 1.0
+    coming[1, GROUPS.index("other")] = seen[1, GROUPS.index("other")] = 1.0
+    world, azimuths = WorldFilter(), np.radians(np.linspace(20.0, -50.0, 25))
+    for hop in range(30):
+        groups = coming if hop < 5 else seen
+        said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, None)
+        # Stated as where walls reflect: one peak in seven is another one, the others are off by 7 degrees.
+        bearing = SILENT if hop < 5 else Bearing(float(azimuths[hop - 5]), math.radians(20.0), 3.0)
+        world = world.update(replace(heard(hop, said), bearing=bearing))
+        if hop >= 15:
+            [car] = [one for one in world.state.entities if one.direction == "left"]
+            assert car.azimuth_rad == pytest.approx(azimuths[hop - 5], abs=math.radians(10.0))

@@ -17,6 +17,7 @@ from .track import Track, merged
 # Density of peaks that are not this entity's: uniform over the half-plane ahead, since images in walls and
 # other sources were found at all azimuths.
 _LOG_CLUTTER_DENSITY = -math.log(math.pi)
+_ANYWHERE_RAD2 = math.pi**2 / 12.0
 
 
 def acoustic_update(
@@ -101,11 +102,20 @@ def _updated(
         )
 
 
-def _path(line_of_sight_std_rad: float, share: float, settings: FilterSettings) -> tuple[float, float]:
-    """Return standard deviation and prior path probability of a peak, hidden or in line of sight."""
+def _path(std_rad: float, share: float, settings: FilterSettings) -> tuple[float, float]:
+    r"""Return standard deviation and prior path probability of a peak, hidden or in line of sight.
+
+    The deviation that comes with a peak holds that it may be another one, which association weighs itself:
+
+    .. math:: \sigma^2 = \sigma_0^2 + p\, \frac{\pi^2}{12}
+
+    with the deviation :math:`\sigma_0` of peaks that are the entity's, and p the chance that this one is not.
+    """
     if share >= 0.5:
         return settings.hidden_bearing_std_rad, settings.hidden_path_probability
-    return line_of_sight_std_rad, settings.line_of_sight_path_probability
+    own_rad = min(std_rad, settings.line_of_sight_std_rad)
+    astray = (std_rad**2 - own_rad**2) / _ANYWHERE_RAD2
+    return own_rad, min(max(1.0 - astray, 0.0), settings.line_of_sight_path_probability)
 
 
 def _sounding(track: Track, sides: HiddenBelief, visible: float) -> float:
