@@ -207,9 +207,8 @@ def _has_left(track: Track, answer: CoEvidence, stamp_ns: int, site: SiteGeometr
     if not (track.seen and track.moving) or isinstance(answer, Unqueried):
         return False
     way = math.copysign(1.0, track.motion.mean[AZIMUTH_RATE])
-    past = site.past_edge(
-        track.motion.azimuth_rad + 0.5 * way * track.width_rad, track.motion.azimuth_std_rad, way
-    )
+    end_rad = track.motion.azimuth_rad + 0.5 * way * track.width_rad
+    past = site.past_edge(end_rad, track.motion.azimuth_std_rad, way)
     unseen_s = seconds(stamp_ns - (track.last_seen_ns or 0))
     missed = math.pow(answer.miss_rate, min(unseen_s / site.settings.look_interval_s, 1.0))
     return past >= (1.0 - past) * missed

@@ -36,7 +36,7 @@ from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
 # A predicted time and the stamp of the next measurement may differ by the rounding of sample counts.
 STAMP_SLACK_NS = 5_000_000
 _ABOVE_ZERO = math.ulp(0.0)
-MOST_FURTHER = 32  # Cameras of a car
+_MOST_LOOKS = 32  # Cameras of a car
 _KINDS: dict[str, Any] = {
     "signature": SignatureEvidence,
     "co_evidence": CoEvidence,
@@ -224,7 +224,7 @@ class WorldFilter:
 
     def _begun_anew(self, measurement: Timed) -> "WorldFilter":
         delivery = self._lag.delivery
-        fresh = first_memory(self.context, self.policy, measurement.stamp_ns)
+        fresh = first_memory(self.context, measurement.stamp_ns)
         counted = replace(delivery, reanchored=delivery.reanchored + 1)
         world = replace(self, start_ns=measurement.stamp_ns, memory=fresh, lag=FixedLag(fresh, (), counted))
         return world.update(measurement)
@@ -271,7 +271,7 @@ class WorldFilter:
 
     @cached_property
     def _memory(self) -> Memory:
-        return self.memory or first_memory(self.context, self.policy, self.start_ns)
+        return self.memory or first_memory(self.context, self.start_ns)
 
     @cached_property
     def _lag(self) -> FixedLag:
@@ -300,12 +300,10 @@ def _checked(measurement: Timed, context: Context) -> Timed:
         raise InvalidArgumentError(f"sequence: expected the directions {SIDES}, got {context.directions}")
     stamp_ns = integer_ns("stamp_ns", measurement.stamp_ns)
     further = measurement.further
-    if len(further) > MOST_FURTHER or not all(isinstance(one, CameraLook) for one in further):
-        wanted = f"expected at most {MOST_FURTHER} CameraLook"
-        raise InvalidArgumentError(f"further: {wanted}, got {further!r:.40}")
-    for look in (measurement.look, *(one.look for one in further)):
-        if look is not None:
-            integer_ns("look.stamp_ns", look.stamp_ns)
+    if len(further) > _MOST_LOOKS or not all(isinstance(one, CameraLook) for one in further):
+        raise InvalidArgumentError(f"further: expected at most {_MOST_LOOKS} CameraLook, got {further!r:.40}")
+    for seen in measurement.looks:
+        integer_ns("look.stamp_ns", seen.look.stamp_ns)
     for name, value, low, high in _numbers(measurement):
         # NaN compares false, and what is no number does not compare.
         if not isinstance(value, int | float | np.number) or not low <= value <= high:

@@ -8,7 +8,6 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
@@ -127,7 +126,7 @@ def sides_of(explanation: ExplanationBelief, sequence: SequenceMemory | None) ->
     return HiddenBelief(explanation.hidden, explanation.emerged) if sequence is None else sequence.hidden
 
 
-def first_memory(context: Context, policy: CueingPolicy, start_ns: int) -> Memory:
+def first_memory(context: Context, start_ns: int) -> Memory:
     """Return the memory of a filter that has measured nothing."""
     directions, explanation = context.directions, _first_explanation(context)
     return Memory(
