@@ -14,7 +14,7 @@ from worldstate.measurement.measurement import Sighting
 from worldstate.measurement.sector import Sector
 
 from .settings import FilterSettings
-from .site_geometry import SiteGeometry
+from .site_geometry import SiteGeometry, normal_share
 from .track import Track
 
 # Of a pair outside the gate; below any sum of scores within it.
@@ -22,6 +22,7 @@ FORBIDDEN = -1e6
 # Of pairing a parked with a moving object, nats: below the gate's 4 deviations, so that any free partner is
 # preferred, and finite, so that a parked car that drives off keeps its id.
 _PARKED_MISMATCH = -10.0
+_UNFORESEEN = 0.05  # Of who comes into view, whatever the sound had said of the time
 _FOUND = 0.95  # Of the looks at an entity in view
 _LEAST = 1e-300  # Keeps logarithms finite
 # All of five tracks and five measurements, or of three and twelve; their tables take .2 ms to read.
@@ -59,8 +60,9 @@ def associated(
     .. math:: \log \frac{r p_D N(z; \theta, S)}{1 - r p_D} \frac{V}{u}, \qquad
               \log r\, [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)] \frac{V}{u}
 
-    with existence r, the edge a of a hidden one's side, which the signature may have confused with
-    probability c, and u vehicles that were not heard anywhere in the view V. Entities in view and hidden ones
+    with existence r, of a hidden one times the chance that it stands near its edge by now, the edge a of its
+    side, which the signature may have confused with probability c, and u vehicles that were not heard
+    anywhere in the view V. Entities in view and hidden ones
     compete: an entity that has left the view would else take the first sighting of the next one.
     """
     if not tracks or not sightings:
@@ -196,8 +198,8 @@ def _scores(
     if detected.all():
         return in_view
     classes = np.log([[_shared_class(track, one.label) for track in tracks] for one in sightings])
-    existence = np.array([track.existence for track in tracks])
-    heard = np.maximum(existence * emergence_density(tracks, azimuth_rad, site), _LEAST)
+    comes = np.array([track.existence * reached_edge(track, site) for track in tracks])
+    heard = np.maximum(comes * emergence_density(tracks, azimuth_rad, site), _LEAST)
     return np.where(detected, in_view, np.where(moving, np.log(heard) + classes, FORBIDDEN))
 
 
@@ -224,6 +226,22 @@ def _shared_class(track: Track, label: str) -> float:
         return _MISREAD if label in _ON_FOOT else 1.0
     kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in track.labels)
     return max(sum(share for matches, share in kinds if matches), _MISREAD)
+
+
+def reached_edge(track: Track, site: SiteGeometry) -> float:
+    """Return how likely a hidden entity is near enough to its edge, against one of whom no time is known.
+
+    Who is believed seconds away from the edge is not the one who appears now.
+    """
+    side, near_rad = site.sides[track.side], site.settings.edge_std_rad
+    outwards = math.copysign(1.0, side.edge_azimuth_rad)
+
+    def near(azimuth_rad: float, std_rad: float) -> float:
+        far_rad = outwards * wrap_angle(azimuth_rad - side.edge_azimuth_rad)
+        return normal_share((2.0 * near_rad - far_rad) / math.hypot(std_rad, near_rad))
+
+    by_time = near(track.motion.azimuth_rad, track.motion.azimuth_std_rad)
+    return min(max(by_time / near(side.azimuth_rad, side.std_rad), _UNFORESEEN), 1.0)
 
 
 def emergence_density(tracks: Sequence[Track], azimuth_rad: FloatArray, site: SiteGeometry) -> FloatArray:
