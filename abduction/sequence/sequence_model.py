@@ -78,9 +78,14 @@ class SequenceAlarm:
 
     def raised(self, posterior: SequencePosterior) -> BoolArray:
         """Return whether each side is in alarm at every hop of a stream, shape (n, 2)."""
-        log_odds = smoothed_log_odds(posterior)
-        over = (log_odds >= self.threshold_nats) & named_sides(log_odds, posterior.groups)
+        over = self.over(smoothed_log_odds(posterior), posterior.groups)
         return np.stack([held(side) for side in over.T], axis=1)
+
+    def over(
+        self, log_odds: FloatArray, groups: FloatArray, learned_nats: FloatArray | float = 0.0
+    ) -> BoolArray:
+        """Return which sides are named by their mean log-odds, shapes as in `named_sides`."""
+        return (log_odds >= self.threshold_nats) & named_sides(log_odds, groups, learned_nats)
 
 
 def named_sides(

@@ -1,11 +1,19 @@
 """The limit on BLAS threads holds inside, and only there."""
 
 import numpy as np
+import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground import blas_threads as limits
 from worldstate.ground.blas_threads import one_blas_thread
+
+
+@pytest.fixture(autouse=True)
+def _of_now() -> None:
+    """Look for libraries anew: what an earlier test has loaded since brings a BLAS of its own."""
+    limits._controller.cache_clear()
 
 
 def blas_threads() -> set[int]:

@@ -20,13 +20,7 @@ from worldstate.abduction.sequence.sequence_chain import (
     states_of,
 )
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.sequence.sequence_model import (
-    COMING_S,
-    GROUPS,
-    SequenceAlarm,
-    SequencePosterior,
-    named_sides,
-)
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.belief.hidden_belief import HiddenBelief
@@ -254,8 +248,7 @@ def _alerted(kept: SequenceMemory, context: Context) -> SequenceMemory:
     kept = replace(kept, recent=recent)
     if kept.alarm is None:
         return kept
-    nats, learned_nats = kept.mean_log_odds, np.array(kept.learned_nats(context))
-    named = named_sides(nats, kept.posterior.groups[0], learned_nats)
-    over = (nats >= kept.alarm.threshold_nats) & named
+    learned_nats = np.array(kept.learned_nats(context))
+    over = kept.alarm.over(kept.mean_log_odds, kept.posterior.groups[0], learned_nats)
     over_ns = tuple(kept.stamp_ns if now else ns for now, ns in zip(over, kept.over_ns, strict=True))
     return replace(kept, over_ns=over_ns)
