@@ -10,16 +10,15 @@ from typing import TypeAlias
 from worldstate.adapters.files.json_schema import json_schema
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
-from worldstate.state import WorldState
+from worldstate.state.world_state import WorldState, snapshot_schema
 
 from .scene import scene_update, srp_scene
-from .scene_messages import CompressedImage, Instant, SceneUpdate
+from .scene_messages import CompressedImage, SceneTime, SceneUpdate
 
 SNAPSHOT_TOPIC, SCENE_TOPIC = "/worldstate/snapshot", "/worldstate/scene"
 SRP_TOPIC, IMAGE_TOPIC = "/worldstate/srp", "/camera/image"
 # By the name that a viewer knows them by.
-_SCHEMAS: dict[str, type] = {
-    "worldstate.Snapshot": WorldState,
+_SCENES: dict[str, type] = {
     "foxglove.SceneUpdate": SceneUpdate,
     "foxglove.CompressedImage": CompressedImage,
 }
@@ -63,7 +62,7 @@ def srp_message(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) ->
 def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
     """Return an image of the camera."""
     text = base64.b64encode(jpeg).decode("ascii")
-    image = CompressedImage(Instant.of_ns(stamp_ns), "camera", text)
+    image = CompressedImage(SceneTime.of_ns(stamp_ns), "camera", text)
     return LogMessage(IMAGE_TOPIC, "foxglove.CompressedImage", stamp_ns, _json(encode(image)))
 
 
@@ -77,4 +76,5 @@ def _json(value: object) -> bytes:
 
 @cache
 def _schema(name: str) -> bytes:
-    return json.dumps(json_schema(_SCHEMAS[name])).encode()
+    own = json_schema(_SCENES[name]) if name in _SCENES else snapshot_schema()
+    return json.dumps(own).encode()

@@ -10,7 +10,6 @@ from worldstate.ground.typing import FloatArray
 from worldstate.state import Entity, Occluder, RiskCue, SearchedView, WorldState
 
 from .scene_messages import (
-    Instant,
     Placed,
     Rgba,
     SceneArrow,
@@ -20,6 +19,7 @@ from .scene_messages import (
     SceneRemoval,
     SceneSolid,
     SceneText,
+    SceneTime,
     SceneTriangles,
     SceneUpdate,
     Xyz,
@@ -59,7 +59,7 @@ def scene_update(state: WorldState) -> SceneUpdate:
         *(_cue(state, one) for one in state.cues),
         *(_entity(state, one) for one in state.entities if one.moving),
     ]
-    return SceneUpdate((SceneRemoval(Instant.of_ns(state.stamp_ns)),), tuple(items))
+    return SceneUpdate((SceneRemoval(SceneTime.of_ns(state.stamp_ns)),), tuple(items))
 
 
 def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> SceneUpdate:
@@ -71,7 +71,8 @@ def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> S
     radii = SRP_M * np.clip(level, 0.0, 2.0)
     points = tuple(map(_at, azimuths_rad.tolist(), radii.tolist()))
     line = SceneLine(0, points, Rgba(*_SKY, 1.0))
-    return SceneUpdate((SceneRemoval(Instant.of_ns(state.stamp_ns)),), (_item(state, "srp", lines=(line,)),))
+    removal = SceneRemoval(SceneTime.of_ns(state.stamp_ns))
+    return SceneUpdate((removal,), (_item(state, "srp", lines=(line,)),))
 
 
 def sector_of(
@@ -179,7 +180,7 @@ def _forecast(azimuth_rad: float, std_rad: float, color: tuple[float, float, flo
 def _item(state: WorldState, name: str, **shapes: tuple[object, ...]) -> SceneItem:
     # After that nothing in the snapshot holds, and a viewer must not show it either.
     lifetime_ns = 0 if state.valid_until_ns is None else max(state.valid_until_ns - state.stamp_ns, 1)
-    stamp, lifetime = Instant.of_ns(state.stamp_ns), Instant.of_ns(lifetime_ns)
+    stamp, lifetime = SceneTime.of_ns(state.stamp_ns), SceneTime.of_ns(lifetime_ns)
     return SceneItem(stamp, state.frame_id, name, lifetime, **shapes)  # type: ignore[arg-type]
 
 

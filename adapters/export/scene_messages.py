@@ -14,20 +14,20 @@ Base64: TypeAlias = Annotated[str, Check("base64", str.isascii, {"contentEncodin
 
 
 @dataclass(frozen=True, slots=True)
-class Instant:
+class SceneTime:
     """A time stamp or a duration."""
 
     sec: Count
     nsec: Count
 
     @classmethod
-    def of_ns(cls, time_ns: int) -> "Instant":
+    def of_ns(cls, time_ns: int) -> "SceneTime":
         """Split nanoseconds.
 
         Examples
         --------
-        >>> Instant.of_ns(1_500_000_000)
-        Instant(sec=1, nsec=500000000)
+        >>> SceneTime.of_ns(1_500_000_000)
+        SceneTime(sec=1, nsec=500000000)
         """
         return cls(*divmod(time_ns, 1_000_000_000))
 
@@ -139,10 +139,10 @@ class SceneText:
 class SceneItem:
     """One entity of a scene."""
 
-    timestamp: Instant
+    timestamp: SceneTime
     frame_id: str
     id: str
-    lifetime: Instant
+    lifetime: SceneTime
     frame_locked: bool = True
     metadata: tuple[ScenePair, ...] = ()
     arrows: tuple[SceneArrow, ...] = ()
@@ -159,7 +159,7 @@ class SceneItem:
 class SceneRemoval:
     """Remove entities that are older than the stamp: type 0 the one of this id, 1 all of the topic."""
 
-    timestamp: Instant
+    timestamp: SceneTime
     type: Count = 1
     id: str = ""
 
@@ -176,7 +176,7 @@ class SceneUpdate:
 class CompressedImage:
     """An image of the camera, as `foxglove.CompressedImage`."""
 
-    timestamp: Instant
+    timestamp: SceneTime
     frame_id: str
     data: Base64
     format: str = "jpeg"
