@@ -25,6 +25,7 @@ from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
 
 # Before, what is usual in a street is what was heard just now.
 LEAST_HOPS = 10
+TOO_FEW = NotUsable(f"less than {LEAST_HOPS} hops of evidence")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +116,7 @@ class SequenceReader:
         """Take the next hop in; return what it says together with those before."""
         self.history = history = self.history.heard(evidence)
         if history.hops < LEAST_HOPS:
-            return NotUsable(f"less than {LEAST_HOPS} hops of evidence")
+            return TOO_FEW
         posterior = self._model.of_inputs(last_inputs(history.recent, history.minute))
         model = self._model
         return SequenceReading(posterior.groups[0], model.share, model.margin_s, model.alarm)

@@ -15,7 +15,7 @@ from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
@@ -379,3 +379,16 @@ def test_who_came_into_view_unseen_is_where_it_sounds() -> None:
         if hop >= 15:
             [car] = [one for one in world.state.entities if one.direction == "left"]
             assert car.azimuth_rad == pytest.approx(azimuths[hop - 5], abs=math.radians(10.0))
+
+
+def test_who_will_read_a_sequence_waits_for_it() -> None:
+    sure = SignatureEvidence(("left", "right"), (9.0, 0.0), -1.0, -1.0)
+
+    def warned(said: NotUsable | None) -> bool:
+        world = WorldFilter()
+        for hop in range(1, 9):
+            world = world.update(replace(heard(hop, said), signature=sure))
+        return any(cue.advisory is not None for cue in world.state.cues)
+
+    assert warned(None) and warned(NotUsable("made for another array"))
+    assert not warned(TOO_FEW)

@@ -14,7 +14,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import posterior_of
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign
 from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
@@ -389,8 +389,13 @@ def advisory_ends_ns(memory: Memory) -> tuple[int | None, ...]:
 
 
 def heard_ends_ns(memory: Memory) -> tuple[int | None, ...]:
-    """Return for each side when its advisory by what is heard and seen ends."""
+    """Return for each side when its advisory by what is heard and seen ends.
+
+    Who will read a sequence waits for it: the first second of single windows was counted in no budget.
+    """
     sequence, hidden = memory.sequence, memory.explanation.hidden
+    if memory.no_sequence == TOO_FEW:
+        return (None,) * len(hidden)
     if sequence is not None and sequence.alarm is not None:
         return sequence.alarm_ends_ns(memory.stamp_ns)
     end_ns, least = _rule_ends_ns(memory), max(hidden) * (1.0 - _TIE)
@@ -412,11 +417,8 @@ def _rule_ends_ns(memory: Memory, announced: int | None = None) -> int | None:
 
     That of a source that is silent for a second has ended.
     """
-    rules = (one for one in memory.rules if one.alarm)
-    if announced is None:
-        rules = (one for one in rules if not one.announced)
-    else:
-        rules = (one for one in rules if announced in one.announced)
+    # A rule that announces nobody hears, which is asked for with None.
+    rules = (one for one in memory.rules if one.alarm and announced in (one.announced or (None,)))
     ends_ns = (one.stamp_ns + NEWS_HOLDS_NS for one in rules)
     return max((end_ns for end_ns in ends_ns if end_ns >= memory.stamp_ns), default=None)
 

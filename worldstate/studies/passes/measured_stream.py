@@ -7,7 +7,7 @@ import numpy as np
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
-from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReading
+from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import asked_again
@@ -34,7 +34,7 @@ def measurements(
             co_evidence=Unqueried("no camera"),
             bearing=_bearing(heard, i),
             approach=_approach(heard, i),
-            sequence=reading if i + 1 >= LEAST_HOPS else NotUsable("too few hops"),
+            sequence=reading if i + 1 >= LEAST_HOPS else TOO_FEW,
         )
         yield asked_again(measurement, vision)
 
