@@ -1,4 +1,4 @@
-"""An ego that drives up to the corner: its own noise, the model for it, and what the snapshot leaves out."""
+"""An ego that drives up to the corner: its own noise, the model for it, and how often it warns."""
 
 from dataclasses import replace
 from pathlib import Path
