@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
@@ -83,23 +83,21 @@ class SeveralCameras:
 
     def looks(self, stamp_ns: int) -> tuple[CameraLook, ...]:
         """Return the image of every camera that has one at this instant, searched in its own view."""
-        found = ((name, one, one.last_look(stamp_ns)) for name, one in self.cameras.items())
-        return tuple(
-            CameraLook(
-                replace(look, sensor=name, sector_rad=one.camera.view_rad),
-                one.sightings(stamp_ns),
-            )
-            for name, one, look in found
-            if look is not None
-        )
+        return tuple(self._each(stamp_ns))
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
         """Return the boxes of the first camera that has an image; `looks` has those of all."""
-        return next((one.sightings for one in self.looks(stamp_ns)), ())
+        return next((one.sightings for one in self._each(stamp_ns)), ())
 
     def last_look(self, stamp_ns: int) -> Look | None:
         """Return the look of the first camera that has an image, None without one."""
-        return next((one.look for one in self.looks(stamp_ns)), None)
+        return next((one.look for one in self._each(stamp_ns)), None)
+
+    def _each(self, stamp_ns: int) -> Iterator[CameraLook]:
+        for name, one in self.cameras.items():
+            if (look := one.last_look(stamp_ns)) is not None:
+                own = replace(look, sensor=name, sector_rad=one.camera.view_rad)
+                yield CameraLook(own, one.sightings(stamp_ns))
 
 
 def _parts(sector: Sector, views: Sequence[Sector]) -> list[tuple[float, Sector]]:

@@ -62,8 +62,8 @@ def associated(
 
     with existence r, of a hidden one times the chance that it stands near its edge by now, the edge a of its
     side, which the signature may have confused with probability c, and u vehicles that were not heard
-    anywhere in the view V. Entities in view and hidden ones
-    compete: an entity that has left the view would else take the first sighting of the next one.
+    anywhere in the view V. Entities in view and hidden ones compete: an entity that has left the view would
+    else take the first sighting of the next one.
     """
     if not tracks or not sightings:
         return Association({}, [0.0] * len(tracks))

@@ -74,9 +74,10 @@ def vision_update(
     for i, track in enumerate(tracks):
         answer = _searched(track, measurement, seen.look, view)
         existence = _existence(track, whose.chances[i], answer, weight, rates)
-        if i in found:
-            update = _sighted if track.seen else _handed_over
-            after.append(update(turned[i], sightings[found[i]], existence, measurement, site))
+        if i in found and track.seen:
+            after.append(_sighted(turned[i], sightings[found[i]], existence, measurement, site))
+        elif i in found:
+            after.append(_handed_over(turned[i], sightings[found[i]], measurement, site))
         elif answer is _OUTSIDE and any(one.touches(track.motion.azimuth_rad) for one in others):
             after.append(track)
         else:
@@ -148,9 +149,7 @@ def _sighted(
     return _found(track, sighting, measurement, site, existence=existence, labels=labels)
 
 
-def _handed_over(
-    track: Track, sighting: Sighting, existence: float, measurement: Measurement, site: SiteGeometry
-) -> Track:
+def _handed_over(track: Track, sighting: Sighting, measurement: Measurement, site: SiteGeometry) -> Track:
     """Return a hidden entity after its hand-over: same id, azimuth and side of the sighting."""
     known = max(track.existence, site.settings.sighting_existence)
     existence = after_sighting(known, *_rates(measurement.co_evidence, site.settings))
