@@ -136,6 +136,20 @@ def test_a_hidden_bearing_lies_behind_the_edge_and_is_mirrored(seed: int, edge_r
     assert coming[0] > 0.9 or hidden_bearing(nearer, sides[0])[0] <= left + 1e-9
 
 
+@given(st.floats(0.0, 8.0))
+@settings(max_examples=20)
+def test_a_known_edge_narrows_the_bearing_and_keeps_the_errors_of_the_time(edge_deg: float) -> None:
+    """An edge less sure than the usual one adds all of its variance, a surer one leaves half of the usual."""
+    coming = np.full(len(COMING_S), 1.0 / len(COMING_S))
+
+    def variance(degrees: float) -> float:
+        side = SideGeometry("left", 0.56, 0.96, 0.35, math.radians(degrees))
+        return math.degrees(math.degrees(hidden_bearing(coming, side)[1] ** 2))
+
+    expected = edge_deg**2 - 25.0 if edge_deg > 5.0 else 0.5 * (edge_deg**2 - 25.0)
+    assert variance(edge_deg) - variance(5.0) == pytest.approx(expected, abs=1e-6)
+
+
 def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_boxes() -> None:
     pytest.importorskip("stonesoup", reason="the benchmark's trackers: pip install 'worldstate[oracles]'")
     import bench_gospa as bench
