@@ -60,7 +60,7 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     weight = coming[:, None] * _PACE_WEIGHTS + _SMALLEST
     weight = weight / weight.sum()
     mean = float((weight * azimuth).sum())
-    # The five degrees of the usual edge hold more than the edge, from which the five junctions deviate by 2.6:
+    # The five degrees of the usual edge hold more than the edge, from which five junctions deviate by 2.6:
     # errors of the time, which a known edge does not end. Half of their variance stays: likeliest on exam
     # seed 1 with learned edges; without it squared errors are 1.42 of the variance.
     edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, _USUAL_EDGE_STD) ** 2)

@@ -1,9 +1,6 @@
-r"""What a street's passes tell of it: edges, pace, who comes from where, and what the camera misses.
+"""What a street's passes tell of it: edges, pace, who comes when and for how long, what the camera misses.
 
-Sufficient statistics only, so that a pass is added and time forgotten without anything else being kept. From
-one arm n vehicles in a time T come at a rate whose density is a Gamma distribution,
-
-.. math:: \lambda \sim \mathrm{Gamma}(a_0 + n,\; b_0 + T), \qquad E[\lambda] = \frac{a_0 + n}{b_0 + T}
+Sufficient statistics only, so that a pass is added and time forgotten without anything else being kept.
 """
 
 import math
@@ -13,8 +10,10 @@ from typing import ClassVar, Literal
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import Layout
+from worldstate.ground.serialisation import ADDED, Layout
+from worldstate.state.context import Rates
 
+from .event_rate import EventRate
 from .learned_edge import LearnedEdge
 from .running_moments import Moments, NormalPrior
 
@@ -23,8 +22,10 @@ ARMS: tuple[Arm, Arm] = ("left", "right")
 # A building stands for years, traffic changes with the season: after a month a pass counts a third.
 DAY_S = 86400.0
 FORGETTING_S = 30.0 * DAY_S
-# One vehicle in the 20 s that the usual rate of .05/s takes: a minute of watching outweighs it.
-_USUAL_ARRIVALS, _USUAL_EXPOSURE_S = 1.0, 20.0
+# Who is hidden comes into view or turns away, who is in view leaves it or hides again: a time ends by either.
+_USUAL = Rates()
+USUAL_REVEAL_HZ = _USUAL.emergence_hz + _USUAL.departure_hz
+USUAL_DEPARTURE_HZ = _USUAL.reocclusion_hz + _USUAL.visible_departure_hz
 # Of the logarithm: drivers at a usual corner have .5 per second; simulated junctions have .4 to .7 in the
 # median, and their drivers differ by a factor of 1.35.
 PACE_PRIOR = NormalPrior(math.log(0.5), 0.22, 0.3)
@@ -47,22 +48,38 @@ class StreetPass:
     arm: Arm
     edge_rad: float | None  # Azimuth of the edge that it came out of; None where the image ends before it
     pace_hz: float | None  # How fast the tangent of its azimuth fell there
+    hidden_s: float | None = None  # Heard before it came into view; None where nobody listened
+    in_view_s: float | None = None  # From there until it was last seen; None where nobody knows
+    gone: bool = True  # Whether it had left the view then, and not the recording had ended
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedArm:
-    """One arm: its edge, its drivers, how many came in which time."""
+    """One arm: its edge, its drivers, how many came in which time, how long they were hidden and in view."""
 
     direction: Arm
     edge: LearnedEdge = field(default_factory=LearnedEdge)
     log_pace: Moments = field(default_factory=Moments)
     arrivals: float = 0.0
     exposure_s: float = 0.0
+    # Of those who came into view: out of hiding, over the time heard there, and out of view again.
+    reveals: EventRate = field(default_factory=EventRate, metadata=ADDED)
+    departures: EventRate = field(default_factory=EventRate, metadata=ADDED)
 
     @property
     def rate_hz(self) -> float:
         """Expected arrivals a second."""
-        return (_USUAL_ARRIVALS + self.arrivals) / (_USUAL_EXPOSURE_S + self.exposure_s)
+        return EventRate(self.arrivals, self.exposure_s).mean_hz(_USUAL.arrival_hz)
+
+    @property
+    def reveal_hz(self) -> float:
+        """Expected rate at which who is heard there comes into view, 1/s."""
+        return self.reveals.mean_hz(USUAL_REVEAL_HZ)
+
+    @property
+    def departure_hz(self) -> float:
+        """Expected rate at which who came from there leaves the view, 1/s."""
+        return self.departures.mean_hz(USUAL_DEPARTURE_HZ)
 
     @property
     def pace_hz(self) -> float:
@@ -77,12 +94,18 @@ class LearnedArm:
 
     def with_pass(self, one: StreetPass) -> "LearnedArm":
         """Return it after one more vehicle came out of it."""
-        edge, log_pace = self.edge, self.log_pace
+        edge, log_pace, reveals, departures = self.edge, self.log_pace, self.reveals, self.departures
         if one.edge_rad is not None:
             edge = edge.with_pass(abs(one.edge_rad))
         if one.pace_hz is not None:
             log_pace = log_pace.plus(math.log(one.pace_hz))
-        return replace(self, edge=edge, log_pace=log_pace, arrivals=self.arrivals + 1.0)
+        if one.hidden_s is not None:
+            reveals = reveals.after(one.hidden_s)
+        if one.in_view_s is not None:
+            departures = departures.after(one.in_view_s, happened=one.gone)
+        return LearnedArm(
+            self.direction, edge, log_pace, self.arrivals + 1.0, self.exposure_s, reveals, departures
+        )
 
     def faded(self, factor: float) -> "LearnedArm":
         """Return it with everything weighed less."""
@@ -92,6 +115,8 @@ class LearnedArm:
             self.log_pace.faded(factor),
             factor * self.arrivals,
             factor * self.exposure_s,
+            self.reveals.faded(factor),
+            self.departures.faded(factor),
         )
 
 
@@ -109,7 +134,7 @@ class LearnedStreet:
     (0.5, 0.44)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.LearnedStreet", "1.0.0")
+    LAYOUT: ClassVar = Layout("worldstate.LearnedStreet", "1.1.0")
 
     site: str | None = None
     arms: tuple[LearnedArm, LearnedArm] = (LearnedArm("left"), LearnedArm("right"))

@@ -3,16 +3,17 @@
 import math
 from dataclasses import replace
 
-from worldstate.state.context import Context, Occluder
+from worldstate.state.context import Context, Occluder, Rates
 
-from .learned_street import LearnedArm, LearnedStreet
+from .event_rate import EventRate
+from .learned_street import USUAL_DEPARTURE_HZ, USUAL_REVEAL_HZ, LearnedArm, LearnedStreet
 
 # An arm of which no edge was seen keeps the corner of a usual junction.
 _LEAST_WEIGHT = 0.5
 
 
 def context_of(street: LearnedStreet) -> Context:
-    """Return edges and pace of a street; what no pass has told is as in `Context()`.
+    """Return edges, pace and rates of a street; what no pass has told is as in `Context()`.
 
     Arrivals are left to the filter, which learns the traffic of the hour: given as priors, they move its
     alarm away from the onsets an hour that it was set for.
@@ -26,7 +27,26 @@ def context_of(street: LearnedStreet) -> Context:
     """
     usual = Context()
     occluders = tuple(map(_occluder, street.arms, usual.occluders))
-    return replace(usual, occluders=occluders, site=street.site)
+    return replace(usual, rates=_rates(street, usual.rates), occluders=occluders, site=street.site)
+
+
+def _rates(street: LearnedStreet, usual: Rates) -> Rates:
+    """Return how long who comes is hidden and in view: the filter has one rate for both arms.
+
+    How a time ends is not told by those who came into view: of the rates out of a state all are scaled alike.
+    """
+    reveals, departures = EventRate(), EventRate()
+    for arm in street.arms:
+        reveals, departures = reveals.plus(arm.reveals), departures.plus(arm.departures)
+    sooner = reveals.mean_hz(USUAL_REVEAL_HZ) / USUAL_REVEAL_HZ
+    shorter = departures.mean_hz(USUAL_DEPARTURE_HZ) / USUAL_DEPARTURE_HZ
+    return replace(
+        usual,
+        emergence_hz=sooner * usual.emergence_hz,
+        departure_hz=sooner * usual.departure_hz,
+        reocclusion_hz=shorter * usual.reocclusion_hz,
+        visible_departure_hz=shorter * usual.visible_departure_hz,
+    )
 
 
 def _occluder(arm: LearnedArm, usual: Occluder) -> Occluder:

@@ -17,7 +17,7 @@ from worldstate.operations.metrics.assignment import gated_pairs
 # A vehicle three metres ahead at 10 m/s turns by a fifth of a radian from image to image; boxes of two
 # vehicles in view at once lie farther apart than their own width most of the time.
 _GATE_RAD = math.radians(8.0)
-_LONGEST_GAP_S = 0.8  # Eight images: of 86 % detected each, one gap in ten million is longer
+LONGEST_GAP_S = 0.8  # Eight images: of 86 % detected each, one gap in ten million is longer
 _LEAST_BOXES = 4
 # Who turns less than this while in view drives along the ego's own street, and comes out of no arm.
 _LEAST_TURN_RAD = math.radians(8.0)
@@ -75,8 +75,8 @@ def box_tracks(log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter) 
     open_tracks: list[list[_Box]] = []
     closed: list[list[_Box]] = []
     for time_s, boxes in _moving_boxes(log, camera, keep):
-        closed += [one for one in open_tracks if time_s - one[-1].time_s > _LONGEST_GAP_S]
-        open_tracks = [one for one in open_tracks if time_s - one[-1].time_s <= _LONGEST_GAP_S]
+        closed += [one for one in open_tracks if time_s - one[-1].time_s > LONGEST_GAP_S]
+        open_tracks = [one for one in open_tracks if time_s - one[-1].time_s <= LONGEST_GAP_S]
         expected = np.array([_predicted(one, time_s) for one in open_tracks])
         found = np.array([box.middle_rad for box in boxes])
         cost = np.abs(expected[:, None] - found[None, :])

@@ -11,7 +11,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
 
-from .box_tracks import BoxTrack, box_tracks
+from .box_tracks import LONGEST_GAP_S, BoxTrack, box_tracks
 from .pass_labels import HOP_S, PassLabel, label_passes
 
 # Nearer to the axis nobody comes out of an arm: who turns there has overtaken, or was two vehicles.
@@ -20,14 +20,22 @@ _LEAST_EDGE_RAD = math.radians(5.0)
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 3.0
 
 
-def street_pass(one: PassLabel) -> StreetPass:
-    """Return what a labelled pass tells of its arm: the edge, and the pace of who came past it."""
+def street_pass(one: PassLabel, until_s: float = math.inf) -> StreetPass:
+    """Return what a labelled pass tells of its arm: edge, pace, and the times that it was hidden and in view.
+
+    A pass smoothed from boxes tells nothing of the time in hiding: its past begins at a fixed time before T0.
+    """
     x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
+    last_s = float(one.track.time_s[-1])
     return StreetPass(
         "left" if one.arm == "left" else "right",
         seen_edge(one.arm, one.edge_rad),
         pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
+        None if one.heard_s is None else max(one.t0.time_s - one.heard_s, 0.0),
+        max(last_s - one.t0.time_s, 0.0),
+        # As boxes are joined: without one for longer it has left the view.
+        gone=until_s - last_s > LONGEST_GAP_S,
     )
 
 
@@ -62,7 +70,7 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
     before_s = 0.0
     for one in sorted(recording.passes, key=lambda one: one.t0.time_s):
         now_s = min(max(one.t0.time_s, before_s), recording.duration_s)
-        street = with_pass(watched(street, now_s - before_s), street_pass(one))
+        street = with_pass(watched(street, now_s - before_s), street_pass(one, recording.duration_s))
         before_s = now_s
         yield street
     for track in recording.tracks:
