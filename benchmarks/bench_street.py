@@ -1,18 +1,21 @@
 """What ten passes tell of a street: corners, changes of geometry, and what the filter makes of it afterwards.
 
-Run: python benchmarks/bench_street.py [NPZ...] [--junctions 20] [--json]
+Run: python benchmarks/bench_street.py [NPZ...] [--junctions 20] [--window 3 0] [--json]
 
 Without streams only what needs no sound: vehicles at drawn junctions before a camera with misses, ten passes
 at a time. Corners are the plan's. A change is the same arm at another junction, seen after ten passes. With
 streams (approaches of the named junctions) the filter follows each with the usual street and with the one
 learned from its first ten passes; the passes after these are compared in pairs, intervals of 95 % by 1000
-draws of passes.
+draws of passes. What is left of the azimuth's error with the true time to visible, and with the true azimuth
+at T0 in place of the edge besides, says what is the time's and what the place's. Rates are those of all
+passes, reveals from the snapshots of the filter with the usual street.
 """
 
 import argparse
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +35,13 @@ from worldstate.operations.commissioning.plan import junction_named
 from worldstate.operations.commissioning.stream_exam import alarm_outcomes, approaches
 from worldstate.operations.commissioning.stream_labels import stream_truth
 from worldstate.operations.labelling.box_tracks import box_tracks
-from worldstate.operations.labelling.street_passes import seen_edge, streets_after
+from worldstate.operations.labelling.heard_passes import heard_passes
+from worldstate.operations.labelling.street_passes import WatchedRecording, seen_edge, streets_after
 from worldstate.operations.recordings.advisories import rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.smoothing.learned_edge import LearnedEdge
-from worldstate.smoothing.learned_street import LearnedStreet
+from worldstate.smoothing.learned_street import USUAL_DEPARTURE_HZ, USUAL_REVEAL_HZ, LearnedStreet
 from worldstate.smoothing.street_context import context_of
 from worldstate.state.context import Context
 from worldstate.studies.passes.followed_stream import FollowedStream, followed
@@ -47,6 +51,8 @@ from worldstate.studies.passes.world_exam import EVERYBODY, stream_measurements,
 
 PASSES, MINUTES, SEED, NOTICED = 10, 30.0, 7, 3
 SIDES = ("left", "right")
+# Of a pass; outwards is positive of degrees.
+KEYS = ("azimuth_deg", "nees", "time_s", "side", "true_time_deg", "true_place_deg")
 Edges = list[tuple[str, float]]
 
 
@@ -141,7 +147,7 @@ def _needed(edge: LearnedEdge, edges: Edges, arm: str) -> float:
     return math.inf
 
 
-def filtered(path: Path) -> dict[str, object]:
+def filtered(path: Path, window_s: list[float]) -> dict[str, object]:
     """Every pass after the tenth, with the usual street and with the learned one."""
     stream, policies = HeardStream.load(path), read_model(None).policies
     _, measured = stream_measurements(path, read_model(None), "all", 0)
@@ -159,13 +165,32 @@ def filtered(path: Path) -> dict[str, object]:
     }
     return {
         "site": stream.site,
-        "passes": {name: passes_of(stream, one, since_s) for name, one in told.items()},
+        "passes": {
+            name: passes_of(stream, one, since_s, window_s, contexts[name]) for name, one in told.items()
+        },
+        "rates": rates_of(recording, told["usual"]),
         "figures": {name: figures_of(stream, one, since_s) for name, one in told.items()},
     }
 
 
-def passes_of(stream: HeardStream, one: FollowedStream, since_s: float) -> list[dict[str, list[float]]]:
-    """Errors of azimuth, time and side in the three seconds before T0, pass by pass."""
+def rates_of(recording: WatchedRecording, one: FollowedStream) -> dict[str, object]:
+    """Rates of reveal and departure of either arm, each with its interval, passes and seconds."""
+    passes = heard_passes(recording.passes, zip(one.time_s.tolist(), one.entities, strict=True))
+    *_, street = streets_after(LearnedStreet(), replace(recording, passes=passes))
+    return {
+        f"{arm.direction} {name}": [rate.mean_hz(hz), rate.interval_hz(hz), rate.count, rate.exposure_s]
+        for arm in street.arms
+        for name, rate, hz in (
+            ("reveals", arm.reveals, USUAL_REVEAL_HZ),
+            ("departures", arm.departures, USUAL_DEPARTURE_HZ),
+        )
+    }
+
+
+def passes_of(
+    stream: HeardStream, one: FollowedStream, since_s: float, window_s: list[float], context: Context
+) -> list[dict[str, list[float]]]:
+    """Errors of azimuth, time and side in the last seconds before T0, pass by pass."""
     found = []
     for approach in approaches(stream):
         if approach.quiet or approach.entries_s[0] < since_s:
@@ -173,14 +198,21 @@ def passes_of(stream: HeardStream, one: FollowedStream, since_s: float) -> list[
         at = int(np.nanargmin(np.abs(stream.vehicles.entry_s - approach.entries_s[0])))
         vehicle, side = int(stream.vehicles.vehicle[at]), approach.sides[0]
         lead_s = one.time_s - approach.entries_s[0]
-        mine: dict[str, list[float]] = {"azimuth_deg": [], "nees": [], "time_s": [], "side": []}
-        for hop in np.flatnonzero((lead_s > -3.0) & (lead_s < -0.05)).tolist():
+        mine: dict[str, list[float]] = {key: [] for key in KEYS}
+        corner, entry = context.occluders[side], true_azimuth(stream, vehicle, approach.entries_s[0])
+        first_s, last_s = window_s
+        for hop in np.flatnonzero((lead_s > -first_s) & (lead_s < -max(last_s, 0.05))).tolist():
             azimuth = true_azimuth(stream, vehicle, float(one.time_s[hop]))
             for entity in one.hidden(hop, side, 0.5)[:1]:
                 if azimuth is not None:
                     off = wrap_angle(entity.azimuth_rad - azimuth)
-                    mine["azimuth_deg"].append(math.degrees(off))
+                    mine["azimuth_deg"].append(math.degrees(math.copysign(off, off * azimuth)))
                     mine["nees"].append((off / entity.azimuth_std_rad) ** 2)
+                    starts = {"true_time_deg": corner.edge_azimuth_rad, "true_place_deg": entry}
+                    for key, start in starts.items():
+                        if start is not None:
+                            told = math.atan(math.tan(abs(start)) - corner.pace_hz * lead_s[hop])
+                            mine[key].append(math.degrees(told - abs(azimuth)))
             best_s, soon = one.time_to_visible_s[hop, side, 1], one.within[hop, :, HORIZONS_S.index(2.0)]
             if np.isfinite(best_s):
                 mine["time_s"].append(float(best_s + lead_s[hop]))
@@ -214,7 +246,7 @@ def figures_of(stream: HeardStream, one: FollowedStream, since_s: float) -> dict
 def paired(streams: list[dict[str, object]], name: str) -> dict[str, object]:
     """Root mean squares with the usual street and another one, their difference and its interval."""
     rng, found = np.random.default_rng(0), {}
-    for key in ("azimuth_deg", "nees", "time_s", "side"):
+    for key in KEYS:
         pairs, sites = [], {}
         for stream in streams:
             mine = list(zip(stream["passes"]["usual"], stream["passes"][name], strict=True))
@@ -226,28 +258,31 @@ def paired(streams: list[dict[str, object]], name: str) -> dict[str, object]:
         usual, told = (_pooled(key, [p[k] for p in pairs]) for k in (0, 1))
         interval = np.quantile(apart, [0.025, 0.975]).round(3).tolist()
         found[key] = {
-            "passes": len(pairs), "usual": usual, "street": told, "difference": interval, "sites": sites
+            "passes": len(pairs), "usual": usual, "street": told, "difference": interval, "sites": sites,
+            "means": [float(np.mean(np.concatenate([pair[k] for pair in pairs]))) for k in (0, 1)],
         }  # fmt: skip
     return found
 
 
 def _pooled(key: str, passes: list[list[float]]) -> float:
     values = np.concatenate(passes)
-    return float(np.sqrt(np.mean(values**2)) if key in ("azimuth_deg", "time_s") else np.mean(values))
+    return float(np.sqrt(np.mean(values**2)) if key.endswith(("_deg", "_s")) else np.mean(values))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("streams", type=Path, nargs="*", help="approaches at the named junctions")
     parser.add_argument("--junctions", type=int, default=20, help="drawn ones (default: %(default)s)")
+    window = "seconds before T0 that count (default: %(default)s)"
+    parser.add_argument("--window", type=float, nargs=2, default=[3.0, 0.0], metavar="S", help=window)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     report: dict[str, object] = {"geometry": geometry(arguments.junctions)}
-    streams = [filtered(path) for path in arguments.streams]
+    streams = [filtered(path, arguments.window) for path in arguments.streams]
     if streams:
         report["street"] = paired(streams, "street")
     for stream in streams:
-        report[stream["site"]] = stream["figures"]
+        report[stream["site"]] = stream["figures"] | {"rates": stream["rates"]}
     print(json.dumps(report, indent=None if arguments.json else 1))
 
 

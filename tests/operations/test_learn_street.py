@@ -10,7 +10,6 @@ from passing_boxes import CAMERA, EDGE_RAD, LANE_M, LENGTH_M, passing
 
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.cli.main import main
-from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, SchemaVersionError
 from worldstate.ground.values import nanoseconds
 from worldstate.operations.labelling.heard_passes import heard_passes
@@ -18,7 +17,7 @@ from worldstate.operations.labelling.street_file import read_street, write_stree
 from worldstate.operations.labelling.street_passes import looks_at, streets_after, watched_recording
 from worldstate.smoothing.learned_street import LearnedStreet
 from worldstate.smoothing.street_context import context_of
-from worldstate.state import Entity, WorldState
+from worldstate.state import Entity
 from worldstate.state.context import Rates
 
 SPEED = 6.0
@@ -75,7 +74,7 @@ def test_who_was_heard_before_was_hidden_since_the_filter_believed_it(recording)
     first, second = sorted(recording.passes, key=lambda one: one.t0.time_s)[:2]
     times_s = np.arange(0.0, second.t0.time_s + 1.0, 0.1)
     onset_s = first.t0.time_s - 2.0
-    passes = heard_passes(recording.passes, (_state(at_s, onset_s, first.t0.time_s) for at_s in times_s))
+    passes = heard_passes(recording.passes, ((at_s, _hidden(at_s, onset_s)) for at_s in times_s))
     told = {one.t0.time_s: one.heard_s for one in passes}
     assert told[first.t0.time_s] == pytest.approx(onset_s)
     assert told[second.t0.time_s] is None
@@ -84,15 +83,13 @@ def test_who_was_heard_before_was_hidden_since_the_filter_believed_it(recording)
     assert street.arms[0].reveals.exposure_s == pytest.approx(2.0)
 
 
-def _state(at_s: float, since_s: float, until_s: float) -> WorldState:
-    """Somebody hidden on the left from one time to another."""
-    stamp_ns, state = nanoseconds(at_s), WorldFilter().state
+def _hidden(at_s: float, since_s: float) -> tuple[Entity, ...]:
+    """Somebody hidden on the left for the two seconds after a time."""
     there = Entity(
         "id", "hidden", 0.9, 0.9, 0.8, azimuth_std_rad=0.3, created_ns=nanoseconds(since_s),
-        updated_ns=stamp_ns, direction="left",
+        updated_ns=nanoseconds(at_s), direction="left",
     )  # fmt: skip
-    entities = (there,) if since_s <= at_s <= until_s else ()
-    return replace(state, stamp_ns=stamp_ns, entities=entities)
+    return (there,) if since_s <= at_s <= since_s + 2.0 else ()
 
 
 def test_a_street_of_the_version_before_is_read_without_rates(street, tmp_path):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
     from worldstate.smoothing.event_rate import EventRate
     from worldstate.smoothing.learned_street import LearnedArm, LearnedStreet
-    from worldstate.state import WorldState
+    from worldstate.state import Entity
 
 EXAMPLE = """\
 examples:
@@ -116,7 +116,7 @@ def _recording(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     seen = _seen(arguments, path)
     if arguments.states is None:
         return seen
-    return replace(seen, passes=heard_passes(seen.passes, _states(arguments.states)))
+    return replace(seen, passes=heard_passes(seen.passes, _snapshots(arguments.states)))
 
 
 def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
@@ -133,10 +133,11 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     return watched_recording(detections, source.camera, source.settings.boxes, duration_s)
 
 
-def _states(path: Path) -> "Iterator[WorldState]":
+def _snapshots(path: Path) -> "Iterator[tuple[float, tuple[Entity, ...]]]":
     from worldstate.adapters.state_log import read_log
+    from worldstate.ground.values import seconds
 
-    return (state for _, state in read_log(path))
+    return ((seconds(state.stamp_ns), state.entities) for _, state in read_log(path))
 
 
 def _draw(arguments: argparse.Namespace, stages: "list[LearnedStreet]", street: "LearnedStreet") -> None:

@@ -6,7 +6,7 @@ from operator import attrgetter
 
 from worldstate.ground.values import seconds
 from worldstate.smoothing.learned_street import ARMS
-from worldstate.state import WorldState
+from worldstate.state import Entity
 
 from .pass_labels import PassLabel
 
@@ -16,25 +16,28 @@ _EXISTS = 0.5  # Likelier than not: a birth is no more than that
 _BEFORE_S = 0.2
 
 
-def heard_passes(passes: Sequence[PassLabel], states: Iterable[WorldState]) -> list[PassLabel]:
+def heard_passes(
+    passes: Sequence[PassLabel], snapshots: Iterable[tuple[float, Sequence[Entity]]]
+) -> list[PassLabel]:
     """Return the passes with the time since which an entity that existed at T0 was believed on their arm.
 
-    The snapshots are in order. Whoever came unheard, or after the last snapshot, keeps None.
+    Snapshots are times in order, each with its entities. Whoever came unheard, or after the last one, keeps
+    None.
     """
     found = list(passes)
     last: dict[str, float | None] = dict.fromkeys(ARMS)
     waiting = sorted(range(len(found)), key=lambda at: -found[at].t0.time_s)
-    for state in states:
-        while waiting and seconds(state.stamp_ns) > found[waiting[-1]].t0.time_s - _BEFORE_S:
+    for time_s, entities in snapshots:
+        while waiting and time_s > found[waiting[-1]].t0.time_s - _BEFORE_S:
             at = waiting.pop()
             found[at] = replace(found[at], heard_s=last[found[at].arm])
-        last = {arm: _hidden_since_s(state, arm) for arm in ARMS}
+        last = {arm: _hidden_since_s(entities, arm) for arm in ARMS}
     return found
 
 
-def _hidden_since_s(state: WorldState, arm: str) -> float | None:
+def _hidden_since_s(entities: Sequence[Entity], arm: str) -> float | None:
     """Return since when the likeliest entity hidden on an arm has been there, None without one."""
-    hidden = [one for one in state.entities if one.status == "hidden" and one.direction == arm]
+    hidden = (one for one in entities if one.status == "hidden" and one.direction == arm)
     likeliest = max(hidden, key=attrgetter("existence_probability"), default=None)
     if likeliest is None or likeliest.existence_probability < _EXISTS:
         return None
