@@ -7,7 +7,8 @@ front's middle against its path, in the three seconds before T0 ("hidden": all o
 `worldstate.belief`'s in modified polar coordinates from the same prior, with the same approach rates and the
 bearings that the front-end heard, as hidden ones (25 degrees): its place is the best that it could have said.
 "nees" is the squared error of azimuth and log range over the stated covariance, halved: 1 in the mean where
-deviations are stated rightly. Intervals of nine tenths by 1000 draws of passes.
+deviations are stated rightly; "place_nees" that of x and y in metres, and "covered" the share of places in
+their ellipse of nine tenths. Intervals of nine tenths by 1000 draws of passes.
 """
 
 import argparse
@@ -37,6 +38,7 @@ LEADS_S, SHOWN_S = HOP_S * np.arange(1, 31), (0.5, 1.0, 2.0, 3.0)
 HIDDEN_BEARING_STD_RAD, SAME_PASS_S = math.radians(25.0), 2.0
 METHODS = ("smoothed", "filter")
 PLACE = [0, 3]  # Azimuth and logarithm of the range, of a state
+ELLIPSE_HALVED = math.log(10.0)  # Half the quantile of .9 of chi-square with two degrees of freedom
 
 
 def stream_passes(path: Path, passes: int, seed: int = 0) -> tuple[HeardStream, list[PassLabel], int]:
@@ -98,8 +100,18 @@ def pass_errors(stream: HeardStream, one: PassLabel) -> dict[str, list[float]]:
         off = np.stack([np.angle(said * true.conj()), np.log(np.abs(said) / np.abs(true))], axis=1)
         told[f"{name}_m"] = np.abs(said - true).tolist()
         told[f"{name}_deg"] = np.degrees(np.abs(off[:, 0])).tolist()
-        told[f"{name}_nees"] = (0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)).tolist()
+        told[f"{name}_nees"] = _halved(off, spread).tolist()
+        place = _at(track.time_s, track.states, entry_s)[:, :2]
+        aside = place - np.stack([true.real, true.imag], axis=1)
+        square = _halved(aside, _at(track.time_s, track.covariance, entry_s)[:, :2, :2])
+        told[f"{name}_place_nees"] = square.tolist()
+        told[f"{name}_covered"] = np.where(np.isnan(square), math.nan, square < ELLIPSE_HALVED).tolist()
     return told
+
+
+def _halved(off: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the squared error over the covariance, of two numbers each, halved."""
+    return 0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
 
 
 def _at(time_s: np.ndarray, rows: np.ndarray, entry_s: float) -> np.ndarray:
@@ -138,7 +150,7 @@ def figures(found: list[dict[str, list[float]]], came: int, rng: np.random.Gener
 
 
 def _measure(key: str) -> Callable[[np.ndarray], float]:
-    return _mean if key.endswith("nees") else _rms
+    return _mean if key.endswith(("nees", "covered")) else _rms
 
 
 def _mean(values: np.ndarray) -> float:

@@ -32,9 +32,11 @@ _OTHER_BODY = (1.7, 0.7, 0.1)
 _BOX_STD_RAD, _HEIGHT_STD = math.radians(0.4), 0.05
 # Where the corner stands is not seen, only its direction; any distance does for an ego that stands.
 _CORNER_M, _LEAST_EDGE_STD_RAD = 6.0, math.radians(0.5)
-# Of .5, 1 and 2, with which places in the three seconds before T0 are off by 1.38, 1.54 and 1.84 m rms, and
-# by 1.92 m without; their squared errors are .15, .23, .31 and .34 of the stated ones (docs/smoothing.md).
-_MANOEUVRE_K = 1.0
+# In the two seconds before T0 simulated drivers depart from the pace that they have then as under white
+# acceleration of .015 to .04 m^2/s^3 in the median, .04 to .26 in the mean square; with 1 m^2/s^3 and a scale
+# of 1 the stated variance of hidden places was four times the squared error. In the grid of densities and
+# scales of docs/smoothing.md these have one of the least errors, and state it rightly.
+_ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
 # At the earliest hop: beyond the corner, at a walk to 15 m/s, from some 10 to 100 m away.
 _START_STD = (math.radians(25.0), 0.25, 0.3, 0.6)
 _START_RAD, _START_M = math.radians(55.0), 30.0
@@ -61,7 +63,9 @@ def label_passes(
     """Return the labels of all vehicles that came out of an arm, in the order of their boxes."""
     # Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
     # runs off and the system is indeterminate.
-    chosen = settings or SmoothingSettings(lag_s=30.0, relinearize_every=1000, manoeuvre_k=_MANOEUVRE_K)
+    chosen = settings or SmoothingSettings(
+        lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
+    )
     coming = [one for one in tracks if one.arm is not None]
     edges = {arm: _edge(coming, arm) for arm in ("left", "right")}
     found = []
