@@ -1,18 +1,23 @@
 """The evidence of one hop for a sequence model, and whether the model may be used at all."""
 
+import logging
+
 import numpy as np
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
-from worldstate.adapters.files.acoustic_domain import UNFIT
+from worldstate.abduction.sequence.street_sides import StreetSides
+from worldstate.adapters.files.acoustic_domain import UNFIT, heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.ground.values import NotUsable
 
 # Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
 LEVEL_BAND_HZ = (50.0, 2700.0)
+
+_LOG = logging.getLogger(__name__)
 
 
 def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:
@@ -29,6 +34,14 @@ def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceM
     if model.domain.ego_motion not in (motion, "any"):
         return NotUsable(f"the model was made for a {model.domain.ego_motion} ego, this one is {motion}")
     return model.sequence
+
+
+def sides_of(sides: StreetSides | None, model: Model) -> StreetSides | None:
+    """Return what a street's arms sound like where this model's array heard it; else none, and a warning."""
+    if sides is None or (model.domain is not None and sides.heard_by == heard_with(model.domain)):
+        return sides
+    _LOG.warning("the street's sides were heard by another array (%s) and are left out", sides.heard_by)
+    return None
 
 
 def read_hop(
@@ -56,4 +69,4 @@ def read_hop(
         looming_std_hz=np.array([std_hz]),
         bearing_rad=np.array([frame.bearing_rad]),
     )
-    return reader.read(evidence)
+    return reader.read(evidence, frame.feature)

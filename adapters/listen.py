@@ -9,6 +9,7 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader
+from worldstate.abduction.sequence.street_sides import StreetSides
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
@@ -49,7 +50,7 @@ from worldstate.state import Context, WorldState
 
 from .acoustic import AcousticAdapter, Signature
 from .acoustic_grounding import Grounding
-from .acoustic_sequence import sequence_of
+from .acoustic_sequence import sequence_of, sides_of
 from .own_parts import OtherModality, Waiting
 
 BLOCKS_PER_SECOND = 20
@@ -187,6 +188,8 @@ class Source:
         Reads who comes into view and when; or why the model's cannot be used here.
     history : SequenceHistory or None
         What it has heard beforehand, from a checkpoint.
+    sides : StreetSides or None
+        What either arm of a known street sounds like.
     co_evidence : CoEvidenceChannel or None
         Asked in place of the detections: a camera that runs.
     others : tuple of callables
@@ -229,6 +232,7 @@ class Source:
     road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None
     history: SequenceHistory | None = None
+    sides: StreetSides | None = None
     co_evidence: CoEvidenceChannel | None = None
     others: tuple[OtherModality, ...] = ()
     told: Callable[[int], Iterable[Timed]] | None = None
@@ -254,7 +258,7 @@ class Source:
     def reader(self) -> SequenceReader | NotUsable | None:
         """Return the sequence model as it is at the start of the recording, or why it cannot be used."""
         known = self.sequence
-        return SequenceReader(known, self.history) if isinstance(known, SequenceModel) else known
+        return SequenceReader(known, self.history, self.sides) if isinstance(known, SequenceModel) else known
 
     def camera_channel(self) -> VisionQuery:
         """Return the camera's detections as the channel that is asked for co-evidence."""
@@ -328,6 +332,7 @@ def open_source(
     miss_rates: Path | str | MissRates | None = None,
     model: Path | str | Model | None = None,
     context: Context | None = None,
+    sides: StreetSides | None = None,
     resume: Path | str | Checkpoint | None = None,
     start_s: float = 0.0,
     engine: Path | str | EngineSpeed | None = None,
@@ -360,6 +365,9 @@ def open_source(
         or the context says.
     context : Context, optional
         Rates, occluders and ego motion; defaults where not given.
+    sides : StreetSides, optional
+        What either arm of this street sounds like, as `LearnedStreet.patterns` tells it. What another array
+        heard is left out, and a warning says so.
     resume : path or Checkpoint, optional
         Belief and site to go on from. Hops up to its time are heard, which fills the windows, and not
         measured: the same recording again goes on where the other run ended.
@@ -407,7 +415,7 @@ def open_source(
     if engine is not None and not settings.ego_noise:
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
     sound = as_sound(path)
-    source, recording = _heard(sound, array, model, context, settings, ego is not None and ego.moves)
+    source, recording = _heard(sound, array, model, context, settings, ego is not None and ego.moves, sides)
     source = _with_camera(source, recording, detections, detector, camera, miss_rates)
     if source.detections is not None:
         source = replace(source, detections=source.detections.shifted(source.camera.stamp_offset_s))
@@ -431,6 +439,7 @@ def _heard(
     context: Context,
     settings: ListenSettings,
     driven: bool,
+    sides: StreetSides | None,
 ) -> tuple[Source, Recording | None]:
     """Return what is heard and by which array and model, and the recording folder if it is one."""
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
@@ -453,6 +462,7 @@ def _heard(
         guard=model.guard,
         road_users=model.road_users,
         sequence=sequence_of(model, moves, settings.uncalibrated),
+        sides=sides_of(sides, model),
     )
     return source, recording
 

@@ -149,19 +149,21 @@ def _needed(edge: LearnedEdge, edges: Edges, arm: str) -> float:
 
 def filtered(path: Path, window_s: list[float]) -> dict[str, object]:
     """Every pass after the tenth, with the usual street and with the learned one."""
-    stream, policies = HeardStream.load(path), read_model(None).policies
-    _, measured = stream_measurements(path, read_model(None), "all", 0)
-    hops, recording = list(measured), watched_stream(path, 0)
+    model = read_model(None)
+    stream, recording = HeardStream.load(path), watched_stream(path, 0, model)
     *stages, _ = streets_after(LearnedStreet(stream.site), recording)
     street = stages[PASSES - 1]
     since_s = sorted(one.t0.time_s for one in recording.passes)[PASSES - 1] + 3.0
     contexts = {
-        "usual": Context(),
-        "street": context_of(street),
+        "usual": (Context(), None),
+        "street": (context_of(street), street.patterns.sides()),
     }
     told = {
-        name: followed(WorldFilter(context, policies.for_alpha(0.02)), hops)
-        for name, context in contexts.items()
+        name: followed(
+            WorldFilter(context, model.policies.for_alpha(0.02)),
+            stream_measurements(path, model, "all", 0, sides)[1],
+        )
+        for name, (context, sides) in contexts.items()
     }
     return {
         "site": stream.site,

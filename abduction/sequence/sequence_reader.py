@@ -22,6 +22,7 @@ from .sequence_inputs import (
     streets_own,
 )
 from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
+from .street_sides import StreetSides
 
 # Before, what is usual in a street is what was heard just now.
 LEAST_HOPS = 10
@@ -104,19 +105,30 @@ class SequenceReader:
     1
     """
 
-    def __init__(self, model: SequenceModel, history: SequenceHistory | None = None) -> None:
+    def __init__(
+        self,
+        model: SequenceModel,
+        history: SequenceHistory | None = None,
+        sides: StreetSides | None = None,
+    ) -> None:
         self._model = model
+        self.sides = sides  # What is known of the street
         self.history = history or SequenceHistory()  # All that is carried; `Checkpoint` writes it to disk
 
     def interrupt(self) -> None:
         """Forget the last seconds, as after sound that was lost; what is usual in the street stays."""
         self.history = SequenceHistory(minute=self.history.minute)
 
-    def read(self, evidence: HopEvidence) -> SequenceReading | NotUsable:
-        """Take the next hop in; return what it says together with those before."""
+    def read(self, evidence: HopEvidence, feature: FloatArray | None = None) -> SequenceReading | NotUsable:
+        """Take the next hop in; return what it says together with those before.
+
+        `feature` is that of its window, shape (azimuths,), which a known street turns to its sides.
+        """
         self.history = history = self.history.heard(evidence)
         if history.hops < LEAST_HOPS:
             return TOO_FEW
-        posterior = self._model.of_inputs(last_inputs(history.recent, history.minute))
         model = self._model
-        return SequenceReading(posterior.groups[0], model.share, model.margin_s, model.alarm)
+        groups = model.of_inputs(last_inputs(history.recent, history.minute)).groups
+        if self.sides is not None and feature is not None:
+            groups = self.sides.turned(groups, feature[None])
+        return SequenceReading(groups[0], model.share, model.margin_s, model.alarm)

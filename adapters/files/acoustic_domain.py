@@ -1,5 +1,6 @@
 """Hold an array and a sample rate against what a model was made for."""
 
+import hashlib
 import logging
 from collections.abc import Sequence
 
@@ -77,6 +78,13 @@ def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAI
 def array_of(domain: ModelDomain) -> MicrophoneArray:
     """Return the array of a domain."""
     return MicrophoneArray(domain.positions_m, domain.array)
+
+
+def heard_with(domain: ModelDomain) -> str:
+    """Return what tells features of one array, band and kind from those of others."""
+    places = np.round(domain.positions_m, 3) + 0.0  # No minus zero
+    told = hashlib.sha256(places.astype("<f8").tobytes()).hexdigest()[:12]
+    return f"{domain.array}, {told}, {_feature(domain.feature, domain.band_hz)}"
 
 
 def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> bool:

@@ -10,6 +10,7 @@ from made_up_sequence import evidence_of, sequence_model
 
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
+from worldstate.abduction.sequence.street_sides import SECTORS, StreetSides
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable
 
@@ -51,3 +52,20 @@ def test_a_history_from_a_file_goes_on_to_the_bit(seed: int) -> None:
         if isinstance(here, SequenceReading):
             np.testing.assert_array_equal(here.groups, there.groups)
     assert isinstance(here, SequenceReading)
+
+
+def test_a_known_street_turns_what_is_read_to_its_sides() -> None:
+    rng = np.random.default_rng(5)
+    model, hops = sequence_model(rng), _hops(evidence_of(rng, 12))
+    sides = StreetSides(np.linspace(1.0, -1.0, SECTORS), 0.0, 1.0, "roof")
+    plain, turned, of_the_left = (
+        SequenceReader(model),
+        SequenceReader(model, sides=sides),
+        np.arange(60, 0, -1.0),
+    )
+    for hop in hops:
+        usual, known = plain.read(hop), turned.read(hop, of_the_left)
+    assert isinstance(usual, SequenceReading)
+    assert isinstance(known, SequenceReading)
+    np.testing.assert_array_equal(known.groups, sides.turned(usual.groups[None], of_the_left[None])[0])
+    assert not np.allclose(known.groups, usual.groups)

@@ -15,6 +15,7 @@ from worldstate.ground.values import nanoseconds
 from worldstate.operations.labelling.heard_passes import heard_passes
 from worldstate.operations.labelling.street_file import read_street, write_street
 from worldstate.operations.labelling.street_passes import looks_at, streets_after, watched_recording
+from worldstate.operations.labelling.street_sound import HeardStreet
 from worldstate.smoothing.learned_street import LearnedStreet
 from worldstate.smoothing.street_context import context_of
 from worldstate.state import Entity
@@ -46,6 +47,16 @@ def test_edges_and_paces_are_those_of_the_street(street):
     assert abs(right.edge.mean_rad - EDGE_RAD) < math.radians(1.5)
     seen = math.exp(left.log_pace.total / left.log_pace.weight)
     assert seen == pytest.approx(SPEED / LANE_M, rel=0.15)
+
+
+def test_sound_belongs_to_a_pass_unless_the_other_arm_is_heard_too(recording):
+    first, *_ = recording.passes
+    times = np.arange(0.1, 30.0, 0.1)
+    heard = HeardStreet(times, np.zeros((len(times), 12)), np.ones(len(times)), "roof")
+    assert len(heard.before(first, recording.passes).weights) == 30
+    beside = replace(first, arm="right", t0=replace(first.t0, time_s=first.t0.time_s + 2.0))
+    assert heard.before(first, [first, beside]) is None
+    assert heard.before(replace(first, t0=replace(first.t0, time_s=99.0)), [first]) is None
 
 
 def test_images_without_a_box_between_boxes_are_misses(recording):
@@ -138,6 +149,9 @@ def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys)
     assert found["n_passes"] == sum(arm["arrivals"] for arm in found["arms"].values())
     assert figure.stat().st_size > 0
     first = read_street(out)
+    # It listened, with the model that ships; a single pass tells no side.
+    assert sum(first.patterns.weights) > 0.0
+    assert found["sides_heard"] is False
     assert main([*told, "--known", str(out), "--days", "1"]) == 0
     again = read_street(out)
     assert again.site == "here"

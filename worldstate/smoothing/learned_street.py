@@ -16,6 +16,7 @@ from worldstate.state.context import Rates
 from .event_rate import EventRate
 from .learned_edge import LearnedEdge
 from .running_moments import Moments, NormalPrior
+from .side_patterns import PassSound, SidePatterns
 
 Arm = Literal["left", "right"]
 ARMS: tuple[Arm, Arm] = ("left", "right")
@@ -51,6 +52,7 @@ class StreetPass:
     hidden_s: float | None = None  # Heard before it came into view; None where nobody listened
     in_view_s: float | None = None  # From there until it was last seen; None where nobody knows
     gone: bool = True  # Whether it had left the view then, and not the recording had ended
+    sound: PassSound | None = None  # Before it came into view
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,8 @@ class LearnedStreet:
     arms: tuple[LearnedArm, LearnedArm] = (LearnedArm("left"), LearnedArm("right"))
     looks: tuple[float, ...] = (0.0,) * BINS  # At a vehicle in view, by azimuth from the right
     missed: tuple[float, ...] = (0.0,) * BINS  # Of these, in which the camera reported nothing there
+    # What either arm sounds like
+    patterns: SidePatterns = field(default_factory=SidePatterns, metadata=ADDED)
 
     def __post_init__(self) -> None:
         directions = tuple(arm.direction for arm in self.arms)
@@ -158,7 +162,8 @@ class LearnedStreet:
 def with_pass(street: LearnedStreet, one: StreetPass) -> LearnedStreet:
     """Return the street after one more vehicle came into view."""
     left, right = (arm.with_pass(one) if arm.direction == one.arm else arm for arm in street.arms)
-    return replace(street, arms=(left, right))
+    heard = street.patterns if one.sound is None else street.patterns.with_pass(one.arm, one.sound)
+    return replace(street, arms=(left, right), patterns=heard)
 
 
 def watched(street: LearnedStreet, time_s: float) -> LearnedStreet:
@@ -186,7 +191,8 @@ def forgotten(street: LearnedStreet, time_s: float) -> LearnedStreet:
     factor = math.exp(-in_range("time_s", time_s, 0.0, 1e12) / FORGETTING_S)
     left, right = (arm.faded(factor) for arm in street.arms)
     looks, missed = (tuple(factor * one for one in many) for many in (street.looks, street.missed))
-    return replace(street, arms=(left, right), looks=looks, missed=missed)
+    patterns = street.patterns.faded(factor)
+    return replace(street, arms=(left, right), looks=looks, missed=missed, patterns=patterns)
 
 
 def _bin(azimuth_rad: float) -> int:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from .array_options import search_of
 
 if TYPE_CHECKING:
+    from worldstate.abduction.sequence.street_sides import StreetSides
     from worldstate.adapters.listen import ListenSettings
     from worldstate.state import Context
 
@@ -33,7 +34,7 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
         "corners, lanes and rates of this place, JSON (default: a usual blind junction, and states say so)"
     )
     add("--context", type=Path, metavar="FILE", help=place)
-    street = "edges and pace of this place as learn-street wrote them, in place of --context"
+    street = "edges, pace and sides of this place as learn-street wrote them, in place of --context"
     add("--street", type=Path, metavar="JSON", help=street)
 
 
@@ -75,3 +76,10 @@ def given_context(arguments: argparse.Namespace) -> "Context | None":
     if arguments.context is not None:
         raise InvalidArgumentError("--street: expected it without --context, both say what stands there")
     return context_of(read_street(arguments.street))
+
+
+def given_sides(arguments: argparse.Namespace) -> "StreetSides | None":
+    """Return what either arm of the place that --street names sounds like, None without it."""
+    from worldstate.operations.labelling.street_file import read_street
+
+    return None if arguments.street is None else read_street(arguments.street).patterns.sides()

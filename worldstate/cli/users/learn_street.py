@@ -1,10 +1,10 @@
 """`worldstate learn-street`: what the vehicles that passed tell of a street.
 
 Join the camera's boxes into passes, smooth them, and learn from each vehicle that came out of hiding: where
-the edge stands past which it came into view, how fast it was there and how long it stayed in view, how many
-come from either side in which time, and how often the camera misses somebody in view, by azimuth. For a
-standing ego. Boxes do not tell how long somebody was hidden; --states, the snapshots of the same recording,
-do: from when `worldstate run` believed somebody there until T0.
+the edge stands past which it came into view, how fast it was there and how long it stayed in view, what
+either arm sounded like before, how many come from either side in which time, and how often the camera misses
+somebody in view, by azimuth. For a standing ego. Boxes do not tell how long somebody was hidden; --states,
+the snapshots of the same recording, do: from when `worldstate run` believed somebody there until T0.
 
 INPUT is a recording with boxes of a camera, as `worldstate label` takes it, or a simulated stream (NPZ) as
 `worldstate commission` keeps it, of which a camera's boxes are drawn. --known goes on from a street that was
@@ -55,6 +55,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--known", type=Path, metavar="JSON", help="a street that was learned before")
     add("--days", type=float, default=0.0, metavar="D", help="since then (default: %(default)g)")
     add("--site", metavar="NAME", help="name of the place (default: the known street's)")
+    add("--model", type=Path, help="that listens (default: the one that ships)")
+    add(
+        "--sides", action=argparse.BooleanOptionalAction, default=True,
+        help="learn what either arm sounds like, which takes listening to all of it (default: on)",
+    )  # fmt: skip
     add("--seed", type=int, default=0, help="of a stream's camera (default: %(default)s)")
     output = parser.add_argument_group("output").add_argument
     output("--out", type=Path, required=True, metavar="JSON", help="what was learned")
@@ -79,8 +84,13 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         _draw(arguments, [before, *stages], street)
     found = {arm.direction: _figures(arm) for arm in street.arms}
     return CommandResult(
-        {"out": str(arguments.out), "n_passes": len(stages), "arms": found},
-        lines=[f"{len(stages)} passes", *(_line(arm) for arm in street.arms)],
+        {
+            "out": str(arguments.out),
+            "n_passes": len(stages),
+            "arms": found,
+            "sides_heard": street.patterns.sides() is not None,
+        },
+        lines=[f"{len(stages)} passes", *(_line(arm) for arm in street.arms), _heard(street)],
     )
 
 
@@ -121,16 +131,23 @@ def _recording(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
 
 def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     """Return the passes of a recording, or those of a stream before a camera that is drawn."""
+    from dataclasses import replace
+
     from worldstate.adapters.audio.open_sound import as_sound, open_sound
+    from worldstate.adapters.files.model_file import read_model
     from worldstate.operations.labelling.street_passes import watched_recording
+    from worldstate.operations.labelling.street_sound import heard_street
     from worldstate.studies.passes.world_exam import watched_stream
 
+    model = read_model(arguments.model)
     if path.suffix == STREAM:
-        return watched_stream(path, arguments.seed)
+        watched = watched_stream(path, arguments.seed, model)
+        return watched if arguments.sides else replace(watched, heard=None)
     source, detections = camera_source(arguments, as_sound((path,)))
     with open_sound(source.sound) as audio:
         duration_s = audio.duration_s
-    return watched_recording(detections, source.camera, source.settings.boxes, duration_s)
+    watched = watched_recording(detections, source.camera, source.settings.boxes, duration_s)
+    return replace(watched, heard=heard_street(source, model)) if arguments.sides else watched
 
 
 def _snapshots(path: Path) -> "Iterator[tuple[float, tuple[Entity, ...]]]":
@@ -192,3 +209,9 @@ def _rate_words(name: str, told: dict[str, float | int]) -> str:
         return f"{name} not observed"
     mean, low, high = (told[f"{name}{end}_hz"] for end in ("", "_low", "_high"))
     return f"{name} {mean:.2f} /s ({low:.2f} to {high:.2f})"
+
+
+def _heard(street: "LearnedStreet") -> str:
+    left, right = street.patterns.weights
+    told = "told apart by sound" if street.patterns.sides() is not None else "not told apart by sound"
+    return f"sides  {told}; heard of {left:.1f} and {right:.1f} passes"

@@ -45,6 +45,7 @@ from worldstate.cli.common.listen_options import (
     add_listen_options,
     add_memory_options,
     given_context,
+    given_sides,
     listen_settings,
 )
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
@@ -164,6 +165,7 @@ def _source(arguments: argparse.Namespace) -> "Source":
         miss_rates=arguments.miss_rates,
         model=arguments.model,
         context=given_context(arguments),
+        sides=given_sides(arguments),
         resume=arguments.resume,
         start_s=arguments.start or 0.0,
         detector=detector,

@@ -36,6 +36,7 @@ from worldstate.cli.common.listen_options import (
     add_listen_options,
     add_memory_options,
     given_context,
+    given_sides,
     listen_settings,
 )
 from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
@@ -134,6 +135,7 @@ def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source
         miss_rates=arguments.miss_rates,
         model=arguments.model,
         context=given_context(arguments),
+        sides=given_sides(arguments),
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
         # A channel that is silent is told by the front-end, which leaves it out.

@@ -10,9 +10,11 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
+from worldstate.smoothing.side_patterns import PassSound
 
 from .box_tracks import LONGEST_GAP_S, BoxTrack, box_tracks
 from .pass_labels import HOP_S, PassLabel, label_passes
+from .street_sound import HeardStreet
 
 # Nearer to the axis nobody comes out of an arm: who turns there has overtaken, or was two vehicles.
 _LEAST_EDGE_RAD = math.radians(5.0)
@@ -20,8 +22,8 @@ _LEAST_EDGE_RAD = math.radians(5.0)
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 3.0
 
 
-def street_pass(one: PassLabel, until_s: float = math.inf) -> StreetPass:
-    """Return what a labelled pass tells of its arm: edge, pace, and the times that it was hidden and in view.
+def street_pass(one: PassLabel, until_s: float = math.inf, sound: PassSound | None = None) -> StreetPass:
+    """Return what a labelled pass tells of its arm: edge, pace, times hidden and in view, sound before.
 
     A pass smoothed from boxes tells nothing of the time in hiding: its past begins at a fixed time before T0.
     """
@@ -36,6 +38,7 @@ def street_pass(one: PassLabel, until_s: float = math.inf) -> StreetPass:
         max(last_s - one.t0.time_s, 0.0),
         # As boxes are joined: without one for longer it has left the view.
         gone=until_s - last_s > LONGEST_GAP_S,
+        sound=sound,
     )
 
 
@@ -47,12 +50,13 @@ def seen_edge(arm: str, edge_rad: float) -> float | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedRecording:
-    """What a camera saw of a street in one recording."""
+    """What a camera saw of a street in one recording, and what was heard."""
 
     tracks: Sequence[BoxTrack]
     passes: Sequence[PassLabel]
     duration_s: float
     image_s: float  # Between images
+    heard: HeardStreet | None = None  # Meanwhile, where somebody listened
 
 
 def watched_recording(
@@ -70,7 +74,9 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
     before_s = 0.0
     for one in sorted(recording.passes, key=lambda one: one.t0.time_s):
         now_s = min(max(one.t0.time_s, before_s), recording.duration_s)
-        street = with_pass(watched(street, now_s - before_s), street_pass(one, recording.duration_s))
+        sound = None if recording.heard is None else recording.heard.before(one, recording.passes)
+        told = street_pass(one, recording.duration_s, sound)
+        street = with_pass(watched(street, now_s - before_s), told)
         before_s = now_s
         yield street
     for track in recording.tracks:

@@ -8,6 +8,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
+from worldstate.abduction.sequence.street_sides import StreetSides
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import asked_again
@@ -23,11 +24,14 @@ def measurements(
     sequence: SequenceModel,
     evidence: HopEvidence,
     vision: CoEvidenceChannel | None,
+    sides: StreetSides | None = None,
 ) -> Iterator[Measurement]:
     """Yield one measurement a hop, as the acoustic adapter makes them of the sound."""
-    hops, signature, posterior = heard.hops, SiteSignature(model), sequence.posterior(evidence)
+    hops, signature, groups = heard.hops, SiteSignature(model), sequence.posterior(evidence).groups
+    if sides is not None:
+        groups = sides.turned(groups, hops.feature)
     for i in range(len(hops)):
-        reading = SequenceReading(posterior.groups[i], sequence.share, sequence.margin_s, sequence.alarm)
+        reading = SequenceReading(groups[i], sequence.share, sequence.margin_s, sequence.alarm)
         measurement = Measurement(
             stamp_ns=nanoseconds(float(hops.time_s[i])),
             signature=signature.evidence(hops.feature[i]),

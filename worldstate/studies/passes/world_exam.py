@@ -1,14 +1,17 @@
 """Let the whole world-state follow streams that were listened to, with a camera or without."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from worldstate.abduction.sequence.street_sides import StreetSides, arrival_pattern, somebody_comes
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
+from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.simulation.scene.junction import site
 from worldstate.core.filter import WorldFilter
@@ -17,6 +20,7 @@ from worldstate.operations.commissioning.commission import parts_of, stream_evid
 from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.commissioning.stream_labels import stream_truth
 from worldstate.operations.labelling.street_passes import WatchedRecording, watched_recording
+from worldstate.operations.labelling.street_sound import HeardStreet
 from worldstate.state.context import Context, corner_at
 
 from .followed_stream import followed
@@ -54,7 +58,7 @@ def passed_stream(
 
 
 def stream_measurements(
-    path: Path, model: Model, camera: CameraKind, seed: int
+    path: Path, model: Model, camera: CameraKind, seed: int, sides: StreetSides | None = None
 ) -> tuple[HeardStream, Iterator[Measurement]]:
     """Return a stream with what microphones and camera measure of it, hop by hop."""
     windows, sequence = parts_of(model)
@@ -67,14 +71,21 @@ def stream_measurements(
         if camera == "mover":
             detections = with_mover(detections, heard)
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
-    return heard, measurements(heard, windows, sequence, stream_evidence(windows, heard), vision)
+    evidence = stream_evidence(windows, heard)
+    return heard, measurements(heard, windows, sequence, evidence, vision, sides)
 
 
-def watched_stream(path: Path, seed: int) -> WatchedRecording:
-    """Return the passes of a stream before a camera; `seed` draws its misses."""
+def watched_stream(path: Path, seed: int, model: Model) -> WatchedRecording:
+    """Return the passes of a stream before a camera and what was heard; `seed` draws the camera's misses."""
     heard, camera = HeardStream.load(path), PinholeCamera()
     detections = stream_detections(heard, np.random.default_rng(seed), camera)
-    return watched_recording(detections, camera, EVERYBODY, float(heard.hops.time_s[-1]))
+    seen = watched_recording(detections, camera, EVERYBODY, float(heard.hops.time_s[-1]))
+    if model.domain is None:
+        return seen
+    windows, sequence = parts_of(model)
+    groups = sequence.posterior(stream_evidence(windows, heard)).groups
+    patterns, heard_by = arrival_pattern(heard.hops.feature), heard_with(model.domain)
+    return replace(seen, heard=HeardStreet(heard.hops.time_s, patterns, somebody_comes(groups), heard_by))
 
 
 def known_context(name: str) -> Context:

@@ -1,0 +1,129 @@
+"""What passes tell of how either arm sounds: against another discriminant, and where it may not speak."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.abduction.sequence.street_sides import SECTORS, StreetSides, arrival_pattern
+from worldstate.adapters.acoustic_sequence import sides_of
+from worldstate.adapters.files.acoustic_domain import heard_with
+from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.listen import open_source
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, forgotten, with_pass
+from worldstate.smoothing.side_patterns import PassSound, SidePatterns
+
+OTHER = GROUPS.index("other")
+SLOPE = np.linspace(1.0, -1.0, SECTORS)
+
+
+def passes_of(rng: np.random.Generator, count: int, hops: int = 30) -> list[tuple[str, PassSound]]:
+    """Left ones louder on the left, right ones the other way round, and all of them noisy."""
+    arms = [("left", 1.0), ("right", -1.0)] * count
+    sounds = [sign * 0.3 * SLOPE + rng.normal(0.0, 0.4, (hops, SECTORS)) for _, sign in arms]
+    return [
+        (arm, PassSound(x - x.mean(axis=1, keepdims=True), np.ones(hops), "roof"))
+        for (arm, _), x in zip(arms, sounds, strict=True)
+    ]
+
+
+def learned(passes: list[tuple[str, PassSound]]) -> SidePatterns:
+    known = SidePatterns()
+    for arm, sound in passes:
+        known = known.with_pass(arm, sound)
+    return known
+
+
+def test_of_many_passes_it_is_fishers_discriminant():
+    passes = passes_of(np.random.default_rng(0), 400)
+    sides = learned(passes).sides()
+    x = np.concatenate([sound.patterns for _, sound in passes])
+    y = np.repeat([arm == "left" for arm, _ in passes], 30)
+    peer = LinearDiscriminantAnalysis(solver="lsqr", shrinkage=0.1).fit(x, y)
+    assert sides.weights == pytest.approx(peer.coef_[0], rel=0.02, abs=0.02)
+    assert sides.offset == pytest.approx(peer.intercept_[0], abs=0.02)
+    assert sides.certainty > 0.99
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_whether_anybody_comes_stays_and_only_the_side_moves(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sides = learned(passes_of(rng, 3)).sides()
+    groups, feature = rng.dirichlet(np.ones(len(GROUPS)), (5, 2)), rng.lognormal(0.0, 1.0, (5, 60))
+    turned, told = sides.turned(groups, feature), sides.log_ratio(feature)
+    np.testing.assert_allclose(turned.sum(axis=-1), 1.0, atol=1e-12)
+    assert (turned >= 0.0).all()
+    untouched = slice(len(COMING_S), OTHER), slice(OTHER + 1, None)
+    for one in untouched:
+        np.testing.assert_array_equal(turned[..., one], groups[..., one])
+
+    def odds(of: np.ndarray) -> np.ndarray:
+        return np.log(of[..., : len(COMING_S)].sum(axis=-1)) - np.log(of[..., OTHER])
+
+    np.testing.assert_allclose(odds(turned) - odds(groups), np.stack([told, -told], axis=1), atol=1e-6)
+
+
+def test_a_window_without_sound_somewhere_says_nothing():
+    sides = learned(passes_of(np.random.default_rng(1), 3)).sides()
+    groups = np.full((1, 2, len(GROUPS)), 1 / len(GROUPS))
+    silent = np.where(np.arange(60) == 7, 0.0, 1.0 + np.arange(60))[None]
+    np.testing.assert_allclose(sides.turned(groups, silent), groups, atol=1e-9)
+
+
+def test_one_arm_alone_tells_no_side_and_more_passes_tell_more():
+    passes = passes_of(np.random.default_rng(2), 8)
+    assert learned([one for one in passes if one[0] == "left"]).sides() is None
+    of_the_left = np.exp(np.repeat(SLOPE, 5))[None]
+    told = [float(learned(passes[: 2 * n]).sides().log_ratio(of_the_left)[0]) for n in (1, 8)]
+    assert 0.0 < told[0] < told[1] < 3.0
+
+
+def test_a_pass_that_nobody_heard_teaches_nothing():
+    passes = passes_of(np.random.default_rng(3), 4)
+    known = learned(passes)
+    silent = PassSound(np.tile(SLOPE, (30, 1)), np.zeros(30), "roof")
+    assert known.with_pass("right", silent) == known
+
+
+def test_another_array_begins_anew_and_its_model_leaves_it_out(caplog):
+    known = learned(passes_of(np.random.default_rng(4), 3))
+    arm, sound = passes_of(np.random.default_rng(5), 1)[0]
+    again = known.with_pass(arm, PassSound(sound.patterns, sound.weights, "bumper"))
+    assert again.weights == (1.0, 0.0)
+    with caplog.at_level(logging.WARNING):
+        assert sides_of(known.sides(), read_model(None)) is None
+    assert "another array (roof)" in caplog.text
+
+
+def test_the_models_own_array_hears_with_them(approach):
+    known = learned(passes_of(np.random.default_rng(4), 3)).sides()
+    mine = replace(known, heard_by=heard_with(read_model(None).domain))
+    assert open_source(approach.folder, sides=mine).reader().sides is mine
+
+
+def test_a_street_keeps_them_and_forgets_slowly():
+    street = LearnedStreet()
+    for arm, sound in passes_of(np.random.default_rng(6), 3):
+        street = with_pass(street, StreetPass(arm, None, None, sound=sound))
+    later = forgotten(street, 30 * 86400.0).patterns
+    assert later.weights == pytest.approx(tuple(3.0 * np.exp(-1.0) for _ in range(2)))
+    assert later.sides().certainty < street.patterns.sides().certainty
+
+
+def test_patterns_of_other_sectors_are_refused():
+    with pytest.raises(InvalidArgumentError, match="12 sectors"):
+        SidePatterns(sums=((0.0,), (0.0,)))
+    with pytest.raises(InvalidArgumentError):
+        StreetSides(np.zeros(3), 0.0, 1.0, "roof")
+
+
+def test_a_pattern_does_not_know_how_loud_it_was():
+    feature = np.random.default_rng(7).lognormal(0.0, 1.0, (4, 60))
+    np.testing.assert_allclose(arrival_pattern(7.0 * feature), arrival_pattern(feature), atol=1e-12)
