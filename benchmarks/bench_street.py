@@ -1,12 +1,12 @@
 """What ten passes tell of a street: corners, changes of geometry, and what the filter makes of it afterwards.
 
-Run: python benchmarks/bench_street.py [NPZ...] [--junctions 20] [--window 3 0] [--json]
+Run: python benchmarks/bench_street.py [NPZ...] [--junctions 20] [--passes 10] [--window 3 0] [--json]
 
 Without streams only what needs no sound: vehicles at drawn junctions before a camera with misses, ten passes
 at a time. Corners are the plan's. A change is the same arm at another junction, seen after ten passes. With
 streams (approaches of the named junctions) the filter follows each with the usual street and with the one
-learned from its first ten passes; the passes after these are compared in pairs, intervals of 95 % by 1000
-draws of passes. What is left of the azimuth's error with the true time to visible, and with the true azimuth
+learned from its first ten passes, or --passes; the passes after these are compared in pairs, intervals of
+95 % by 1000 draws of passes. What is left of the azimuth's error with the true time to visible, and with the true azimuth
 at T0 in place of the edge besides, says what is the time's and what the place's. Rates are those of all
 passes, reveals from the snapshots of the filter with the usual street.
 """
@@ -147,13 +147,13 @@ def _needed(edge: LearnedEdge, edges: Edges, arm: str) -> float:
     return math.inf
 
 
-def filtered(path: Path, window_s: list[float]) -> dict[str, object]:
-    """Every pass after the tenth, with the usual street and with the learned one."""
+def filtered(path: Path, passes: int, window_s: list[float]) -> dict[str, object]:
+    """Every pass after the first ones, with the usual street and with the learned one."""
     model = read_model(None)
     stream, recording = HeardStream.load(path), watched_stream(path, 0, model)
     *stages, _ = streets_after(LearnedStreet(stream.site), recording)
-    street = stages[PASSES - 1]
-    since_s = sorted(one.t0.time_s for one in recording.passes)[PASSES - 1] + 3.0
+    street = stages[passes - 1]
+    since_s = sorted(one.t0.time_s for one in recording.passes)[passes - 1] + 3.0
     contexts = {
         "usual": (Context(), None),
         "street": (context_of(street), street.patterns.sides()),
@@ -238,7 +238,12 @@ def figures_of(stream: HeardStream, one: FollowedStream, since_s: float) -> dict
         at for at in onsets_s[onsets_s > since_s] if not ((entries_s > at - 1) & (entries_s < at + 8)).any()
     ]
     hours = (one.time_s[-1] - since_s) / 3600.0
+    single, both = ([a for a in loud if a.approach.flow == flow] for flow in ("single", "both"))
     return {
+        "singles": len(single),
+        "other_side_too": sum(a.other_side for a in single),
+        "two_sided": len(both),
+        "both_found": sum(a.every_side for a in both),
         "skill_2s": float(1.0 - np.nanmean((soon - comes) ** 2) / (comes.mean() * (1.0 - comes.mean()))),
         "warned": float(np.mean([a.detected for a in loud])),
         "stray_onsets_per_hour": len(stray) / hours,
@@ -249,20 +254,27 @@ def paired(streams: list[dict[str, object]], name: str) -> dict[str, object]:
     """Root mean squares with the usual street and another one, their difference and its interval."""
     rng, found = np.random.default_rng(0), {}
     for key in KEYS:
-        pairs, sites = [], {}
+        pairs, sites = [], dict[str, list[tuple[list[float], list[float]]]]()
         for stream in streams:
             mine = list(zip(stream["passes"]["usual"], stream["passes"][name], strict=True))
             mine = [(a[key], b[key]) for a, b in mine if a[key] and b[key]]
             pairs += mine
-            sites[stream["site"]] = [round(_pooled(key, [p[k] for p in mine]), 3) for k in (0, 1)]
+            sites.setdefault(stream["site"], []).extend(mine)
         draws = [[pairs[i] for i in rng.integers(0, len(pairs), len(pairs))] for _ in range(1000)]
         apart = [_pooled(key, [p[1] for p in d]) - _pooled(key, [p[0] for p in d]) for d in draws]
         usual, told = (_pooled(key, [p[k] for p in pairs]) for k in (0, 1))
         interval = np.quantile(apart, [0.025, 0.975]).round(3).tolist()
         found[key] = {
-            "passes": len(pairs), "usual": usual, "street": told, "difference": interval, "sites": sites,
+            "passes": len(pairs),
+            "usual": usual,
+            "street": told,
+            "difference": interval,
             "means": [float(np.mean(np.concatenate([pair[k] for pair in pairs]))) for k in (0, 1)],
-        }  # fmt: skip
+            "sites": {
+                site: [round(_pooled(key, [p[k] for p in mine]), 3) for k in (0, 1)]
+                for site, mine in sites.items()
+            },
+        }
     return found
 
 
@@ -277,14 +289,16 @@ def main() -> None:
     parser.add_argument("--junctions", type=int, default=20, help="drawn ones (default: %(default)s)")
     window = "seconds before T0 that count (default: %(default)s)"
     parser.add_argument("--window", type=float, nargs=2, default=[3.0, 0.0], metavar="S", help=window)
+    parser.add_argument("--passes", type=int, default=PASSES, help="learned from (default: %(default)s)")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     report: dict[str, object] = {"geometry": geometry(arguments.junctions)}
-    streams = [filtered(path, arguments.window) for path in arguments.streams]
+    streams = [filtered(path, arguments.passes, arguments.window) for path in arguments.streams]
     if streams:
         report["street"] = paired(streams, "street")
-    for stream in streams:
-        report[stream["site"]] = stream["figures"] | {"rates": stream["rates"]}
+        report["figures"] = [
+            {"site": stream["site"], **stream["figures"], "rates": stream["rates"]} for stream in streams
+        ]
     print(json.dumps(report, indent=None if arguments.json else 1))
 
 
