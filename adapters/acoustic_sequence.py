@@ -1,18 +1,22 @@
 """The evidence of one hop for a sequence model, and whether the model may be used at all."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.sequence.sequence_inputs import HopEvidence
+from worldstate.abduction.sequence.sequence_inputs import SIDES, HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader, SequenceReading
-from worldstate.abduction.sequence.street_sides import StreetSides
+from worldstate.abduction.sequence.side_patterns import SidePatterns
+from worldstate.abduction.sequence.street_hearing import StreetHearing, StreetListener
+from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.files.acoustic_domain import UNFIT, heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.ground.values import NotUsable
+from worldstate.state import WorldState
 
 # Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
 LEVEL_BAND_HZ = (50.0, 2700.0)
@@ -36,12 +40,32 @@ def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceM
     return model.sequence
 
 
-def sides_of(sides: StreetSides | None, model: Model) -> StreetSides | None:
-    """Return what a street's arms sound like where this model's array heard it; else none, and a warning."""
-    if sides is None or (model.domain is not None and sides.heard_by == heard_with(model.domain)):
-        return sides
-    _LOG.warning("the street's sides were heard by another array (%s) and are left out", sides.heard_by)
-    return None
+def street_listener(
+    domain: ModelDomain | None, known: SidePatterns | None, before: StreetHearing | None
+) -> StreetListener | None:
+    """Return what learns a street while it is heard: from what was heard before, else from what is known.
+
+    What another array heard is left out, and a warning says so.
+    """
+    if domain is None:
+        return None
+    heard_by = heard_with(domain)
+    given = known if before is None else before.known
+    if given is not None and given.heard_by not in ("", heard_by):
+        _LOG.warning("the street's sides were heard by another array (%s) and are left out", given.heard_by)
+        before = known = None
+    return StreetListener(before or StreetHearing(replace(known or SidePatterns(), heard_by=heard_by)))
+
+
+def learn_passes(street: StreetListener | None, state: WorldState) -> None:
+    """Tell a street who has just come into view out of which of its arms."""
+    if street is None:
+        return
+    arms = {one.id: one.direction for one in state.entities}
+    came = {arms.get(event.entity_id) for event in state.events if event.kind == "handed_over"}
+    for arm in SIDES:
+        if arm in came:
+            street.passed(arm)
 
 
 def read_hop(

@@ -9,7 +9,8 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader
-from worldstate.abduction.sequence.street_sides import StreetSides
+from worldstate.abduction.sequence.side_patterns import SidePatterns
+from worldstate.abduction.sequence.street_hearing import StreetHearing
 from worldstate.abduction.signature.domain_guard import DomainGuard
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.signature_io import AnySignature
@@ -50,7 +51,7 @@ from worldstate.state import Context, WorldState
 
 from .acoustic import AcousticAdapter, Signature
 from .acoustic_grounding import Grounding
-from .acoustic_sequence import sequence_of, sides_of
+from .acoustic_sequence import learn_passes, sequence_of, street_listener
 from .own_parts import OtherModality, Waiting
 
 BLOCKS_PER_SECOND = 20
@@ -188,8 +189,10 @@ class Source:
         Reads who comes into view and when; or why the model's cannot be used here.
     history : SequenceHistory or None
         What it has heard beforehand, from a checkpoint.
-    sides : StreetSides or None
+    sides : SidePatterns or None
         What either arm of a known street sounds like.
+    street : StreetHearing or None
+        What of it was heard beforehand, from a checkpoint; then `sides` are not read.
     co_evidence : CoEvidenceChannel or None
         Asked in place of the detections: a camera that runs.
     others : tuple of callables
@@ -232,7 +235,8 @@ class Source:
     road_users: RoadUserModel | None = None
     sequence: SequenceModel | NotUsable | None = None
     history: SequenceHistory | None = None
-    sides: StreetSides | None = None
+    sides: SidePatterns | None = None
+    street: StreetHearing | None = None
     co_evidence: CoEvidenceChannel | None = None
     others: tuple[OtherModality, ...] = ()
     told: Callable[[int], Iterable[Timed]] | None = None
@@ -258,7 +262,10 @@ class Source:
     def reader(self) -> SequenceReader | NotUsable | None:
         """Return the sequence model as it is at the start of the recording, or why it cannot be used."""
         known = self.sequence
-        return SequenceReader(known, self.history, self.sides) if isinstance(known, SequenceModel) else known
+        if not isinstance(known, SequenceModel):
+            return known
+        listener = street_listener(getattr(self.model, "domain", None), self.sides, self.street)
+        return SequenceReader(known, self.history, listener)
 
     def camera_channel(self) -> VisionQuery:
         """Return the camera's detections as the channel that is asked for co-evidence."""
@@ -290,6 +297,8 @@ class Step:
         What is known of the site after it; None where no site is learned.
     history : SequenceHistory or None
         What a sequence model has heard up to it; None without one.
+    street : StreetHearing or None
+        What was learned of the street's sound up to it; likewise.
 
     Examples
     --------
@@ -310,6 +319,7 @@ class Step:
     world: WorldFilter
     site: SiteEstimate | None = None
     history: SequenceHistory | None = None
+    street: StreetHearing | None = None
 
     @property
     def state(self) -> WorldState:
@@ -319,7 +329,7 @@ class Step:
     @property
     def checkpoint(self) -> Checkpoint:
         """What another run goes on from."""
-        return Checkpoint(self.world, self.site, self.history)
+        return Checkpoint(self.world, self.site, self.history, self.street)
 
 
 def open_source(
@@ -332,7 +342,7 @@ def open_source(
     miss_rates: Path | str | MissRates | None = None,
     model: Path | str | Model | None = None,
     context: Context | None = None,
-    sides: StreetSides | None = None,
+    sides: SidePatterns | None = None,
     resume: Path | str | Checkpoint | None = None,
     start_s: float = 0.0,
     engine: Path | str | EngineSpeed | None = None,
@@ -365,9 +375,10 @@ def open_source(
         or the context says.
     context : Context, optional
         Rates, occluders and ego motion; defaults where not given.
-    sides : StreetSides, optional
-        What either arm of this street sounds like, as `LearnedStreet.patterns` tells it. What another array
-        heard is left out, and a warning says so.
+    sides : SidePatterns, optional
+        What either arm of this street sounds like, `LearnedStreet.patterns`; with site adaptation it is
+        learned on, or from nothing, from whoever comes into view. What another array heard is left out, and a
+        warning says so.
     resume : path or Checkpoint, optional
         Belief and site to go on from. Hops up to its time are heard, which fills the windows, and not
         measured: the same recording again goes on where the other run ended.
@@ -415,7 +426,7 @@ def open_source(
     if engine is not None and not settings.ego_noise:
         raise InvalidArgumentError("engine: expected ego_noise with it, which cancels its lines")
     sound = as_sound(path)
-    source, recording = _heard(sound, array, model, context, settings, ego is not None and ego.moves, sides)
+    source, recording = _heard(sound, array, model, context, settings, ego is not None and ego.moves)
     source = _with_camera(source, recording, detections, detector, camera, miss_rates)
     if source.detections is not None:
         source = replace(source, detections=source.detections.shifted(source.camera.stamp_offset_s))
@@ -423,6 +434,8 @@ def open_source(
     return replace(
         source,
         site=None if before is None else before.site,
+        sides=sides,
+        street=None if before is None else before.street,
         history=None if before is None else before.history,
         resume=None if before is None else before.world,
         start_ns=nanoseconds(in_range("start_s", start_s, 0.0, 1e10))
@@ -439,7 +452,6 @@ def _heard(
     context: Context,
     settings: ListenSettings,
     driven: bool,
-    sides: StreetSides | None,
 ) -> tuple[Source, Recording | None]:
     """Return what is heard and by which array and model, and the recording folder if it is one."""
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
@@ -462,7 +474,6 @@ def _heard(
         guard=model.guard,
         road_users=model.road_users,
         sequence=sequence_of(model, moves, settings.uncalibrated),
-        sides=sides_of(sides, model),
     )
     return source, recording
 
@@ -642,8 +653,14 @@ def listen_steps(source: Source) -> Iterator[Step]:
             world = world.update(other)
         world = world.predict_to(measurement.stamp_ns).update(measurement)
         site = signature.estimate if isinstance(signature, SiteSignature) else None
-        history = reader.history if isinstance(reader, SequenceReader) else None
-        yield Step(frame, measurement, world, site, history)
+        if not isinstance(reader, SequenceReader):
+            yield Step(frame, measurement, world, site)
+            continue
+        street = reader.street
+        if source.settings.site_adaptation:
+            learn_passes(street, world.state)
+        hearing = None if street is None else street.hearing
+        yield Step(frame, measurement, world, site, reader.history, hearing)
 
 
 def measure_steps(

@@ -6,9 +6,9 @@ Without streams only what needs no sound: vehicles at drawn junctions before a c
 at a time. Corners are the plan's. A change is the same arm at another junction, seen after ten passes. With
 streams (approaches of the named junctions) the filter follows each with the usual street and with the one
 learned from its first ten passes, or --passes; the passes after these are compared in pairs, intervals of
-95 % by 1000 draws of passes. What is left of the azimuth's error with the true time to visible, and with the true azimuth
-at T0 in place of the edge besides, says what is the time's and what the place's. Rates are those of all
-passes, reveals from the snapshots of the filter with the usual street.
+95 % by 1000 draws of passes. What is left of the azimuth's error with the true time to visible, and with the
+true azimuth at T0 in place of the edge besides, says what is the time's and what the place's. Rates are those
+of all passes, reveals from the snapshots of the filter with the usual street.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.simulation.scene.settings import rate_for
@@ -156,7 +157,7 @@ def filtered(path: Path, passes: int, window_s: list[float]) -> dict[str, object
     since_s = sorted(one.t0.time_s for one in recording.passes)[passes - 1] + 3.0
     contexts = {
         "usual": (Context(), None),
-        "street": (context_of(street), street.patterns.sides()),
+        "street": (context_of(street), street_listener(model.domain, street.patterns, None)),
     }
     told = {
         name: followed(

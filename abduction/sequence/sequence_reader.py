@@ -22,7 +22,7 @@ from .sequence_inputs import (
     streets_own,
 )
 from .sequence_model import GROUPS, SequenceAlarm, SequenceModel
-from .street_sides import StreetSides
+from .street_hearing import StreetListener
 
 # Before, what is usual in a street is what was heard just now.
 LEAST_HOPS = 10
@@ -109,26 +109,28 @@ class SequenceReader:
         self,
         model: SequenceModel,
         history: SequenceHistory | None = None,
-        sides: StreetSides | None = None,
+        street: StreetListener | None = None,
     ) -> None:
         self._model = model
-        self.sides = sides  # What is known of the street
+        self.street = street  # Where sides are learned
         self.history = history or SequenceHistory()  # All that is carried; `Checkpoint` writes it to disk
 
     def interrupt(self) -> None:
         """Forget the last seconds, as after sound that was lost; what is usual in the street stays."""
         self.history = SequenceHistory(minute=self.history.minute)
+        if self.street is not None:
+            self.street.interrupt()
 
     def read(self, evidence: HopEvidence, feature: FloatArray | None = None) -> SequenceReading | NotUsable:
         """Take the next hop in; return what it says together with those before.
 
-        `feature` is that of its window, shape (azimuths,), which a known street turns to its sides.
+        `feature` is that of its window, shape (azimuths,), by which the street tells the sides.
         """
         self.history = history = self.history.heard(evidence)
         if history.hops < LEAST_HOPS:
             return TOO_FEW
         model = self._model
-        groups = model.of_inputs(last_inputs(history.recent, history.minute)).groups
-        if self.sides is not None and feature is not None:
-            groups = self.sides.turned(groups, feature[None])
-        return SequenceReading(groups[0], model.share, model.margin_s, model.alarm)
+        groups = model.of_inputs(last_inputs(history.recent, history.minute)).groups[0]
+        if self.street is not None and feature is not None:
+            groups = self.street.turned(groups, feature)
+        return SequenceReading(groups, model.share, model.margin_s, model.alarm)

@@ -76,11 +76,9 @@ class StreetSides:
     def turned(self, groups: FloatArray, feature: FloatArray) -> FloatArray:
         """Return posteriors of the groups with those who come put where the street says.
 
-        Shapes: groups (n, 2, groups), feature (n, azimuths). A window without sound in some direction says
-        nothing.
+        Shapes: groups (n, 2, groups), feature (n, azimuths), positive.
         """
-        whole = np.asarray((feature > 0.0).all(axis=-1))
-        told = np.where(whole, self.log_ratio(np.where(whole[:, None], feature, 1.0)), 0.0)
+        told = self.log_ratio(feature)
         coming, other = groups[..., :_COMING], groups[..., _OTHER]
         here = coming.sum(axis=-1)
         odds = np.log(here + _SMALLEST) - np.log(other + _SMALLEST) + np.stack([told, -told], axis=-1)

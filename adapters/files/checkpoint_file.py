@@ -1,18 +1,21 @@
-"""Checkpoints on disk: the filter's memory, the site estimate and the history of a sequence."""
+"""Checkpoints on disk: the filter's memory, site estimate, a sequence's history, the sound of the arms."""
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory
+from worldstate.abduction.sequence.street_hearing import StreetHearing
 from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.serialisation import decode, encode
 
 from .atomic import write_text
 from .json_file import read_json, refused_as_file
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +30,8 @@ class Checkpoint:
         `SiteSignature.estimate`; None where no site is learned.
     history : SequenceHistory or None
         `SequenceReader.history`; None without a sequence model.
+    street : StreetHearing or None
+        `StreetListener.hearing`; likewise.
 
     Examples
     --------
@@ -39,15 +44,16 @@ class Checkpoint:
     world: WorldFilter
     site: SiteEstimate | None = None
     history: SequenceHistory | None = None
+    street: StreetHearing | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values: the filter's checkpoint with site and history beside its memory."""
-        beside = {"site": self.site, "history": self.history}
+        """Return JSON-able values: the filter's checkpoint with the other parts beside its memory."""
+        beside = {"site": self.site, "history": self.history, "street": self.street}
         return self.world.to_dict() | {k: None if v is None else encode(v) for k, v in beside.items()}
 
     @classmethod
     def from_dict(cls, data: object) -> "Checkpoint":
-        """Return what `to_dict` wrote; the filter's own checkpoint reads as one without site and history.
+        """Return what `to_dict` wrote; the filter's own checkpoint reads as one without the other parts.
 
         Raises
         ------
@@ -57,12 +63,18 @@ class Checkpoint:
             If a value is missing, of the wrong type or out of range; the message says where.
         """
         world = WorldFilter.from_dict(data)
-        site, history = (data.get(key) if isinstance(data, Mapping) else None for key in ("site", "history"))
+        beside: Mapping[str, object] = data if isinstance(data, Mapping) else {}
         return cls(
             world,
-            None if site is None else decode(SiteEstimate, site, "site"),
-            None if history is None else decode(SequenceHistory, history, "history"),
+            _part(SiteEstimate, beside, "site"),
+            _part(SequenceHistory, beside, "history"),
+            _part(StreetHearing, beside, "street"),
         )
+
+
+def _part(kind: type[T], beside: Mapping[str, object], name: str) -> T | None:
+    value = beside.get(name)
+    return None if value is None else decode(kind, value, name)
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:

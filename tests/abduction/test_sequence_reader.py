@@ -10,7 +10,9 @@ from made_up_sequence import evidence_of, sequence_model
 
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
-from worldstate.abduction.sequence.street_sides import SECTORS, StreetSides
+from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
+from worldstate.abduction.sequence.street_hearing import StreetHearing, StreetListener
+from worldstate.abduction.sequence.street_sides import SECTORS
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable
 
@@ -54,18 +56,19 @@ def test_a_history_from_a_file_goes_on_to_the_bit(seed: int) -> None:
     assert isinstance(here, SequenceReading)
 
 
-def test_a_known_street_turns_what_is_read_to_its_sides() -> None:
+def test_a_known_street_tells_the_sides_of_what_is_read() -> None:
     rng = np.random.default_rng(5)
     model, hops = sequence_model(rng), _hops(evidence_of(rng, 12))
-    sides = StreetSides(np.linspace(1.0, -1.0, SECTORS), 0.0, 1.0, "roof")
-    plain, turned, of_the_left = (
-        SequenceReader(model),
-        SequenceReader(model, sides=sides),
-        np.arange(60, 0, -1.0),
-    )
+    known = SidePatterns("roof")
+    for arm, sign in (("left", 1.0), ("right", -1.0)):
+        patterns = sign * np.linspace(1.0, -1.0, SECTORS) + rng.normal(0.0, 0.3, (30, SECTORS))
+        known = known.with_pass(arm, PassSound(patterns, np.ones(30), "roof"))
+    plain = SequenceReader(model)
+    turned = SequenceReader(model, street=StreetListener(StreetHearing(known)))
+    of_the_left = np.arange(60, 0, -1.0)
     for hop in hops:
-        usual, known = plain.read(hop), turned.read(hop, of_the_left)
+        usual, told = plain.read(hop), turned.read(hop, of_the_left)
     assert isinstance(usual, SequenceReading)
-    assert isinstance(known, SequenceReading)
-    np.testing.assert_array_equal(known.groups, sides.turned(usual.groups[None], of_the_left[None])[0])
-    assert not np.allclose(known.groups, usual.groups)
+    assert isinstance(told, SequenceReading)
+    np.testing.assert_array_equal(told.groups, known.sides().turned(usual.groups[None], of_the_left[None])[0])
+    assert not np.array_equal(told.groups, usual.groups)

@@ -20,7 +20,7 @@ from worldstate.abduction.signature.site_reference import SiteReference
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
 from worldstate.adapters.acoustic_sequence import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
+from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.adapters.listen import ListenSettings, Step, listen_steps, open_source
 from worldstate.frontend.approach.looming import Looming
@@ -88,7 +88,7 @@ def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path, whole: l
 
 def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path, whole: list[Step]) -> None:
     cut = whole[12]
-    save_checkpoint(folder / "half.json", Checkpoint(cut.world, cut.site, cut.history))
+    save_checkpoint(folder / "half.json", cut.checkpoint)
     rest = steps(folder, resume=read_checkpoint(folder / "half.json"))
     assert [one.state.to_json() for one in rest] == [one.state.to_json() for one in whole[13:]]
 

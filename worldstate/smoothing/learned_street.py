@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
+from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout
@@ -16,7 +17,6 @@ from worldstate.state.context import Rates
 from .event_rate import EventRate
 from .learned_edge import LearnedEdge
 from .running_moments import Moments, NormalPrior
-from .side_patterns import PassSound, SidePatterns
 
 Arm = Literal["left", "right"]
 ARMS: tuple[Arm, Arm] = ("left", "right")

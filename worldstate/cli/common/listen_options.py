@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from .array_options import search_of
 
 if TYPE_CHECKING:
-    from worldstate.abduction.sequence.street_sides import StreetSides
+    from worldstate.abduction.sequence.side_patterns import SidePatterns
     from worldstate.adapters.listen import ListenSettings
     from worldstate.state import Context
 
@@ -78,8 +78,8 @@ def given_context(arguments: argparse.Namespace) -> "Context | None":
     return context_of(read_street(arguments.street))
 
 
-def given_sides(arguments: argparse.Namespace) -> "StreetSides | None":
+def given_sides(arguments: argparse.Namespace) -> "SidePatterns | None":
     """Return what either arm of the place that --street names sounds like, None without it."""
     from worldstate.operations.labelling.street_file import read_street
 
-    return None if arguments.street is None else read_street(arguments.street).patterns.sides()
+    return None if arguments.street is None else read_street(arguments.street).patterns

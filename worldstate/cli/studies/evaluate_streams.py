@@ -30,6 +30,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--camera", choices=("all", "cars", "none", "dies", "mover"), default="all", help=cameras)
     place = "give the filter the corners and lanes of the junction (default: those of a usual one)"
     add("--known-place", action="store_true", help=place)
+    add(
+        "--sides", action=argparse.BooleanOptionalAction, default=True,
+        help="learn what either arm sounds like from whoever comes into view (default: on)",
+    )  # fmt: skip
     add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--report", type=Path, metavar="JSON", help="write the figures")
@@ -47,6 +51,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     check_outputs(arguments, "report")
     model = read_model(arguments.model)
     given = {"camera": arguments.camera, "seed": arguments.seed, "known_place": arguments.known_place}
+    given["learns"] = arguments.sides
     follow = partial(passed_stream, model=model, **given)
     streams: dict[str, list[PassedStream]] = {}
     with progress_bar("following", len(arguments.streams)) as bar:

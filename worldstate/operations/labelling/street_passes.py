@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.abduction.sequence.side_patterns import PassSound
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
-from worldstate.smoothing.side_patterns import PassSound
 
 from .box_tracks import LONGEST_GAP_S, BoxTrack, box_tracks
 from .pass_labels import HOP_S, PassLabel, label_passes

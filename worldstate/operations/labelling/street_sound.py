@@ -8,6 +8,7 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.sequence.side_patterns import PassSound
 from worldstate.abduction.sequence.street_sides import arrival_pattern, somebody_comes
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
@@ -15,7 +16,6 @@ from worldstate.adapters.listen import Source, measure_steps, open_source
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, seconds
-from worldstate.smoothing.side_patterns import PassSound
 
 from .pass_labels import PassLabel
 

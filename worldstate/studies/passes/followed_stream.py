@@ -7,6 +7,8 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.abduction.sequence.street_hearing import StreetListener
+from worldstate.adapters.acoustic_sequence import learn_passes
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.measurement.measurement import Measurement
@@ -34,11 +36,14 @@ class FollowedStream:
         ]
 
 
-def followed(world: WorldFilter, measurements: Iterable[Measurement]) -> FollowedStream:
-    """Filter a stream; return what was believed after every measurement."""
+def followed(
+    world: WorldFilter, measurements: Iterable[Measurement], street: StreetListener | None = None
+) -> FollowedStream:
+    """Filter a stream; return what was believed after every measurement. `street` is told who came."""
     states: list[WorldState] = []
     for measurement in measurements:
         world = world.update(measurement)
+        learn_passes(street, world.state)
         states.append(world.state)
     cues = [sorted(state.cues, key=lambda cue: SIDES.index(cue.direction)) for state in states]
     nothing, never = [np.nan] * len(HORIZONS_S), [np.nan] * 3

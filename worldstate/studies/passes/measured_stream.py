@@ -8,7 +8,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, TOO_FEW, SequenceReading
-from worldstate.abduction.sequence.street_sides import StreetSides
+from worldstate.abduction.sequence.street_hearing import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import asked_again
@@ -24,14 +24,19 @@ def measurements(
     sequence: SequenceModel,
     evidence: HopEvidence,
     vision: CoEvidenceChannel | None,
-    sides: StreetSides | None = None,
+    street: StreetListener | None = None,
 ) -> Iterator[Measurement]:
-    """Yield one measurement a hop, as the acoustic adapter makes them of the sound."""
+    """Yield one measurement a hop, as the acoustic adapter makes them of the sound.
+
+    `street` tells the sides; where whoever filters tells it who came, it learns on the way.
+    """
     hops, signature, groups = heard.hops, SiteSignature(model), sequence.posterior(evidence).groups
-    if sides is not None:
-        groups = sides.turned(groups, hops.feature)
     for i in range(len(hops)):
-        reading = SequenceReading(groups[i], sequence.share, sequence.margin_s, sequence.alarm)
+        if street is not None and i + 1 >= LEAST_HOPS:
+            told = street.turned(groups[i], hops.feature[i])
+        else:
+            told = groups[i]
+        reading = SequenceReading(told, sequence.share, sequence.margin_s, sequence.alarm)
         measurement = Measurement(
             stamp_ns=nanoseconds(float(hops.time_s[i])),
             signature=signature.evidence(hops.feature[i]),

@@ -7,7 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from worldstate.abduction.sequence.street_sides import StreetSides, arrival_pattern, somebody_comes
+from worldstate.abduction.sequence.street_hearing import StreetListener
+from worldstate.abduction.sequence.street_sides import arrival_pattern, somebody_comes
+from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
@@ -41,24 +43,27 @@ def passed_stream(
     alpha: float = 0.02,
     *,
     known_place: bool = False,
+    learns: bool = True,
 ) -> PassedStream:
     """Return a stream with what the filter believed at every hop; `seed` draws the camera's misses.
 
-    Where the place is known, the filter has its corners and lanes as a context file would say them.
+    Where the place is known, the filter has its corners and lanes as a context file would say them. Unless
+    told not to, it learns what either arm sounds like from whoever comes into view.
 
     Raises
     ------
     InvalidArgumentError
         If the model has no sequence, as `commission` makes one.
     """
-    heard, measured = stream_measurements(path, model, camera, seed)
+    street = street_listener(model.domain, None, None) if learns else None
+    heard, measured = stream_measurements(path, model, camera, seed, street)
     context = known_context(heard.site) if known_place else Context()
     world = WorldFilter(context, model.policies.for_alpha(alpha))
-    return PassedStream(heard, stream_truth(heard), followed(world, measured))
+    return PassedStream(heard, stream_truth(heard), followed(world, measured, street))
 
 
 def stream_measurements(
-    path: Path, model: Model, camera: CameraKind, seed: int, sides: StreetSides | None = None
+    path: Path, model: Model, camera: CameraKind, seed: int, street: StreetListener | None = None
 ) -> tuple[HeardStream, Iterator[Measurement]]:
     """Return a stream with what microphones and camera measure of it, hop by hop."""
     windows, sequence = parts_of(model)
@@ -72,7 +77,7 @@ def stream_measurements(
             detections = with_mover(detections, heard)
         vision = VisionQuery(PinholeCamera(), detections, settings=VisionSettings(keep=boxes))
     evidence = stream_evidence(windows, heard)
-    return heard, measurements(heard, windows, sequence, evidence, vision, sides)
+    return heard, measurements(heard, windows, sequence, evidence, vision, street)
 
 
 def watched_stream(path: Path, seed: int, model: Model) -> WatchedRecording:

@@ -1,5 +1,6 @@
 """What passes tell of how either arm sounds: against another discriminant, and where it may not speak."""
 
+import json
 import logging
 from dataclasses import replace
 
@@ -10,14 +11,16 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
+from worldstate.abduction.sequence.street_hearing import StreetHearing, StreetListener
 from worldstate.abduction.sequence.street_sides import SECTORS, StreetSides, arrival_pattern
-from worldstate.adapters.acoustic_sequence import sides_of
+from worldstate.adapters.acoustic_sequence import street_listener
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listen import open_source
+from worldstate.adapters.listen import ListenSettings, listen_steps, open_source
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import decode, encode
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, forgotten, with_pass
-from worldstate.smoothing.side_patterns import PassSound, SidePatterns
 
 OTHER = GROUPS.index("other")
 SLOPE = np.linspace(1.0, -1.0, SECTORS)
@@ -70,13 +73,6 @@ def test_whether_anybody_comes_stays_and_only_the_side_moves(seed: int) -> None:
     np.testing.assert_allclose(odds(turned) - odds(groups), np.stack([told, -told], axis=1), atol=1e-6)
 
 
-def test_a_window_without_sound_somewhere_says_nothing():
-    sides = learned(passes_of(np.random.default_rng(1), 3)).sides()
-    groups = np.full((1, 2, len(GROUPS)), 1 / len(GROUPS))
-    silent = np.where(np.arange(60) == 7, 0.0, 1.0 + np.arange(60))[None]
-    np.testing.assert_allclose(sides.turned(groups, silent), groups, atol=1e-9)
-
-
 def test_one_arm_alone_tells_no_side_and_more_passes_tell_more():
     passes = passes_of(np.random.default_rng(2), 8)
     assert learned([one for one in passes if one[0] == "left"]).sides() is None
@@ -97,15 +93,66 @@ def test_another_array_begins_anew_and_its_model_leaves_it_out(caplog):
     arm, sound = passes_of(np.random.default_rng(5), 1)[0]
     again = known.with_pass(arm, PassSound(sound.patterns, sound.weights, "bumper"))
     assert again.weights == (1.0, 0.0)
+    domain = read_model(None).domain
     with caplog.at_level(logging.WARNING):
-        assert sides_of(known.sides(), read_model(None)) is None
+        assert street_listener(domain, known, None).hearing.known == SidePatterns(heard_with(domain))
     assert "another array (roof)" in caplog.text
+    mine = replace(known, heard_by=heard_with(domain))
+    assert street_listener(domain, mine, None).hearing.known == mine
 
 
-def test_the_models_own_array_hears_with_them(approach):
-    known = learned(passes_of(np.random.default_rng(4), 3)).sides()
-    mine = replace(known, heard_by=heard_with(read_model(None).domain))
-    assert open_source(approach.folder, sides=mine).reader().sides is mine
+def heard_hop(rng: np.random.Generator, slope: float) -> tuple[np.ndarray, np.ndarray]:
+    """Somebody comes, and it is not known from where; loud on the left or on the right."""
+    groups = np.zeros((2, len(GROUPS)))
+    groups[:, 3], groups[:, OTHER], groups[:, -1] = 0.4, 0.4, 0.2
+    return groups, np.exp(np.repeat(slope * SLOPE, 5) + rng.normal(0.0, 0.3, 60))
+
+
+def told_of(listener: StreetListener, rng: np.random.Generator, slope: float, hops: int = 40) -> float:
+    """The chance that somebody comes from the left, by the last of some hops."""
+    for _ in range(hops):
+        groups = listener.turned(*heard_hop(rng, slope))
+    return float(groups[0, 3])
+
+
+def test_who_comes_into_view_teaches_the_side_and_a_checkpoint_goes_on_to_the_bit():
+    rng = np.random.default_rng(8)
+    listener = StreetListener(StreetHearing(SidePatterns("roof")))
+    for arm, slope in (("left", 0.5), ("right", -0.5)) * 3:
+        told_of(listener, rng, slope)
+        listener.passed(arm)
+    assert told_of(listener, rng, 0.5) > 0.6
+    assert told_of(listener, rng, -0.5) < 0.2
+    written = json.dumps(encode(listener.hearing), allow_nan=False)
+    again = StreetListener(decode(StreetHearing, json.loads(written), "street"))
+    for arm in ("left", "right"):
+        groups, feature = heard_hop(rng, 0.5)
+        np.testing.assert_array_equal(listener.turned(groups, feature), again.turned(groups, feature))
+        listener.passed(arm)
+        again.passed(arm)
+    assert listener.hearing.known == again.hearing.known
+
+
+def test_in_the_company_of_the_other_arm_nobody_knows_whose_sound_it_is():
+    rng = np.random.default_rng(9)
+    listener = StreetListener(StreetHearing(SidePatterns("roof")))
+    told_of(listener, rng, 0.5)
+    listener.passed("left")
+    told_of(listener, rng, 0.5, hops=10)
+    before = listener.hearing.known
+    listener.passed("right")
+    assert listener.hearing.known == before
+    listener.interrupt()
+    assert listener.hearing.hops == 0
+    listener.passed("right")
+    assert listener.hearing.known == before
+
+
+@pytest.mark.parametrize("adapts", [True, False])
+def test_a_hand_over_is_a_lesson(adapts, approach):
+    settings = ListenSettings(site_adaptation=adapts)
+    *_, last = listen_steps(open_source(approach.folder, settings=settings))
+    assert (sum(last.street.known.weights) > 0.0) == adapts
 
 
 def test_a_street_keeps_them_and_forgets_slowly():

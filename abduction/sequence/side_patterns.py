@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.abduction.sequence.street_sides import SECTORS, StreetSides
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
+
+from .street_sides import SECTORS, StreetSides
 
 # Of 0, .3, .5 and 1 for the doubt, ten passes of exam seeds 1 and 2 took the side from right in .838 of the
 # hops to .859, .878, .876 and .877 (docs/street.md).
