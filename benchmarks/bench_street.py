@@ -36,7 +36,7 @@ from worldstate.operations.commissioning.plan import junction_named
 from worldstate.operations.commissioning.stream_exam import alarm_outcomes, approaches
 from worldstate.operations.commissioning.stream_labels import stream_truth
 from worldstate.operations.labelling.box_tracks import box_tracks
-from worldstate.operations.labelling.heard_passes import heard_passes
+from worldstate.operations.labelling.hidden_times import with_hidden_times
 from worldstate.operations.labelling.street_passes import WatchedRecording, seen_edge, streets_after
 from worldstate.operations.recordings.advisories import rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
@@ -178,7 +178,7 @@ def filtered(path: Path, passes: int, window_s: list[float]) -> dict[str, object
 
 def rates_of(recording: WatchedRecording, one: FollowedStream) -> dict[str, object]:
     """Rates of reveal and departure of either arm, each with its interval, passes and seconds."""
-    passes = heard_passes(recording.passes, zip(one.time_s.tolist(), one.entities, strict=True))
+    passes = with_hidden_times(recording.passes, zip(one.time_s.tolist(), one.entities, strict=True))
     *_, street = streets_after(LearnedStreet(), replace(recording, passes=passes))
     return {
         f"{arm.direction} {name}": [rate.mean_hz(hz), rate.interval_hz(hz), rate.count, rate.exposure_s]

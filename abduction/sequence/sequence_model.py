@@ -32,10 +32,6 @@ STATED = COMING_S.index(LONGEST_S) + 1  # So many groups
 _HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
 _LEVELS = np.array([[0.05], [0.95]])
 SMOOTHED_HOPS, HELD_HOPS = 3, 10
-# Log-odds of somebody on this side against somebody on the other side alone from which on a side is named
-# beside a likelier one. Of the singles of exam seed 1 the other side was named in .36 without it, and both of
-# two in .84; from 0, .2, .4, .6 nats on in .35, .33, .30, .28 and in .84, .84, .81, .77.
-BESIDE_NATS = 0.5
 _OTHER = GROUPS.index("other")
 _SMALLEST = 1e-9
 
@@ -94,9 +90,9 @@ def named_sides(
     r"""Return which sides an alarm may name: the likelier one; the other one if somebody comes there, too.
 
     Where it is not known from which side one vehicle comes, both are likely; that two come is told by how
-    rarely the other one is believed to come alone,
+    rarely the other one is believed to come alone: beside the likelier side one is named where
 
-    .. math:: \log P(\text{comes here}) - \log P(\text{comes on the other side, not here}).
+    .. math:: P(\text{comes here}) > P(\text{comes on the other side, not here}).
 
     Shapes: log_odds (n, 2), groups (n, 2, groups).
 
@@ -109,7 +105,7 @@ def named_sides(
     """
     here, elsewhere = groups[..., : len(COMING_S)].sum(axis=-1), groups[..., _OTHER]
     likelier = log_odds >= log_odds.max(axis=-1, keepdims=True)
-    return np.asarray(likelier | (here >= np.exp(BESIDE_NATS + learned_nats) * elsewhere))
+    return np.asarray(likelier | (here > np.exp(learned_nats) * elsewhere))
 
 
 def soon_log_odds(posterior: SequencePosterior) -> FloatArray:

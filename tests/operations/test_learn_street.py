@@ -12,7 +12,7 @@ from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, SchemaVersionError
 from worldstate.ground.values import nanoseconds
-from worldstate.operations.labelling.heard_passes import heard_passes
+from worldstate.operations.labelling.hidden_times import with_hidden_times
 from worldstate.operations.labelling.street_file import read_street, write_street
 from worldstate.operations.labelling.street_passes import looks_at, streets_after, watched_recording
 from worldstate.operations.labelling.street_sound import HeardStreet
@@ -85,7 +85,7 @@ def test_who_was_heard_before_was_hidden_since_the_filter_believed_it(recording)
     first, second = sorted(recording.passes, key=lambda one: one.t0.time_s)[:2]
     times_s = np.arange(0.0, second.t0.time_s + 1.0, 0.1)
     onset_s = first.t0.time_s - 2.0
-    passes = heard_passes(recording.passes, ((at_s, _hidden(at_s, onset_s)) for at_s in times_s))
+    passes = with_hidden_times(recording.passes, ((at_s, _hidden(at_s, onset_s)) for at_s in times_s))
     told = {one.t0.time_s: one.heard_s for one in passes}
     assert told[first.t0.time_s] == pytest.approx(onset_s)
     assert told[second.t0.time_s] is None

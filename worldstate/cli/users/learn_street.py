@@ -121,12 +121,12 @@ def _recording(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     """Return the passes of a recording, with the times heard where snapshots of it are given."""
     from dataclasses import replace
 
-    from worldstate.operations.labelling.heard_passes import heard_passes
+    from worldstate.operations.labelling.hidden_times import with_hidden_times
 
     seen = _seen(arguments, path)
     if arguments.states is None:
         return seen
-    return replace(seen, passes=heard_passes(seen.passes, _snapshots(arguments.states)))
+    return replace(seen, passes=with_hidden_times(seen.passes, _snapshots(arguments.states)))
 
 
 def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":

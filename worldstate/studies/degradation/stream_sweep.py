@@ -34,7 +34,7 @@ from .conditions import CLEAN, LENS, OFF, RAIN, ROOF, Condition
 from .rain import RAIN_DB, level_rms, rained
 
 # Changes whenever the same stream would give other advisories.
-VERSION = 2
+VERSION = 3
 # Half of the way and all of it for the camera; of the rain the heaviest, as each level is heard anew.
 STATES = (
     Condition(CLEAN),

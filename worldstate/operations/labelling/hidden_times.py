@@ -16,7 +16,7 @@ _EXISTS = 0.5  # Likelier than not: a birth is no more than that
 _BEFORE_S = 0.2
 
 
-def heard_passes(
+def with_hidden_times(
     passes: Sequence[PassLabel], snapshots: Iterable[tuple[float, Sequence[Entity]]]
 ) -> list[PassLabel]:
     """Return the passes with the time since which an entity that existed at T0 was believed on their arm.
