@@ -27,7 +27,7 @@ _LOG = logging.getLogger(__name__)
 def sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:
     """Return the sequence model of a file where it was made for what is heard, else why it is not used."""
     if model.sequence is None:
-        return NotUsable("the model states no times: `worldstate commission` makes one that does")
+        return NotUsable("the model states no times: `worldstate model make` makes one that does")
     if uncalibrated:
         return NotUsable("uncalibrated: times are stated of the array that the model was made for")
     if not model.provenance.fit_for_use:

@@ -368,7 +368,7 @@ def open_source(
     camera : path or PinholeCamera, optional
         What took the images, as `read_camera` reads it; OVAD's camera where not given.
     miss_rates : path or MissRates, optional
-        What `worldstate measure-absence` wrote. Where it holds the camera's scale of health and the recording
+        What `worldstate model detector` wrote. Where it holds the camera's scale of health and the recording
         folder has a video, the degradation is read from that.
     model : path or Model, optional
         Model; where not given, of the two that ship that for a standing or for a moving ego, as the data set

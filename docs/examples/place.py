@@ -1,11 +1,11 @@
 """A place behind the corner, for known walls and array: python docs/examples/place.py."""
 
 import numpy as np
+from worldstate_lab.places.place_filter import PlaceFilter
+from worldstate_lab.places.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls
 
 from worldstate import WorldFilter, WorldState
-from worldstate.adapters.place.place_filter import PlaceFilter
-from worldstate.adapters.place.place_measurements import PlaceMeasurements, SpatialSpectrum
-from worldstate.adapters.place.spectrum_model import SpectrumModel, StreetWalls
 from worldstate.frontend import MicrophoneArray
 
 AZIMUTHS = np.radians(np.linspace(90.0, -90.0, 61))

@@ -6,8 +6,8 @@ from tempfile import TemporaryDirectory
 from tutorial_options import tutorial_options
 
 from worldstate import WorldState, listen, open_source
-from worldstate.adapters.simulation import DatasetSettings, write_dataset
 from worldstate.operations.figure_style import BLUE, RED, figure_file
+from worldstate.simulation import DatasetSettings, write_dataset
 
 COLOURS = {"left": BLUE, "right": RED}
 

@@ -7,13 +7,13 @@ from tutorial_options import tutorial_options
 
 from worldstate import MicrophoneArray
 from worldstate.adapters import save_model
-from worldstate.operations.commissioning.commission import commission, exam_of
-from worldstate.operations.commissioning.exam_figure import write_exam_figure
-from worldstate.operations.commissioning.exam_report import exam_figures
-from worldstate.operations.commissioning.plan import CommissionSettings, quick_settings
+from worldstate.commissioning.commission import commission, exam_of
+from worldstate.commissioning.exam_figure import write_exam_figure
+from worldstate.commissioning.exam_report import exam_figures
+from worldstate.commissioning.plan import CommissionSettings, quick_settings
 
 CORNERS = [(x, y, 0.0) for x in (0.1, -0.1) for y in (0.1, -0.1)]
-# The whole plan for 4 microphones is: worldstate commission --array mics.csv --out my_model.json --onsets 20
+# The whole plan for 4 microphones is: worldstate model make --array mics.csv --out my_model.json --onsets 20
 BUDGET = CommissionSettings(onsets_per_hour=20.0)
 
 

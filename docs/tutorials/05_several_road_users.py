@@ -9,8 +9,8 @@ import numpy as np
 from tutorial_options import tutorial_options
 
 from worldstate import listen
-from worldstate.adapters.simulation import VehicleSettings, draw_settings, simulate_recording, write_recording
 from worldstate.operations.figure_style import BLUE, GREEN, RED, YELLOW, figure_file
+from worldstate.simulation import VehicleSettings, draw_settings, simulate_recording, write_recording
 
 COLOURS = {"hidden": YELLOW, "visible": GREEN, "emerged": BLUE}
 

@@ -8,8 +8,8 @@ import numpy as np
 from tutorial_options import tutorial_options
 
 from worldstate import listen
-from worldstate.adapters.simulation import draw_settings, simulate_recording, write_recording
 from worldstate.operations.figure_style import BLUE, RED, figure_file
+from worldstate.simulation import draw_settings, simulate_recording, write_recording
 
 
 def main(out: Path, size: str = "full") -> None:

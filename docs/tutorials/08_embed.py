@@ -8,8 +8,8 @@ from tutorial_options import tutorial_options
 
 from worldstate import Measurement, WorldState, open_source
 from worldstate.adapters import Checkpoint, measure_steps, read_checkpoint, save_checkpoint
-from worldstate.adapters.simulation import DatasetSettings, write_dataset
 from worldstate.operations.figure_style import figure_file
+from worldstate.simulation import DatasetSettings, write_dataset
 
 
 def deliveries(measured: list[Measurement], rng: np.random.Generator) -> list[tuple[float, Measurement]]:

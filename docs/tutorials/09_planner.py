@@ -5,11 +5,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from tutorial_options import tutorial_options
+from worldstate_lab.planner.ego_vehicle import EgoVehicle
 
 from worldstate import WorldState, listen, open_source
-from worldstate.adapters.simulation import DatasetSettings, write_dataset
 from worldstate.operations.figure_style import BLUE, GREEN, RED, figure_file
-from worldstate.studies.planner.ego_vehicle import EgoVehicle
+from worldstate.simulation import DatasetSettings, write_dataset
 
 EGO, HOP_S, BEGINS_M = EgoVehicle(), 0.1, 20.0
 # Chance from which on a vehicle is assumed; .01 is a choice: `evaluate-planner` sets it on streams.

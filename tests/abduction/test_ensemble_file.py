@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worldstate_lab.features.held_out import predict_held_out
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.datasets.feature_table import FeatureTable
@@ -19,7 +20,6 @@ from worldstate.adapters.files.model_file import (
 )
 from worldstate.ground.errors import InputFileError, WorldstateError
 from worldstate.operations.training.training import TrainingSettings, train_model
-from worldstate.studies.features.held_out import predict_held_out
 
 WRONG = [None, True, "text", [], {}, [None], -1.5, 10**400, float("nan"), float("inf"), "1.0", ["1.0"]]
 

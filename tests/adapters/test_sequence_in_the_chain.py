@@ -23,10 +23,10 @@ from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.adapters.listen import ListenSettings, Step, listen_steps, open_source
+from worldstate.commissioning.commission import stream_evidence
+from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.frontend.approach.looming import Looming
 from worldstate.ground.values import NotUsable
-from worldstate.operations.commissioning.commission import stream_evidence
-from worldstate.operations.commissioning.heard_stream import HeardStream
 from worldstate.operations.recordings.hop_table import HopTable
 
 RATE_HZ = 6000

@@ -1,4 +1,4 @@
-"""`worldstate commission` from an array file to a model that can be read, and its exam."""
+"""`worldstate model make` from an array file to a model that can be read, and its exam."""
 
 import json
 from pathlib import Path

@@ -17,10 +17,10 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, write_featu
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.adapters.simulation.dataset.dataset import LogRow, write_log
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable, save_tables
+from worldstate.simulation.dataset.dataset import LogRow, write_log
 from worldstate.state import WorldState
 
 COMMAND = (sys.executable, "-m", "worldstate.cli.main")

@@ -26,8 +26,8 @@ from worldstate.adapters.listen import ListenSettings, open_source
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound
 from worldstate.adapters.live.playback import Playback
+from worldstate.cli.common.live_view import view_of
 from worldstate.cli.main import main
-from worldstate.cli.vehicle.live_view import view_of
 from worldstate.state import WorldState
 
 RATE = 8_000
@@ -75,7 +75,7 @@ def test_kept_sound_never_replaces_what_is_played(street, capsys):
 
 
 def test_losses_are_said_when_they_happen(street, capsys, monkeypatch):
-    slow = "worldstate.cli.vehicle.live_view.view_of"
+    slow = "worldstate.cli.common.live_view.view_of"
     monkeypatch.setattr(slow, lambda live: time.sleep(0.05) or view_of(live))
     assert main(command(street, "--speed", 100, "--duration", 8, "--view", "--json")) == 0
     said = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Achieved variance beside its bound: the numbers behind the figures of `worldstate bounds`."""
+"""Achieved variance beside its bound: the numbers behind the figures of `worldstate array bounds`."""
 
 import json
 

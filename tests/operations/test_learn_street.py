@@ -1,4 +1,4 @@
-"""`worldstate learn-street`: boxes of a camera in, a street that `run` takes out."""
+"""`worldstate street learn`: boxes of a camera in, a street that `run` takes out."""
 
 import json
 import math

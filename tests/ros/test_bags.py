@@ -364,7 +364,7 @@ def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
     assert main(["replay", str(states), "--mcap", str(log)]) == 0
     capsys.readouterr()
     assert main(["run", str(log)]) == 2
-    assert "`worldstate replay` reads" in capsys.readouterr().err
+    assert "`worldstate log replay` reads" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

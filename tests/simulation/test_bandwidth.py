@@ -14,31 +14,31 @@ from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.adapters.files.acoustic_domain import check_tables, feature_order
 from worldstate.adapters.files.model_file import load_model
 from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
-from worldstate.adapters.simulation.scene.driving import trajectories
-from worldstate.adapters.simulation.scene.junction import SITES
-from worldstate.adapters.simulation.scene.octave_bands import REFERENCE_PA
-from worldstate.adapters.simulation.scene.settings import (
-    SAMPLE_RATE_HZ,
-    SimulationSettings,
-    draw_settings,
-    rate_for,
-)
-from worldstate.adapters.simulation.scene.vehicle import LIGHT, SOURCE_HEIGHT_M, SourceSignal, drive, emit
-from worldstate.adapters.simulation.sound.background import add_background
-from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.propagation import add_sources
-from worldstate.adapters.simulation.sound.receiver import Receiver, standing_m
-from worldstate.adapters.simulation.sound.scatter import scattering
-from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
-from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.adapters.simulation.sound.surroundings import Surroundings
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import feature_nfft, published_feature
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
+from worldstate.simulation.scene.driving import trajectories
+from worldstate.simulation.scene.junction import SITES
+from worldstate.simulation.scene.octave_bands import REFERENCE_PA
+from worldstate.simulation.scene.settings import (
+    SAMPLE_RATE_HZ,
+    SimulationSettings,
+    draw_settings,
+    rate_for,
+)
+from worldstate.simulation.scene.vehicle import LIGHT, SOURCE_HEIGHT_M, SourceSignal, drive, emit
+from worldstate.simulation.sound.background import add_background
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.propagation import add_sources
+from worldstate.simulation.sound.receiver import Receiver, standing_m
+from worldstate.simulation.sound.scatter import scattering
+from worldstate.simulation.sound.scattered_sound import add_scattered
+from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.surroundings import Surroundings
 
 FACTOR, ARRAY = 8, ovad_array()
 FEWER = MicrophoneArray(ARRAY.positions_m[::4])

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from scipy.signal import coherence, stft
 
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.simulation import (
+from worldstate.cli.main import main
+from worldstate.cli.sim import simulate as cli
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.direction.srp import srp_phat
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation import (
     SITES,
     SOUNDS,
     SimulationSettings,
@@ -21,22 +27,16 @@ from worldstate.adapters.simulation import (
     simulate_recording,
     site,
 )
-from worldstate.adapters.simulation.emitters.emitter import emitted
-from worldstate.adapters.simulation.emitters.placed_sound import add_signal, add_sound, directivity
-from worldstate.adapters.simulation.scene.drawn_sounds import with_sounds
-from worldstate.adapters.simulation.scene.kinds import vehicle_kind
-from worldstate.adapters.simulation.scene.octave_bands import split_octaves
-from worldstate.adapters.simulation.scene.sound_kinds import SIGNALS, sound_kind
-from worldstate.adapters.simulation.scene.vehicle import drive
-from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.cli.main import main
-from worldstate.cli.users import simulate as cli
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.srp import srp_phat
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation.emitters.emitter import emitted
+from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, directivity
+from worldstate.simulation.scene.drawn_sounds import with_sounds
+from worldstate.simulation.scene.kinds import vehicle_kind
+from worldstate.simulation.scene.octave_bands import split_octaves
+from worldstate.simulation.scene.sound_kinds import SIGNALS, sound_kind
+from worldstate.simulation.scene.vehicle import drive
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import StaticSources
 
 FS = 8_000.0
 OPEN = Site("Open1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, in_the_open=True)

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.simulation import (
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation import (
     PLACES,
     SITES,
     DatasetSettings,
@@ -22,11 +24,9 @@ from worldstate.adapters.simulation import (
     simulate_recording,
     site,
 )
-from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
-from worldstate.adapters.simulation.dataset.truth import describe
-from worldstate.adapters.simulation.scene.driving import trajectories
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation.camera.simulated_detector import line_of_sight
+from worldstate.simulation.dataset.truth import describe
+from worldstate.simulation.scene.driving import trajectories
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
 CAMERA = PinholeCamera()

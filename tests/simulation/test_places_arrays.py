@@ -9,12 +9,12 @@ import pytest
 import soundfile
 
 from worldstate.adapters.files.array_file import read_array
-from worldstate.adapters.simulation import SimulationSettings, place, preset, simulate_recording
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation import SimulationSettings, place, preset, simulate_recording
 
 FS, NFFT = 12_000.0, 128
 GRID = np.stack(np.meshgrid(*[np.arange(4.0)] * 2), axis=-1).reshape(-1, 2)

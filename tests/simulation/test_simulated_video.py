@@ -15,7 +15,9 @@ from worldstate.adapters.camera.detector import overlaps
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.simulation import (
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
+from worldstate.simulation import (
     SITES,
     DatasetSettings,
     SimulationSettings,
@@ -24,18 +26,16 @@ from worldstate.adapters.simulation import (
     write_dataset,
     write_recording,
 )
-from worldstate.adapters.simulation.camera.rays import Panel, Patch, View, cast_panels, cast_solid
-from worldstate.adapters.simulation.camera.street_view import ROAD_Z_M, paint_street
-from worldstate.adapters.simulation.camera.vehicle_view import Car, add_car
-from worldstate.adapters.simulation.dataset.rendered_video import (
+from worldstate.simulation.camera.rays import Panel, Patch, View, cast_panels, cast_solid
+from worldstate.simulation.camera.street_view import ROAD_Z_M, paint_street
+from worldstate.simulation.camera.vehicle_view import Car, add_car
+from worldstate.simulation.dataset.rendered_video import (
     camera_frames,
     parked_lane_m,
     parked_middle_m,
     write_video,
 )
-from worldstate.adapters.simulation.scene.vehicle import HEIGHT_M, LENGTH_M, WIDTH_M
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
+from worldstate.simulation.scene.vehicle import HEIGHT_M, LENGTH_M, WIDTH_M
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
 SMALL = PinholeCamera(width_px=320, height_px=201)
@@ -204,7 +204,7 @@ def test_same_seed_same_frames_another_seed_another_noise():
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(SITES))
 def test_the_parked_car_is_read_back_from_its_boxes(seed, name):
-    from worldstate.adapters.simulation.camera.simulated_detector import park
+    from worldstate.simulation.camera.simulated_detector import park
 
     rng = np.random.default_rng(seed)
     plan = site(name)

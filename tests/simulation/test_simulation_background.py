@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.special
+from worldstate_lab.streets.simulated_windows import RATE_HZ
 
-from worldstate.adapters.simulation import preset, site
-from worldstate.adapters.simulation.scene.ambience import site_ambience
-from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
-from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.scene.places import place
-from worldstate.adapters.simulation.scene.vehicle import Trajectory, drive, load_db
-from worldstate.adapters.simulation.sound.background import add_background, opening_images
-from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
-from worldstate.adapters.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
-from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.adapters.simulation.sound.static_field import StaticSources, plane_wave_delays, unit_vectors
-from worldstate.adapters.simulation.sound.vehicle_sound import add_vehicle
-from worldstate.adapters.simulation.sound.wave_field import BlockGrid, WaveField
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
-from worldstate.studies.streets.simulated_windows import RATE_HZ
+from worldstate.simulation import preset, site
+from worldstate.simulation.scene.ambience import site_ambience
+from worldstate.simulation.scene.ego_motion import EgoMotion
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.places import place
+from worldstate.simulation.scene.vehicle import Trajectory, drive, load_db
+from worldstate.simulation.sound.background import add_background, opening_images
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
+from worldstate.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import StaticSources, plane_wave_delays, unit_vectors
+from worldstate.simulation.sound.vehicle_sound import add_vehicle
+from worldstate.simulation.sound.wave_field import BlockGrid, WaveField
 
 FS = 8000.0
 

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worldstate_lab.streets.simulated_windows import NFFT, RATE_HZ, simulated_windows
 
-from worldstate.adapters.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.studies.streets.simulated_windows import NFFT, RATE_HZ, simulated_windows
+from worldstate.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
 
 AZIMUTHS_RAD = np.radians(np.arange(-90.0, 91.0))
 BAND_HZ = (300.0, 1500.0)

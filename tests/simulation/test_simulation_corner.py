@@ -5,17 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.adapters.simulation.scene.junction import SITES, Site, site
-from worldstate.adapters.simulation.scene.octave_bands import OCTAVES_HZ
-from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
-from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.diffraction import EXTERIOR_RAD, SPEED_OF_SOUND_MPS, edge_gain
-from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.paths import through_mouth, trace_paths
-from worldstate.adapters.simulation.sound.propagation import add_sources
-from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.adapters.simulation.sound.surroundings import Surroundings
+from worldstate.simulation.scene.junction import SITES, Site, site
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
+from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, SPEED_OF_SOUND_MPS, edge_gain
+from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.paths import through_mouth, trace_paths
+from worldstate.simulation.sound.propagation import add_sources
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.surroundings import Surroundings
 
 C = SPEED_OF_SOUND_MPS
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from worldstate.adapters.simulation import (
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.simulation import (
     KINDS,
     MOVING_SITES,
     PLACES,
@@ -20,20 +21,19 @@ from worldstate.adapters.simulation import (
     simulate_recording,
     site,
 )
-from worldstate.adapters.simulation.scene.driving import trajectories
-from worldstate.adapters.simulation.scene.ego_motion import EgoMotion
-from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.sound import scattered_sound
-from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
-from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.propagation import add_sources
-from worldstate.adapters.simulation.sound.receiver import Receiver, add_turning
-from worldstate.adapters.simulation.sound.scatter import scattering
-from worldstate.adapters.simulation.sound.scattered_sound import add_scattered
-from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.adapters.simulation.sound.surroundings import Surroundings
-from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.simulation.scene.driving import trajectories
+from worldstate.simulation.scene.ego_motion import EgoMotion
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.sound import scattered_sound
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
+from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.propagation import add_sources
+from worldstate.simulation.sound.receiver import Receiver, add_turning
+from worldstate.simulation.sound.scatter import scattering
+from worldstate.simulation.sound.scattered_sound import add_scattered
+from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.surroundings import Surroundings
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS

@@ -5,22 +5,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.adapters.simulation.scene.junction import Site
-from worldstate.adapters.simulation.scene.octave_bands import octave_masks, split_octaves
-from worldstate.adapters.simulation.scene.vehicle import SOURCE_HEIGHT_M
-from worldstate.adapters.simulation.sound import propagation
-from worldstate.adapters.simulation.sound.delay import (
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.octave_bands import octave_masks, split_octaves
+from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
+from worldstate.simulation.sound import propagation
+from worldstate.simulation.sound.delay import (
     KNOT_SAMPLES,
     OVERSAMPLING,
     Table,
     add_delayed,
     emission_times,
 )
-from worldstate.adapters.simulation.sound.diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
-from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.adapters.simulation.sound.surroundings import Surroundings
+from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
+from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.surroundings import Surroundings
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS

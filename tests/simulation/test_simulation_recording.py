@@ -13,7 +13,12 @@ from hypothesis import strategies as st
 from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import OvadDataset
-from worldstate.adapters.simulation import (
+from worldstate.cli.main import main
+from worldstate.cli.sim import simulate as cli
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.direction.feature import published_feature
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.simulation import (
     KINDS,
     PLACES,
     SITES,
@@ -27,22 +32,17 @@ from worldstate.adapters.simulation import (
     write_dataset,
     write_recording,
 )
-from worldstate.adapters.simulation.camera.simulated_detector import line_of_sight
-from worldstate.adapters.simulation.scene.presets import DEFAULT_PRESET, PRESETS
-from worldstate.adapters.simulation.scene.vehicle import drive, propulsion_level_db, rolling_level_db
-from worldstate.adapters.simulation.sound.background import far_passages_s
-from worldstate.adapters.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.adapters.simulation.sound.emission import Emission, MovingSource
-from worldstate.adapters.simulation.sound.paths import trace_paths
-from worldstate.adapters.simulation.sound.propagation import add_sources
-from worldstate.adapters.simulation.sound.receiver import Receiver
-from worldstate.adapters.simulation.sound.static_field import StaticSources
-from worldstate.adapters.simulation.sound.surroundings import Surroundings
-from worldstate.cli.main import main
-from worldstate.cli.users import simulate as cli
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.direction.feature import published_feature
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.simulation.camera.simulated_detector import line_of_sight
+from worldstate.simulation.scene.presets import DEFAULT_PRESET, PRESETS
+from worldstate.simulation.scene.vehicle import drive, propulsion_level_db, rolling_level_db
+from worldstate.simulation.sound.background import far_passages_s
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.paths import trace_paths
+from worldstate.simulation.sound.propagation import add_sources
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.surroundings import Surroundings
 
 FS = 48_000.0
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])

@@ -13,19 +13,26 @@ import numpy as np
 import pytest
 import soundfile
 from scipy.signal import welch
+from worldstate_lab.trials.takes import find_takes
 
 from worldstate.adapters.datasets.array_choice import choose_array
 from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.simulation import SITES, preset, site
-from worldstate.adapters.simulation.scene.ambience import site_ambience
-from worldstate.adapters.simulation.scene.kinds import LIGHT
-from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
-from worldstate.adapters.simulation.stream.ambience import OVERLAP_S
-from worldstate.adapters.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
-from worldstate.adapters.simulation.stream.event_sound import event_sound, loudness_db
-from worldstate.adapters.simulation.stream.manoeuvres import MANOEUVRES, Driver
-from worldstate.adapters.simulation.stream.microphones import draw_microphones
-from worldstate.adapters.simulation.stream.rendering import (
+from worldstate.cli.main import main
+from worldstate.cli.sim import make
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import Float32Array
+from worldstate.operations.recordings.true_track import read_true_tracks
+from worldstate.simulation import SITES, preset, site
+from worldstate.simulation.scene.ambience import site_ambience
+from worldstate.simulation.scene.kinds import LIGHT
+from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.stream.ambience import OVERLAP_S
+from worldstate.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
+from worldstate.simulation.stream.event_sound import event_sound, loudness_db
+from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver
+from worldstate.simulation.stream.microphones import draw_microphones
+from worldstate.simulation.stream.rendering import (
     EVENT,
     StreamScene,
     pieces,
@@ -33,17 +40,10 @@ from worldstate.adapters.simulation.stream.rendering import (
     render_piece,
     row_times,
 )
-from worldstate.adapters.simulation.stream.settings import StreamSettings
-from worldstate.adapters.simulation.stream.sight import visible_s
-from worldstate.adapters.simulation.stream.traffic import TRAFFICS, traffic_named
-from worldstate.adapters.simulation.stream.writing import write_stream
-from worldstate.cli.main import main
-from worldstate.cli.users import simulate
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import Float32Array
-from worldstate.operations.recordings.true_track import read_true_tracks
-from worldstate.studies.trials.takes import find_takes
+from worldstate.simulation.stream.settings import StreamSettings
+from worldstate.simulation.stream.sight import visible_s
+from worldstate.simulation.stream.traffic import TRAFFICS, traffic_named
+from worldstate.simulation.stream.writing import write_stream
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
 # Nothing that swells or fades by itself: what is left is stationary.
@@ -203,8 +203,8 @@ def test_a_stream_on_disk_is_read_like_a_recording(
 def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert list(simulate.TRAFFICS) == list(TRAFFICS)
-    assert simulate.STREAM_SITES == SITES
+    assert list(make.TRAFFICS) == list(TRAFFICS)
+    assert make.STREAM_SITES == SITES
     refused = {
         "--minutes 1 --site DA1": "drives are heard",
         "--minutes 1 --static 2": "--static",

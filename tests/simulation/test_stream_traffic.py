@@ -10,30 +10,30 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.simulation import preset, site
-from worldstate.adapters.simulation.scene.kinds import LIGHT, vehicle_kind
-from worldstate.adapters.simulation.scene.places import place
-from worldstate.adapters.simulation.scene.route import along
-from worldstate.adapters.simulation.scene.sound_settings import SoundSettings
-from worldstate.adapters.simulation.stream.arrivals import (
+from worldstate.cli.sim.stream_figure import FLOW_COLOURS
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation import preset, site
+from worldstate.simulation.scene.kinds import LIGHT, vehicle_kind
+from worldstate.simulation.scene.places import place
+from worldstate.simulation.scene.route import along
+from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.stream.arrivals import (
     SoundEvent,
     VehicleEvent,
     draw_events,
     draw_sounds,
 )
-from worldstate.adapters.simulation.stream.manoeuvres import MANOEUVRES, Driver, emerges
-from worldstate.adapters.simulation.stream.motion import SpeedLimit, drive_along
-from worldstate.adapters.simulation.stream.settings import StreamSettings
-from worldstate.adapters.simulation.stream.sight import (
+from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, emerges
+from worldstate.simulation.stream.motion import SpeedLimit, drive_along
+from worldstate.simulation.stream.settings import StreamSettings
+from worldstate.simulation.stream.sight import (
     CLUTTER_IMAGES,
     CLUTTER_PER_HOUR,
     detected_frames,
     visible_s,
 )
-from worldstate.adapters.simulation.stream.traffic import FLOWS, HAZARDS, Traffic, traffic_named
-from worldstate.adapters.simulation.stream.truth import describe_events, vehicle_truth
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.recordings.stream_figure import FLOW_COLOURS
+from worldstate.simulation.stream.traffic import FLOWS, HAZARDS, Traffic, traffic_named
+from worldstate.simulation.stream.truth import describe_events, vehicle_truth
 
 NEVER_SEEN = {"turns_away", "parks", "far"}
 

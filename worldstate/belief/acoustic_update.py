@@ -6,11 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from worldstate.belief.kinematics.motion import (
+    MotionBelief,
+    log_azimuth_likelihood,
+    update_approach,
+    update_azimuth,
+)
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
 from .hidden_belief import HiddenBelief
-from .kinematics.motion import MotionBelief, log_azimuth_likelihood, update_approach, update_azimuth
 from .settings import FilterSettings
 from .track import Track, merged
 

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.belief.kinematics.cartesian import CartesianBelief
 
-from .kinematics.cartesian import CartesianBelief
 from .site_geometry import SideGeometry, SiteGeometry
 from .track import Track
 

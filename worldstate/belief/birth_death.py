@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
+from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 
 from .explanation import ExplanationBelief
 from .hidden_belief import HiddenBelief
-from .kinematics.polar import AZIMUTH, LOG_RANGE
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, heard_as
 

@@ -13,12 +13,11 @@ from typing import Annotated
 
 import numpy as np
 
+from worldstate.belief.kinematics.cartesian import arc
 from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.odometry import Odometry
-
-from .kinematics.cartesian import arc
 
 _ROW = Via(FloatArray, np.asarray, lambda row: row.reshape(3))
 _SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(3, 3))

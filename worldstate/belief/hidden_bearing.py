@@ -15,11 +15,11 @@ import math
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import COMING_S
+from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
-from .kinematics.motion import MotionBelief
-from .kinematics.polar import AZIMUTH, AZIMUTH_RATE
 from .site_geometry import SideGeometry
 
 # What is not known of v / d: within a factor of 1.2 (three points of a lognormal distribution with the

@@ -7,6 +7,14 @@ from operator import attrgetter
 import numpy as np
 
 from worldstate.abduction.road_users import UNKNOWN
+from worldstate.belief.kinematics.cartesian import (
+    CartesianBelief,
+    at_position,
+    full_measurement,
+    update_bearing,
+    update_position,
+)
+from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, wrap_angle
 from worldstate.measurement.position import Position, PositionScan, SearchedSector
@@ -14,14 +22,6 @@ from worldstate.measurement.position import Position, PositionScan, SearchedSect
 from .association import FORBIDDEN, emergence_density, joint_association
 from .existence import after_empty_look, after_sighting
 from .explanation import ExplanationBelief
-from .kinematics.cartesian import (
-    CartesianBelief,
-    at_position,
-    full_measurement,
-    update_bearing,
-    update_position,
-)
-from .kinematics.polar import AZIMUTH, LOG_RANGE
 from .site_geometry import SiteGeometry, normal_share
 from .track import Track, entity_id, follow_places, merged, relabelled
 from .vision_update import VisionUpdate, emerged_sides

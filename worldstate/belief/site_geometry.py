@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass, replace
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.measurement import CameraLook, Look
 from worldstate.measurement.sector import Sector
 
-from .kinematics.motion import MotionBelief
 from .settings import FilterSettings
 
 # Who comes along a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.

@@ -9,12 +9,12 @@ from uuid import UUID, uuid5
 import numpy as np
 
 from worldstate.abduction.road_users import ClassShares
+from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
+from worldstate.belief.kinematics.motion import MotionBelief, predict, relax
+from worldstate.belief.kinematics.polar import AZIMUTH_RATE
 from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
-from .kinematics.cartesian import CartesianBelief, polar_motion, predict_place
-from .kinematics.motion import MotionBelief, predict, relax
-from .kinematics.polar import AZIMUTH_RATE
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 

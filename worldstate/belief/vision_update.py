@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.belief.kinematics.cartesian import update_bearing
+from worldstate.belief.kinematics.motion import MotionBelief, update_azimuth
+from worldstate.belief.kinematics.polar import AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import CameraLook, Look, Measurement, Sighting
@@ -17,9 +20,6 @@ from worldstate.measurement.sector import Sector
 from .association import associated
 from .existence import after_empty_look, after_sighting
 from .explanation import ExplanationBelief
-from .kinematics.cartesian import update_bearing
-from .kinematics.motion import MotionBelief, update_azimuth
-from .kinematics.polar import AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, follow_places, merged, relabelled

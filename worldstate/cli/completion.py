@@ -42,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return the script."""
-    from worldstate.cli.main import build_parser
+    from .main import build_parser
 
     script = bash_script(build_parser())
     return CommandResult({"shell": arguments.shell, "script": script}, table={}, lines=[script])

@@ -15,6 +15,7 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
+from worldstate.core import step
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
@@ -24,7 +25,6 @@ from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
 from worldstate.state import Context, WorldState
 
-from . import step
 from .checkpoint import FilterRecord, LagRecord
 from .cue_builder import cues_of, hidden_risks
 from .entity_events import published

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import FloatArray
-
 from .errors import InvalidArgumentError
+from .typing import FloatArray
 
 
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:

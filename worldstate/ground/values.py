@@ -7,8 +7,8 @@ from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
+from .errors import InvalidArgumentError
+from .typing import FloatArray
 
 # A float stays a float, an array an array.
 AngleT = TypeVar("AngleT", float, FloatArray)

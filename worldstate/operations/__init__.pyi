@@ -1,6 +1,5 @@
 from .arrays.array_bounds import ArrayBounds as ArrayBounds
 from .arrays.array_bounds import array_bounds as array_bounds
-from .arrays.bench import run_bench as run_bench
 from .arrays.efficiency import Efficiency as Efficiency
 from .arrays.efficiency import measure_over_snr as measure_over_snr
 from .calibration.cueing_calibration import CueingCalibration as CueingCalibration

@@ -16,8 +16,8 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import Approach, Bearing
 from worldstate.measurement.position import Position
+from worldstate.smoothing import factors as f
 
-from . import factors as f
 from .geometry import moved, polar
 from .graph import FactorGraph, Refined
 from .observations import AngularHeight, EgoStep, Observation, PastEdge, Range, ReflectedBearing

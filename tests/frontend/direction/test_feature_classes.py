@@ -13,10 +13,10 @@ import soundfile
 from acoular_scene import RATE, pass_by, render
 
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.simulation import SITES, draw_settings, simulate_recording
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.frontend.stream import FrontEnd
+from worldstate.simulation import SITES, draw_settings, simulate_recording
 
 ROOF = roof_array_56()
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sklearn.covariance import OAS
 from sklearn.metrics import roc_auc_score
 
-from worldstate.adapters.simulation.sound.ego_sound import ENGINE_M, ego_noise, ego_sound
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
@@ -25,6 +24,7 @@ from worldstate.frontend.spectra.phat import whiten
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation.sound.ego_sound import ENGINE_M, ego_noise, ego_sound
 
 RATE, NFFT = 16_000, 256
 ROOF = MicrophoneArray(roof_array_56().positions_m[::4])
@@ -84,7 +84,7 @@ def test_levels_follow_the_speed_while_driving() -> None:
 def test_wind_knows_nothing_of_its_neighbour_and_the_vehicle_does(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = np.array([[0, 0.03, 1.7], [0, -0.03, 1.7]])
     both = ego_noise(pair, np.full(4 * RATE, 8.0), RATE, np.random.default_rng(4))
-    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._add_wind", lambda *_: None)
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._add_wind", lambda *_: None)
     vehicle = ego_noise(pair, np.full(4 * RATE, 8.0), RATE, np.random.default_rng(4))
     of_wind, of_vehicle = (
         scipy.signal.coherence(*sound.T, RATE, nperseg=1024)[1][20:60] for sound in (both - vehicle, vehicle)
@@ -95,13 +95,13 @@ def test_wind_knows_nothing_of_its_neighbour_and_the_vehicle_does(monkeypatch: p
 
 def test_the_engine_s_sound_arrives_when_geometry_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the engine, no wind, no road: two microphones, delay and level by hand."""
-    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._places", lambda: ENGINE_M[None])
-    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._add_wind", lambda *_: None)
-    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound.ROAD_REFLECTION", 0.0)
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._places", lambda: ENGINE_M[None])
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._add_wind", lambda *_: None)
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound.ROAD_REFLECTION", 0.0)
     monkeypatch.setattr(
-        "worldstate.adapters.simulation.sound.ego_sound._levels_db", lambda *_: [np.full((8, 9), 94.0)]
+        "worldstate.simulation.sound.ego_sound._levels_db", lambda *_: [np.full((8, 9), 94.0)]
     )
-    monkeypatch.setattr("worldstate.adapters.simulation.sound.ego_sound._line_shares", lambda: (0.0,))
+    monkeypatch.setattr("worldstate.simulation.sound.ego_sound._line_shares", lambda: (0.0,))
     pair = np.array([[0.0, 0.4, 1.4], [0.0, -0.1, 2.2]])
     sound = ego_noise(pair, np.full(9 * 1024, 5.0), 48_000.0, np.random.default_rng(5))
     edge = np.stack([np.full(1201, 0.4), np.linspace(-0.6, 0.6, 1201), np.full(1201, 1.35)], axis=1)

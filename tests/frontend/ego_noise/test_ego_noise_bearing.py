@@ -14,13 +14,13 @@ from worldstate.adapters.files.acoustic_domain import check_tables
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listen import ListenSettings, Source, listen_steps, measure_steps, open_source
-from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
-from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate.simulation.sound.ego_sound import ego_noise
 
 RATE, SECONDS, APPEARS_S = 16_000, 6.0, 4.5
 ARRAY = roof_array_56()

@@ -22,15 +22,15 @@ from worldstate.abduction.signature.site_estimate import SiteEstimateSettings
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.model_file import load_model
-from worldstate.adapters.simulation import SimulationSettings, draw_settings, simulate_recording
-from worldstate.adapters.simulation.dataset import recording
-from worldstate.adapters.simulation.dataset.recording import FULL_SCALE_PA
-from worldstate.adapters.simulation.scene.presets import Preset
-from worldstate.adapters.simulation.sound.ego_sound import ego_noise
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
+from worldstate.simulation import SimulationSettings, draw_settings, simulate_recording
+from worldstate.simulation.dataset import recording
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA
+from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.state import Context
 
 Sound = np.ndarray

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.adapters.simulation import draw_settings, simulate_recording
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
@@ -21,6 +20,7 @@ from worldstate.frontend.health.position_fit import position_scores, position_we
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.values import NotUsable
+from worldstate.simulation import draw_settings, simulate_recording
 
 RATE = 16_000
 ROOF = roof_array_56()

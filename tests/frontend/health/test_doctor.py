@@ -1,4 +1,4 @@
-"""`worldstate doctor` names exactly what is wrong; `run` refuses silent channels or leaves them out."""
+"""`worldstate array check` names exactly what is wrong; `run` refuses silent channels or leaves them out."""
 
 import json
 from collections.abc import Callable
@@ -10,10 +10,10 @@ import soundfile
 
 from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.simulation import draw_settings, simulate_recording
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.errors import InputFileError
+from worldstate.simulation import draw_settings, simulate_recording
 
 RATE = 47_998
 ROOF = roof_array_56()

@@ -16,10 +16,6 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.simulation import draw_settings, simulate_recording, site
-from worldstate.adapters.simulation.stream.settings import StreamSettings
-from worldstate.adapters.simulation.stream.traffic import traffic_named
-from worldstate.adapters.simulation.stream.writing import write_stream
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
@@ -28,6 +24,10 @@ from worldstate.frontend.health.channel_health import ArrayHealth, ChannelFault
 from worldstate.frontend.health.order_check import sharpness_gains
 from worldstate.frontend.stream import FrontEnd
 from worldstate.operations.recordings.channel_report import HealthLog
+from worldstate.simulation import draw_settings, simulate_recording, site
+from worldstate.simulation.stream.settings import StreamSettings
+from worldstate.simulation.stream.traffic import traffic_named
+from worldstate.simulation.stream.writing import write_stream
 
 RATE = 6000
 ARRAYS = {56 // step: MicrophoneArray(ovad_array().positions_m[::step]) for step in (2, 7)}

@@ -9,11 +9,12 @@ Subparsers = argparse._SubParsersAction  # argparse gives it no public name
 def add_command(subparsers: "Subparsers[argparse.ArgumentParser]", module: ModuleType) -> None:
     """Declare the command of a module, with --json.
 
-    Its documentation is "`worldstate NAME`: summary.", an empty line, and the description; it has `EXAMPLE`,
-    `add_options` and `run`.
+    Its documentation is "`worldstate [GROUP] NAME`: summary.", an empty line, and the description; it has
+    `EXAMPLE`, `add_options` and `run`.
     """
     head, _, description = (module.__doc__ or "").partition("\n\n")
-    name, _, summary = head.removeprefix("`worldstate ").partition("`: ")
+    called, _, summary = head.removeprefix("`").partition("`: ")
+    name = called.split()[-1]
     parser = subparsers.add_parser(
         name,
         help=summary.removesuffix("."),

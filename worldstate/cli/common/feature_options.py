@@ -26,15 +26,15 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
     import numpy as np
 
     from worldstate.adapters.datasets.feature_table import read_features
-    from worldstate.frontend.array.microphone_array import MicrophoneArray
-    from worldstate.frontend.array.ovad_array import ovad_array
-    from worldstate.operations.commissioning.heard_stream import HeardStream
-    from worldstate.operations.commissioning.open_field import (
+    from worldstate.commissioning.heard_stream import HeardStream
+    from worldstate.commissioning.open_field import (
         N_OPEN,
         open_field_features,
         open_field_windows,
     )
-    from worldstate.operations.commissioning.window_model import learned_beside
+    from worldstate.commissioning.window_model import learned_beside
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.operations.training.site_references import simulated_beside
 
     tables = [read_features(path).group(arguments.group) for path in arguments.simulated or ()]

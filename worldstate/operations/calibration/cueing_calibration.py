@@ -1,4 +1,4 @@
-"""Thresholds and risk maps from whole recordings: what `worldstate calibrate` does."""
+"""Thresholds and risk maps from whole recordings: what `worldstate model threshold` does."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

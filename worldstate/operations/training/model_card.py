@@ -66,7 +66,7 @@ def _limits(model: Model) -> list[str]:
     limits = [
         "another array: refused; microphones more than 1 mm elsewhere count as another",
         f"sample rates outside {low:.0f} to {high:.0f} Hz and their halves, quarters and eighths: refused",
-        "other sites than those named: thresholds were set on these; see worldstate calibrate",
+        "other sites than those named: thresholds were set on these; see worldstate model threshold",
         "sound of anything but vehicles: the model does not know it",
     ]
     if domain.ego_motion != "any":

@@ -1,0 +1,73 @@
+"""Fixtures that cost seconds, made once a session."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.cli.demo import simulate_approach
+from worldstate.cli.main import main
+from worldstate.frontend.array.ovad_array import ovad_array
+
+# Two processes on two cores beside other work: how long an example takes says nothing of the code.
+# With the usual 100 examples of every law the suite was above its five minutes. Every clone draws the same
+# ones: of two hundred laws with new draws, one run in two met a rarest case, whoever's change it was.
+settings.register_profile("shared_machine", deadline=None, max_examples=50, derandomize=True)
+# `make slow`, and whatever is called with --hypothesis-profile=anew.
+settings.register_profile("anew", deadline=None, max_examples=200)
+settings.load_profile("shared_machine")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Let the tests that share a fixture run in one process, or each of several makes it again."""
+    for item in items:
+        group = _shared(item)
+        if group is not None and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _shared(item):
+    scopes = {name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()}
+    for name in ("approach", "smoke"):
+        # A parametrised argument may have that name too.
+        if scopes.get(name) == "session":
+            return name
+    return item.module.__name__ if {"module", "package"} & set(scopes.values()) else None
+
+
+@dataclass(frozen=True)
+class Approach:
+    """One simulated occluded approach on disk."""
+
+    folder: Path
+    array_path: Path
+
+    @property
+    def audio_path(self) -> Path:
+        return Recording.open(self.folder).audio_path
+
+    @property
+    def detections_path(self) -> Path:
+        return self.folder / DETECTION_NAMES[0]
+
+
+@pytest.fixture(scope="session")
+def approach(tmp_path_factory) -> Approach:
+    root = tmp_path_factory.mktemp("approach")
+    write_array_xml(root / "mics.xml", ovad_array())
+    return Approach(simulate_approach(root / "recording", seed=1), root / "mics.xml")
+
+
+@pytest.fixture(scope="session")
+def smoke(tmp_path_factory):
+    """The folder of a smoke evaluation, and its report."""
+    out = tmp_path_factory.mktemp("evaluation")
+    # Five pools would import the library in two processes each: the second run in test_evaluate has pools.
+    assert main(["evaluate", "--smoke", "--jobs", "1", "--out", str(out)]) == 0
+    return out, json.loads((out / "evaluation.json").read_text())

@@ -1,0 +1,55 @@
+"""A small pass over sound files, kept in a cache, for tests that send it to other processes."""
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import soundfile
+from worldstate_lab.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
+
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.recordings.hop_table import HopTable
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Level and Gram matrix of each second of a sound file; every making of a table adds a line to `log`."""
+
+    folder: Path  # Of the cache
+    pause_s: float = 0.0  # As if it took that long
+
+    def __call__(self, path):
+        mark = fingerprint(path, FingerprintMemo(self.folder / "fingerprints"))
+        tables = PassCache(self.folder).tables("levels", [1, mark], lambda: {"hops": self.make(path)})
+        return tables["hops"]
+
+    def make(self, path):
+        with (self.folder.parent / "log").open("a") as log:
+            log.write(f"{path.name}\n")
+        time.sleep(self.pause_s)
+        try:
+            sound, rate_hz = soundfile.read(path)
+        except soundfile.LibsndfileError as error:
+            raise InputFileError(path, "expected a sound file") from error
+        seconds = sound[: len(sound) // rate_hz * rate_hz].reshape(-1, rate_hz, sound.shape[1])
+        # Products of this size are shared among BLAS threads where more than one may run.
+        gram = np.array([second.T @ second for second in seconds])
+        return HopTable({"gram": gram, "level": np.sqrt(np.mean(seconds**2, (1, 2)))}, path.name)
+
+
+def write_sounds(folder, n, seconds=2):
+    """Write so many files of noise."""
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(1)
+    paths = [folder / f"{i}.wav" for i in range(n)]
+    for path in paths:
+        soundfile.write(path, rng.uniform(-0.5, 0.5, (seconds * 8000, 16)), 8000, "PCM_24")
+    return paths
+
+
+def end_at_one(item):
+    """End the process in the middle of its work, as the kernel does where the memory is full."""
+    if item == 1:
+        os._exit(9)

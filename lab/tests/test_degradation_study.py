@@ -1,0 +1,411 @@
+"""The passes of the degradation sweep over one recording, and the study over several."""
+
+import json
+import shutil
+from dataclasses import replace
+from itertools import islice
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from worldstate_lab.degradation.beta_curves import absence_counts, counts_table
+from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, Condition, all_conditions
+from worldstate_lab.degradation.degradation_report import degradation_lines, degradation_record
+from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
+from worldstate_lab.degradation.looks import (
+    READINGS,
+    degradation_in,
+    detections_in,
+    health_of,
+    look,
+    motion_detectors,
+)
+from worldstate_lab.degradation.rain import RAIN_DB, level_rms, rained
+from worldstate_lab.degradation.staged_filter import by_condition, cameras, filter_in_conditions
+from worldstate_lab.degradation.stream_sweep import (
+    STATES,
+    missed,
+    staged_advisories,
+    stream_lines,
+    stream_sweep,
+)
+from worldstate_lab.trials.engine import Engine
+from worldstate_lab.trials.pass_cache import PassCache
+
+from worldstate.abduction.absence import default_miss_rates
+from worldstate.abduction.co_evidence import Absent
+from worldstate.adapters.audio.open_sound import open_sound
+from worldstate.adapters.camera.camera_channel import Watcher
+from worldstate.adapters.camera.camera_health import learn_health
+from worldstate.adapters.camera.degradation import degrade
+from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
+from worldstate.adapters.camera.motion_detector import MotionDetector
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.datasets.ovad import OvadDataset, Recording
+from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.adapters.listen import listen_steps, measure_steps, open_source
+from worldstate.cli.main import main
+from worldstate.core.filter import WorldFilter
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.detectors.miss_rate_measurement import (
+    AbsenceSettings,
+    LabelledVideo,
+    measure_absence,
+)
+from worldstate.operations.recordings.hop_table import HopTable, joined
+
+WHOLE = PinholeCamera()
+WIDTH, HEIGHT = 484, 304
+MOTION = motion_detectors()[:1]
+STAGED = (Condition(CLEAN), Condition("noise", 1), Condition("noise", 4), Condition("lens", 4))
+
+
+def render(log):
+    """A textured street with the reference boxes drawn as textured cars."""
+    rng = np.random.default_rng(0)
+    scene = 110.0 + 25.0 * gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 1.2) / 0.2
+    body = 200.0 + 60.0 * gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 3.0) / 0.1
+    scale = np.array([WIDTH / WHOLE.width_px, HEIGHT / WHOLE.height_px] * 2)
+    for frame in log.frames:
+        image = scene.copy()
+        for left, top, right, bottom in (frame.boxes_px * scale).astype(int):
+            image[top:bottom, left:right] = body[: bottom - top, : right - left]
+        image = image[:, :, None] + rng.normal(0.0, 2.0, (HEIGHT, WIDTH, 3))
+        yield np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def video(approach, tmp_path_factory):
+    path = tmp_path_factory.mktemp("staged") / "street.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    for frame in render(read_detections(approach.detections_path)):
+        writer.write(frame)
+    writer.release()
+    return open_video(path)
+
+
+@pytest.fixture(scope="module")
+def looks(video):
+    return look(video, MOTION, np.random.default_rng(0), 640, STAGED)
+
+
+@pytest.fixture(scope="module")
+def rates(video):
+    rising = FamilyCounts(((100,) * 5,), ((2, 10, 90, 98, 100),), (100,) * 5, (0, 0, 1, 1, 1))
+    return MissRates(
+        (0.0, 37.0), {"noise": rising}, health=learn_health([next(video.frames())], np.random.default_rng(0))
+    )
+
+
+def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
+    detector, scale = MotionDetector(), np.array([WHOLE.width_px / WIDTH, WHOLE.height_px / HEIGHT] * 2)
+    kept = detections_in(looks["mog2"], CLEAN)
+    assert sum(map(len, kept.frames)) > 10
+    for image, frame in zip(video.frames(), kept.frames, strict=True):
+        found = detector.detect(image)
+        assert frame.boxes_px == pytest.approx(found.boxes_px * scale)
+        assert frame.labels == found.labels
+        assert frame.scores == pytest.approx(found.scores)
+    assert kept.stamps_ns[:3].tolist() == [0, 100_000_000, 200_000_000]
+
+
+def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
+    watcher = Watcher(MotionDetector(), rates)
+    for number, image in enumerate(islice(video.frames(), 90)):
+        watcher.look(100_000_000 * number, image)
+    watched, kept = watcher.watched(), detections_in(looks["mog2"], CLEAN)
+    assert [len(frame) for frame in watched.detections.frames] == [len(frame) for frame in kept.frames[:90]]
+    read = degradation_in(looks[READINGS], CLEAN, rates)
+    assert np.median(watched.degradation.degradation) == pytest.approx(np.median(read.degradation), abs=0.05)
+    with pytest.raises(InvalidArgumentError, match="health"):
+        Watcher(MotionDetector(), replace(rates, health=None))
+
+
+def test_d_is_read_from_the_images_alone(looks, rates):
+    levels = {
+        state.name: np.median(degradation_in(looks[READINGS], state.name, rates).degradation)
+        for state in STAGED
+    }
+    assert levels[CLEAN] < 0.1
+    assert levels["noise 1"] > 0.9
+    assert 0.1 < levels["noise 0.25"] < 0.9
+    with pytest.raises(InvalidArgumentError, match="health"):
+        degradation_in(looks[READINGS], CLEAN, replace(rates, health=None))
+
+
+def part(video, first, last):
+    """Some frames of a video as one of their own."""
+    return SimpleNamespace(
+        frames=lambda: islice(video.frames(), first, last), frame_rate_hz=video.frame_rate_hz
+    )
+
+
+def test_the_scale_of_d_is_that_of_the_same_images(video):
+    conditions = (
+        Condition(CLEAN),
+        *(Condition(family, i) for family in ("blur", "noise") for i in range(1, 5)),
+    )
+    tables = look(part(video, 0, 1), MOTION, np.random.default_rng(0), 640, conditions)
+    mine, theirs = (
+        health_of([tables[READINGS]]),
+        learn_health([next(video.frames())], np.random.default_rng(1)),
+    )
+    assert mine.brightness == pytest.approx(theirs.brightness)
+    assert mine.noise == pytest.approx(theirs.noise, rel=0.03)
+    assert mine.sharpness == pytest.approx(theirs.sharpness, rel=0.05)
+
+
+def test_counts_are_those_of_measure_absence(approach, video):
+    """On clean frames, where nothing is drawn at random."""
+    whole, (first, last) = read_detections(approach.detections_path), (60, 100)
+    reference = DetectionLog(whole.frames[first:last], whole.stamps_ns[first:last])
+    small = np.array([WIDTH / WHOLE.width_px, HEIGHT / WHOLE.height_px] * 2)
+    frames = [DetectionFrame(one.boxes_px * small, one.scores, one.labels) for one in reference.frames]
+    camera = PinholeCamera(width_px=WIDTH, height_px=HEIGHT)
+    scene = LabelledVideo(part(video, first, last), replace(reference, frames=tuple(frames)), camera)
+    # The height below which a reference box does not count is one in the pixels of the video.
+    keep = replace(AbsenceSettings().keep, min_height_px=40.0 * HEIGHT / WHOLE.height_px)
+    settings = AbsenceSettings(families=("blur",), keep=keep)
+    measured = measure_absence([scene], MotionDetector, np.random.default_rng(0), settings).families["blur"]
+    looks = look(part(video, first, last), MOTION, np.random.default_rng(0), 640, [Condition(CLEAN)])
+    counted = absence_counts(reference, looks["mog2"])["blur"]
+    for name in ("looks", "misses", "sectors", "clutter"):
+        mine, theirs = (np.array(getattr(one, name))[..., 0] for one in (counted, measured))
+        assert mine == pytest.approx(theirs), name
+    assert np.array(counted.looks)[:, 0].sum() > 10
+
+
+def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, looks, rates):
+    source, seed = open_source(approach.folder), (0, 1)
+    behind = cameras(MOTION, {"mog2": rates}, looks)
+    loud = Condition("lens", 4), Condition("roof", 3), Condition("rain", 4)
+    conditions = (Condition(CLEAN), Condition("noise", 4), *loud, Condition(OFF))
+    staged = by_condition(filter_in_conditions(source, behind, seed, conditions)["mog2"])
+    assert list(staged) == ["clean", "noise 1", "lens 1", "roof 0.75", "rain 1", "off"]
+    staged = {name: one.replace(label="left", t0_s=source.t0_s) for name, one in staged.items()}
+    clean, blind, lens, roof, rain, off = staged.values()
+    after = clean.after_sight()
+    assert after.any()
+    assert not after[clean.time_s < source.t0_s].any()
+    assert clean.seen[after].mean() > 0.7
+    assert blind.seen[after].mean() <= 0.05
+    assert clean.found[after].mean() > 0.7
+    assert not (clean.found & ~(clean.seen & clean.there)).any()
+    assert not off.found.any()
+    assert (off.answer == 0).all()
+    asked = (clean.answer > 0) & (blind.answer > 0)
+    assert asked.mean() > 0.5
+    assert np.median(clean.miss_rate[asked]) < 0.4
+    assert np.median(blind.miss_rate[asked]) > 0.9
+    assert np.array_equal(roof.found, clean.found)
+    assert np.array_equal(rain.found, lens.found)
+    assert np.array_equal(lens.log_likelihoods, clean.log_likelihoods)
+    assert not np.allclose(roof.log_likelihoods, clean.log_likelihoods)
+    assert_the_sound_says_the_same(source, off)
+
+
+def assert_the_sound_says_the_same(source, off):
+    """Against the filter itself, on the sound as it was measured and with no camera."""
+    world, presence, said = WorldFilter(context=source.context, policy=source.policy), [], []
+    for _, measurement in measure_steps(replace(source, detections=None)):
+        world = world.predict_to(measurement.stamp_ns).update(measurement)
+        presence.append(
+            1.0 - np.prod([1.0 - e.existence_probability for e in world.state.entities if e.moving])
+        )
+        said.append(measurement.signature.log_likelihoods)
+    assert off.log_likelihoods == pytest.approx(np.array(said))
+    assert off.presence == pytest.approx(np.array(presence))
+
+
+def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
+    folder = tmp_path / "recording"
+    shutil.copytree(approach.folder, folder)
+    writer = cv2.VideoWriter(str(folder / VIDEO_NAME), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+    for number, frame in enumerate(video.frames()):
+        writer.write(degrade(frame, "darkness", 1.0 if number >= 50 else 0.0, np.random.default_rng(0)))
+    writer.release()
+    darkening = replace(rates, families={"darkness": rates.families["noise"]})
+    save_miss_rates(tmp_path / "beta.json", darkening)
+    source = open_source(folder, miss_rates=tmp_path / "beta.json")
+    assert source.miss_rates.table == darkening.table
+    assert source.degradation(2_000_000_000) < 0.1 < 0.9 < source.degradation(8_000_000_000)
+    looking = open_source(folder, miss_rates=tmp_path / "beta.json", detector=MotionDetector())
+    assert looking.degradation(2_000_000_000) < 0.1 < 0.9 < looking.degradation(8_000_000_000)
+    assert len(looking.detections) == len(looking.detections.stamps_ns) == 100
+    assert looking.detections.stamps_ns[-1] == 9_900_000_000
+    betas = {
+        m.stamp_ns: m.co_evidence.miss_rate
+        for _, m in measure_steps(source)
+        if isinstance(m.co_evidence, Absent)
+    }
+    assert np.median([b for t, b in betas.items() if t < 4_500_000_000]) < 0.4
+    assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
+
+
+def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
+    box = DetectionFrame(np.array([[900.0, 500.0, 1000.0, 600.0]]), np.array([0.9]), ("car",))
+    log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates(90.0)
+    left = {
+        d: np.array(
+            [len(one.boxes_px) for one in missed(log, WHOLE, table, d, np.random.default_rng(1)).frames]
+        )
+        for d in (0.0, 0.5, 1.0)
+    }
+    assert left[0.0].all()
+    azimuth = WHOLE.sighting(box.boxes_px[0], "car", 0.9).azimuth_rad
+    for d in (0.5, 1.0):
+        # Of what a clean camera reports; four standard errors of 2000 draws.
+        expected = (1.0 - table(azimuth, d)) / (1.0 - table(azimuth))
+        assert left[d].mean() == pytest.approx(expected, abs=4 * (expected / 2000) ** 0.5)
+    assert not (left[1.0] > left[0.5]).any()
+
+
+def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
+    hops = 6000
+    onsets = dict.fromkeys((state.name for state in STATES), range(0, hops, 600))
+    onsets["lens 1"], onsets["off"] = range(0, hops, 300), ()
+    rows = []
+    for name, first in onsets.items():
+        advised = np.zeros(hops, bool)
+        for hop in first:
+            advised[hop + 5 : hop + 20] = True
+        columns = {"condition": np.full(hops, name), "time_s": 0.1 * np.arange(hops), "advised": advised}
+        rows.append(HopTable(columns))
+    sweep = stream_sweep([joined(rows)] * 3, seed=0)
+    by_name = {row.name: row for row in sweep.rows}
+    assert sweep.hours == pytest.approx(0.5)
+    assert by_name[CLEAN].onsets == 30 and by_name[CLEAN].per_hour.value == pytest.approx(60.0)
+    # An onset a minute against two, in every minute: no draw of minutes changes that.
+    assert by_name["lens 1"].ratio == pytest.approx((2.0, 2.0, 2.0))
+    assert by_name["off"].onsets == 0 and by_name["off"].upper_90 == pytest.approx(np.log(10.0) / 0.5)
+    assert any(
+        line.startswith("lens 1") and "2.00 [2.00, 2.00]" in " ".join(line.split())
+        for line in stream_lines(sweep)
+    )
+
+
+def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
+    found = staged_advisories(approach.folder, None, 0)
+    names = found.condition.tolist()
+    assert list(dict.fromkeys(names)) == [state.name for state in STATES]
+    chain = [
+        any(cue.advisory for cue in step.state.cues) for step in listen_steps(open_source(approach.folder))
+    ]
+    assert any(chain)
+    assert found.advised[found.condition == CLEAN].tolist() == chain
+    # Drops on every microphone drown the vehicle.
+    assert found.advised[found.condition == "roof 1"].sum() < sum(chain)
+
+
+def test_rain_on_the_roof_is_white_and_its_own_at_every_microphone(approach):
+    source = open_source(approach.folder)
+    with open_sound(source.sound) as audio:
+        dry = np.concatenate(list(audio.blocks()))
+    with open_sound(rained(source, 3, level_rms(source), np.random.default_rng(3)).sound, 56) as audio:
+        drops = np.concatenate(list(audio.blocks(1 << 14))) - dry
+    db = 20.0 * np.log10(drops.std(axis=0) / np.sqrt(np.mean(dry.astype(float).var(axis=0))))
+    assert db == pytest.approx(RAIN_DB[3], abs=0.1)
+    apart = np.corrcoef(drops[::4].T) - np.eye(56)
+    assert np.abs(apart).max() < 6.0 / np.sqrt(len(drops) / 4)
+    assert abs(np.corrcoef(drops[1:, 0], drops[:-1, 0])[0, 1]) < 6.0 / np.sqrt(len(drops))
+
+
+def readings():
+    """Qualities of images that get blurred and noisy as staged."""
+    rows = [(CLEAN, 0.0, 100.0, 2.0, 5.0)]
+    rows += [(Condition("blur", i).name, 0.0, 100.0, 2.0, 5.0 / (1 + i)) for i in range(1, 5)]
+    rows += [(Condition("noise", i).name, 0.0, 100.0, 2.0 + 20.0 * i, np.nan) for i in range(1, 5)]
+    return HopTable.of_rows(("condition", "time_s", "brightness", "noise", "sharpness"), rows)
+
+
+def believed(number, approach):
+    """Beliefs in which the sound is right, and the camera too until it is staged."""
+    rng, n = np.random.default_rng(number), 40
+    time_s = 1.0 + 0.1 * np.arange(n)
+    there = approach & (time_s > 3.0)
+    tables = []
+    for state in all_conditions():
+        found = there & (state.camera.level < 3) & (state.name != OFF)
+        columns = {"time_s": time_s, "there": there, "found": found, "seen": found, "answer": np.full(n, 1)}
+        columns |= {"log_likelihoods": rng.normal(0.0, 1.0, (n, 4)), "presence": 0.5 + 0.4 * there}
+        columns |= {
+            "miss_rate": np.full(n, 0.5),
+            "clutter_rate": np.full(n, 0.01),
+            "degradation": np.zeros(n),
+        }
+        tables.append(HopTable(columns | {"condition": np.full(n, state.name)}))
+    return joined(tables).replace(label="left" if approach else "none", t0_s=3.0 if approach else np.nan)
+
+
+def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
+    """Every recording has looks of a bit of its own, so that the sum tells whose are in it."""
+    recordings = []
+    for i in range(8):
+        folder = tmp_path / f"r{i}"
+        folder.mkdir()
+        for name in (VIDEO_NAME, DETECTION_NAMES[0]):
+            (folder / name).touch()
+        recordings.append(Recording(folder, f"r{i}", f"SA{i % 2}", "left" if i < 4 else "none", 30))
+    used = {}
+
+    def kept(name, key, make):
+        number = int((key if name == "degraded-looks" else key[1])[1][1:])
+        if name == "degraded-looks":
+            looks = ((2.0**number,) * 5,) * 4
+            misses = ((0.0, 0.0, 0.0, 2.0**number, 2.0**number),) * 4
+            counts = dict.fromkeys(FAMILIES, FamilyCounts(looks, misses, (9.0,) * 5, (0.0,) * 5))
+            return {"mog2 misses": counts_table(counts), READINGS: readings()}
+        used[number] = key[2]["mog2"]["families"]["blur"]["looks"][0][0]
+        return {"mog2": believed(number, number < 4)}
+
+    settings = DegradationSettings(detectors=MOTION, approaches=4, hazard_free=4, folds=4)
+    study = degradation_study(recordings, settings, keep=kept, fingerprint=lambda path: path.name)
+    for number, looks in used.items():
+        assert not int(looks) & 1 << number
+        assert int(looks).bit_count() == 6  # Four folds of two
+    (sweep,) = study.sweeps
+    assert sweep.beta.overall.value[0].tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
+    assert sweep.least_vision.vision.value == 0.0 < sweep.least_awareness.awareness.value
+    assert [row.condition.level for row in sweep.family("noise")] == [0, 1, 2, 3, 4]
+    counts = FamilyCounts(((77.0,) * 5,), ((7.0,) * 5,), (9.0,) * 5, (0.0,) * 5)
+    given = replace(settings, miss_rates={"mog2": MissRates((0.0, 37.0), {"blur": counts})})
+    degradation_study(recordings, given, keep=kept, fingerprint=lambda path: path.name)
+    assert set(used.values()) == {77.0}
+
+
+def test_settings_that_cannot_be_are_refused(rates):
+    with pytest.raises(InvalidArgumentError, match="names of their own"):
+        DegradationSettings(detectors=(*MOTION, *MOTION))
+    with pytest.raises(InvalidArgumentError, match="miss_rates"):
+        DegradationSettings(miss_rates={"yolo": rates})
+
+
+@pytest.mark.slow
+def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recording(tmp_path):
+    """Three approaches and two empty streets, short; the second run opens no video."""
+    root = tmp_path / "sim"
+    assert main(["simulate", "--out", str(root), "--static", "5", "--duration", "3", "--video"]) == 0
+    recordings, keep = list(OvadDataset(root).recordings), PassCache(tmp_path / "kept").tables
+    broken = next(one for one in recordings if one.label != "none")
+    (broken.path / VIDEO_NAME).write_bytes(b"no video")
+    settings = DegradationSettings(detectors=MOTION, approaches=3, hazard_free=2, width_px=320)
+    over = Engine(jobs=2).over
+    first = degradation_study(recordings, settings, over=over, keep=keep)
+    assert set(first.skipped) == {broken.recording_id}
+    assert broken.recording_id not in first.approaches
+    assert len(first.approaches) == len(first.hazard_free) == 2
+    for path in root.rglob(VIDEO_NAME):
+        path.write_bytes(b"")
+    (sweep,), (again,) = first.sweeps, degradation_study(recordings, settings, keep=keep, over=over).sweeps
+    assert again.awareness == sweep.awareness
+    assert np.array_equal(again.beta.overall.value, sweep.beta.overall.value, equal_nan=True)
+    assert len(sweep.awareness.rows) == 26
+    values = json.loads(json.dumps(degradation_record(first), allow_nan=False))
+    assert values["detectors"]["mog2"]["rows"][0]["awareness"] == list(sweep.awareness.rows[0].awareness)
+    assert values["skipped"].keys() == {broken.recording_id}
+    assert any(line.startswith("noise 0.75") for line in degradation_lines(first))
+    assert sweep.least_vision.vision.value <= 0.05 < 0.5 < sweep.awareness.row(CLEAN).vision.value

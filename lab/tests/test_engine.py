@@ -1,0 +1,201 @@
+"""One evaluation on one process, on several or on a cluster: the same tables, whatever happens meanwhile."""
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import time
+import tracemalloc
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from engine_work import Levels, end_at_one, write_sounds
+from worldstate_lab.trials.engine import Engine, Failed
+
+from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A cluster of two workers on this machine: processes of their own, as elsewhere."""
+    import distributed
+
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
+        yield workers.scheduler_address
+
+
+def plain(outcome):
+    """What an outcome holds, bit for bit."""
+    if isinstance(outcome, Failed):
+        return outcome
+    return outcome.name, {name: column.tobytes() for name, column in outcome.columns.items()}
+
+
+def test_every_engine_gives_the_same_and_reports_the_broken_recording(cluster, tmp_path):
+    paths = write_sounds(tmp_path / "sounds", 6)
+    paths[2].write_bytes(b"no sound")
+    paths[4].unlink()
+    engines = {
+        "one": Engine(),
+        "two": Engine(jobs=2),
+        "cluster": Engine(scheduler=cluster, shared=(tmp_path / "sounds",)),
+    }
+    found = {}
+    for name, engine in engines.items():
+        # A cache of its own: nothing is taken over from the engine before.
+        work = Levels(tmp_path / name / "cache")
+        work.folder.mkdir(parents=True)
+        found[name] = [plain(one) for one in engine.over(work, paths, name=lambda path: path.stem)]
+        assert sorted((tmp_path / name / "log").read_text().split()) == [f"{i}.wav" for i in (0, 1, 2, 3, 5)]
+    assert found["one"] == found["two"] == found["cluster"]
+    failed = [one for one in found["one"] if isinstance(one, Failed)]
+    assert [one.name for one in failed] == ["2", "4"]
+    assert f"{paths[2]}: expected a sound file" in failed[0].problem
+    assert str(paths[4]) in failed[1].problem
+
+
+@pytest.mark.parametrize("jobs", [1, 2, None])
+def test_an_error_of_the_program_is_no_broken_recording(jobs, request):
+    engine = Engine(scheduler=request.getfixturevalue("cluster")) if jobs is None else Engine(jobs)
+    with pytest.raises(TypeError, match="has no len"):
+        list(engine.over(len, [[0], 1, [2]]))
+
+
+def test_a_loop_that_is_left_leaves_no_work_on_the_cluster(cluster):
+    import distributed
+
+    with distributed.Client(cluster, set_as_default=False) as client:
+        with closing(Engine(scheduler=cluster).over(time.sleep, [0.0, *[0.5] * 40])) as slept:
+            next(slept)
+        deadline = time.monotonic() + 10.0
+        while any(client.processing().values()) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not any(client.processing().values())
+
+
+def test_a_cluster_that_would_compute_something_else_is_refused(cluster, tmp_path, monkeypatch):
+    with pytest.raises(InvalidArgumentError, match=r"nowhere is not there.*same path"):
+        list(Engine(scheduler=cluster, shared=(tmp_path / "nowhere",)).over(abs, [1]))
+    monkeypatch.setattr("worldstate_lab.trials.engine.__version__", "0.0.1")
+    with pytest.raises(InvalidArgumentError, match=r"expected version 0\.0\.1 on tcp"):
+        list(Engine(scheduler=cluster).over(abs, [1]))
+
+
+def test_a_cluster_that_loses_a_worker_is_an_error_not_an_endless_wait(cluster):
+    with pytest.raises(WorldstateError, match="lost a worker"):
+        list(Engine(scheduler=cluster).over(end_at_one, [0, 1, 2]))
+
+
+def test_a_scheduler_that_does_not_answer_is_refused_with_what_to_do(monkeypatch):
+    monkeypatch.setattr("worldstate_lab.trials.engine.CONNECT_S", 0.2)
+    for address in ("127.0.0.1:1", "nonsense:xx"):
+        with pytest.raises(
+            InvalidArgumentError, match=f"{address}, none answers; start one with `dask sched"
+        ):
+            list(Engine(scheduler=address).over(abs, [1]))
+
+
+def test_a_cluster_without_workers_is_refused(monkeypatch):
+    import distributed
+
+    monkeypatch.setattr("worldstate_lab.trials.engine.CONNECT_S", 0.5)
+    # A client that never connected is closed when it is collected; collected while another loop starts, it
+    # waits for the lock that this start holds, for ever.
+    gc.collect()
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
+        pytest.raises(InvalidArgumentError, match="got none; start some with `dask worker"),
+    ):
+        list(Engine(scheduler=empty.scheduler_address).over(abs, [1]))
+
+
+def test_without_dask_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"worldstate\[dask\]"):
+        list(Engine(scheduler="127.0.0.1:1").over(abs, [1]))
+
+
+RUN = """
+import signal, sys
+from pathlib import Path
+from engine_work import Levels
+from worldstate_lab.trials.engine import Engine
+def end(number, frame): raise SystemExit(128 + number)
+signal.signal(signal.SIGTERM, end)
+folder, pause_s = Path(sys.argv[1]), float(sys.argv[2])
+paths = sorted((folder / "sounds").iterdir())
+for one in Engine(jobs=2).over(Levels(folder / "cache", pause_s), paths):
+    print(one.name, one.level.tobytes().hex(), one.gram.tobytes().hex(), flush=True)
+"""
+
+
+def start(folder, pause_s):
+    command = [sys.executable, "-c", RUN, str(folder), str(pause_s)]
+    paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    environment = os.environ | {"PYTHONPATH": paths}
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+# The two that ask are slow: `tests/cli/test_faults.py` sends them to a command with the same processes.
+ASKED = [pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGTERM)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, *ASKED])
+def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, tmp_path):
+    write_sounds(tmp_path / "sounds", 8, seconds=1)
+    (tmp_path / "cache").mkdir()
+    run = start(tmp_path, 0.4)
+    for _ in range(3):
+        run.stdout.readline()
+    asked = time.monotonic()
+    os.killpg(run.pid, number) if number == signal.SIGINT else run.send_signal(number)
+    # The pipe closes when the last process of the run is gone, its workers among them.
+    run.communicate(timeout=20.0)
+    assert run.returncode != 0
+    assert time.monotonic() - asked < 10.0
+    assert not list(tmp_path.rglob(".*"))
+    kept = len(list((tmp_path / "cache" / "levels").iterdir()))
+    assert 3 <= kept < 8
+
+    (tmp_path / "log").unlink()
+    said, problem = start(tmp_path, 0.0).communicate(timeout=60.0)
+    assert problem == ""
+    assert len((tmp_path / "log").read_text().split()) == 8 - kept
+    fresh = tmp_path / "fresh"
+    fresh.mkdir()
+    (fresh / "cache").mkdir()
+    (tmp_path / "sounds").rename(fresh / "sounds")
+    whole = list(Engine().over(Levels(fresh / "cache"), sorted((fresh / "sounds").iterdir())))
+    assert said.splitlines() == [
+        f"{one.name} {one.level.tobytes().hex()} {one.gram.tobytes().hex()}" for one in whole
+    ]
+
+
+def test_memory_does_not_grow_with_the_number_of_recordings(tmp_path):
+    paths = write_sounds(tmp_path / "sounds", 24)
+
+    def peak(n):
+        work = Levels(tmp_path / str(n) / "cache")
+        work.folder.mkdir(parents=True)
+        tracemalloc.start()
+        try:
+            kept = list(Engine().over(work, paths[:n]))
+            return len(kept), tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(1)  # What is imported and cached once does not count
+    (few, small), (many, large) = peak(2), peak(24)
+    assert (few, many) == (2, 24)
+    # The samples of 22 more recordings would take 45 MB; their tables take 5 kB each.
+    assert small > 2 << 20
+    assert large - small < 1 << 20

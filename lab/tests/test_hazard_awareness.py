@@ -1,0 +1,241 @@
+"""Awareness from known decisions, curves of beta from known counts, and the choice of recordings."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from worldstate_lab.degradation.awareness import AwarenessSettings, hazard_awareness
+from worldstate_lab.degradation.beta_curves import beta_curves, counts_of, counts_table
+from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, all_conditions
+from worldstate_lab.degradation.degradation_study import DegradationSettings
+from worldstate_lab.degradation.looks import motion_detectors
+from worldstate_lab.degradation.sweep_data import sweep_data
+from worldstate_lab.evaluation.camera_failure import whole_sweep
+from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.trials.takes import Take, TakeList
+
+from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.miss_rates import FamilyCounts
+from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.alarm_rate import poisson_interval
+from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERIED
+from worldstate.operations.recordings.hop_table import HopTable
+
+PRIOR = (0.25,) * 4
+SETTINGS = AwarenessSettings(PRIOR)
+HOPS, T0_S = 60, 4.0
+STATES = {state.name: state for state in all_conditions()}
+BETA = dict(zip(LEVELS, (0.05, 0.3, 0.6, 0.9, 1.0), strict=True))
+# What the rain on the roof leaves of the signature's log-likelihoods.
+HEARD = dict(enumerate((1.0, 0.9, 0.6, 0.3, 0.0)))
+
+
+def beta_of(state):
+    return 1.0 if state.family == OFF else BETA[state.camera.degradation]
+
+
+def staged(number, approach, rng, hearing=3.0):
+    """A signature that is right most of the time, a camera that misses as its beta says."""
+    time_s = 1.0 + 0.1 * np.arange(HOPS)
+    hidden, visible = approach & (time_s > 2.0) & (time_s <= T0_S), approach & (time_s > T0_S)
+    clear = np.zeros((HOPS, 4))
+    clear[:, 3] += 0.5 * hearing * ~(hidden | visible)
+    clear[:, 0] += hearing * hidden
+    clear[:, 2] += hearing * visible
+    noise, luck = rng.normal(0.0, 0.7, (HOPS, 4)), rng.random(HOPS)
+    tables = {}
+    for name, state in STATES.items():
+        off, likelihoods = state.family == OFF, HEARD[state.sound_level] * clear + noise
+        found = (luck >= beta_of(state)) & visible & (not off)
+        odds = np.logaddexp.reduce(likelihoods[:, :3], axis=1) - likelihoods[:, 3]
+        columns = {
+            "time_s": time_s, "there": visible, "log_likelihoods": likelihoods, "found": found, "seen": found,
+            "answer": np.full(HOPS, UNQUERIED) if off else np.where(found, PRESENT, ABSENT),
+            "miss_rate": np.full(HOPS, np.clip(beta_of(state), 0.02, 0.98)),
+            "clutter_rate": np.full(HOPS, 0.01), "degradation": np.full(HOPS, state.degradation),
+            "presence": 1.0 / (1.0 + np.exp(-odds)),
+        }  # fmt: skip
+        label, t0_s = ("left", T0_S) if approach else ("none", float("nan"))
+        tables[name] = HopTable(columns, f"r{number}", label, t0_s, {"site": f"SA{number % 3}"})
+    return tables
+
+
+def changed(one, **columns):
+    """The same recording with other columns in every condition."""
+    return {state: table.replace(**columns) for state, table in one.items()}
+
+
+def judged(corpus, settings=SETTINGS):
+    kinds = [one[CLEAN].hazard_free for one in corpus]
+    draws = stratified_draws(kinds, np.random.default_rng(1), draws=200)
+    return hazard_awareness(corpus, settings, draws, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def corpus():
+    rng = np.random.default_rng(5)
+    return [staged(i, i % 2 == 0, rng) for i in range(24)]
+
+
+@pytest.fixture(scope="module")
+def found(corpus):
+    return judged(corpus)
+
+
+def test_vision_alone_decays_as_one_minus_beta_and_awareness_does_not(found):
+    assert [row.condition.name for row in found.rows] == list(STATES)
+    for row in found.rows:
+        assert row.vision.value == pytest.approx(1.0 - beta_of(row.condition), abs=0.06)
+        assert row.awareness.value >= row.vision.value
+        for figure in (row.vision, row.awareness, row.false_alarms_per_hour, row.false_awareness_per_hour):
+            assert figure.low <= figure.value <= figure.high
+    blind = found.row("noise 1")
+    assert blind.vision == (0.0, 0.0, 0.0)
+    assert blind.awareness.value == pytest.approx(found.row(OFF).awareness.value)
+    assert blind.awareness.value > 0.6
+    assert 0.0 < found.row("blur 0.5").awareness.high - found.row("blur 0.5").awareness.low < 0.5
+
+
+def test_awareness_is_counted_as_it_is_defined(corpus):
+    """Against loops over the hops, with thresholds that nothing and everything passes."""
+    for level, heard in ((2.0, False), (-1.0, True)):
+        bent = [
+            changed(one, presence=np.full(HOPS, 0.5 if one[OFF].hazard_free else level)) for one in corpus
+        ]
+        for row in judged(bent).rows[::5]:
+            aware = hops = 0
+            for one in (bent_one[row.condition.name] for bent_one in bent):
+                for i, time_s in enumerate(one.time_s):
+                    if not one.hazard_free and time_s > one.t0_s + 1e-6 and one.there[i]:
+                        hops += 1
+                        aware += bool(one.found[i] or not heard)
+            assert row.awareness.value == pytest.approx(aware / hops)
+
+
+def test_false_alarms_keep_the_budget_of_the_clean_recording(found, corpus):
+    """The statistic falls as absence says less, and a detector without clutter adds no awareness."""
+    clean, hours = found.row(CLEAN), found.hazard_free_hours
+    dry = [row for row in found.rows if not row.condition.sound_level]
+    assert all(row.false_alarms_per_hour.value <= clean.false_alarms_per_hour.value + 1e-9 for row in dry)
+    assert hours == pytest.approx(sum(one[CLEAN].hazard_free for one in corpus) * HOPS * 0.1 / 3600.0)
+    onsets = round(clean.false_awareness_per_hour.value * hours)
+    assert clean.false_awareness_per_hour[1:] == pytest.approx(poisson_interval(onsets, hours))
+    assert clean.false_awareness <= 0.06
+
+
+def test_false_detections_are_false_awareness_and_none_of_the_vehicle(found, corpus):
+    raving = judged([changed(one, seen=np.ones(HOPS, bool)) for one in corpus])
+    assert [row.awareness for row in raving.rows] == [row.awareness for row in found.rows]
+    assert {row.any_detection for row in raving.rows} == {row.false_awareness for row in raving.rows} == {1.0}
+
+
+def test_what_each_sense_covers_for_the_other_is_lost_when_one_cause_takes_both(found):
+    """The lens and the roof alone cost little, as the other sense is left; at once they cost half."""
+    harshest = found.common_cause[-1]
+    assert harshest.roof.value > 0.9
+    assert harshest.lens.value > 0.6
+    assert harshest.rain.value < 0.5
+    clean = found.row(CLEAN).awareness.value
+    assert harshest.additive.value == pytest.approx(harshest.lens.value + harshest.roof.value - clean)
+    assert harshest.optimism.value == pytest.approx(harshest.additive.value - harshest.rain.value)
+    assert harshest.optimism.low > 0.2
+    assert [one.noise_db for one in found.common_cause] == [-20.0, -10.0, 0.0, 10.0]
+    assert found.row("rain 1").vision == found.row("lens 1").vision
+
+
+def test_where_the_sound_alone_covers_everything_the_causes_add_up(corpus):
+    deaf = [changed(one, presence=np.where(one[CLEAN].there, 2.0, 0.5)) for one in corpus]
+    assert all(cause.optimism == (0.0, 0.0, 0.0) for cause in judged(deaf).common_cause)
+
+
+def test_what_does_not_fit_is_refused(corpus):
+    free = [one for one in corpus if one[CLEAN].hazard_free]
+    with pytest.raises(InvalidArgumentError, match="view"):
+        judged(free)
+    with pytest.raises(InvalidArgumentError, match="hazard-free"):
+        judged([one for one in corpus if not one[CLEAN].hazard_free] + free[:1])
+
+
+def counts(misses, looks=40):
+    """The same in every family; rows are azimuth bins."""
+    misses = tuple(map(tuple, misses))
+    there = tuple((looks,) * len(LEVELS) for _ in misses)
+    return dict.fromkeys(FAMILIES, FamilyCounts(there, misses, (10,) * 5, (1,) * 5))
+
+
+RISING = [[2, 8, 20, 30, 40], [4, 10, 22, 32, 40], [6, 12, 24, 34, 40], [8, 14, 26, 36, 40]]
+
+
+def test_beta_is_misses_over_looks_with_the_spread_over_recordings():
+    draws = stratified_draws([0] * 6, np.random.default_rng(0))
+    curves = beta_curves([counts(RISING)] * 6, draws)
+    assert curves.by_azimuth.value[1] == pytest.approx(np.array(RISING) / 40.0)
+    assert curves.overall.value[2] == pytest.approx(np.mean(RISING, axis=0) / 40.0)
+    assert curves.overall.low == pytest.approx(curves.overall.high)  # Recordings alike: nothing to spread
+    assert curves.falls == ()
+    other = [[40 - miss for miss in row] for row in RISING]
+    mixed = beta_curves([counts(RISING)] * 3 + [counts(other)] * 3, draws)
+    assert mixed.overall.value == pytest.approx(0.5)
+    assert (mixed.overall.high - mixed.overall.low)[:, 0].min() > 0.4
+
+
+def test_a_fall_of_beta_is_named_with_its_size():
+    bent = [row[:] for row in RISING]
+    for row in bent:
+        row[3] = row[2] - 10
+    draws = stratified_draws([0] * 4, np.random.default_rng(0))
+    falls = beta_curves([counts(bent)] * 4, draws).falls
+    assert {fall.where for fall in falls} == {f"{family} 0.5 to 0.75" for family in FAMILIES}
+    assert all(fall.by == pytest.approx(0.25) and fall.certain for fall in falls)
+    sideways = beta_curves([counts(RISING[::-1])] * 4, draws).falls
+    assert "clean, 0-10 deg to 10-20 deg" in {fall.where for fall in sideways}
+    assert {fall.along for fall in sideways} == {"azimuth"}
+
+
+@given(st.lists(st.lists(st.integers(0, 40), min_size=5, max_size=5), min_size=4, max_size=4))
+def test_counts_survive_the_table(misses):
+    assert counts_of(counts_table(counts(misses))) == counts(misses)
+
+
+def test_counts_of_two_recordings_add_up():
+    both = counts(RISING)["blur"] + counts(RISING)["blur"]
+    assert np.array(both.misses) == pytest.approx(2.0 * np.array(RISING))
+    assert both.sectors == (20,) * 5
+
+
+def recording(root, site, label, number, filmed=True):
+    folder = Path(root) / site / label / f"{label}{site}{number}"
+    folder.mkdir(parents=True)
+    for name in (DETECTION_NAMES[0], VIDEO_NAME)[: 1 + filmed]:
+        (folder / name).touch()
+    return Recording(folder, folder.name, site, label, 40)
+
+
+def test_recordings_are_chosen_evenly_and_what_is_missing_is_named(tmp_path):
+    sites, sides = ("SA1", "SA2", "SB1", "SB2", "SB3"), ("left", "right", "none")
+    whole = [recording(tmp_path, site, side, n) for site in sites for side in sides for n in range(4)]
+    moving = recording(tmp_path, "DA1", "left", 0)
+    chosen = sweep_data([*whole, moving])
+    assert chosen.missing == ()
+    by_site = [sum(one.environment == site for one in chosen.approaches) for site in sites]
+    assert sorted(by_site) == [2, 2, 2, 3, 3]
+    assert len(chosen.hazard_free) == len(set(chosen.hazard_free)) == 12
+    assert {one.label for one in chosen.hazard_free} == {"none"}
+    dark = recording(tmp_path, "SA1", "left", 9, filmed=False)
+    few = sweep_data([*whole[:2], dark, moving], approaches=3, hazard_free=2)
+    assert few.approaches == tuple(whole[:2])
+    assert few.missing == (
+        f"1 of 3 filmed approaches are missing: no {VIDEO_NAME} or no detections beside leftSA19",
+        "2 of 2 filmed hazard-free recordings are missing",
+    )
+    assert "hazard-free recordings are missing" in few.lacks
+    assert chosen.lacks is None
+    takes = tuple(Take.of(one) for one in [*whole, dark])
+    full = whole_sweep(TakeList(tmp_path, takes, (), (), False), DegradationSettings(motion_detectors()))
+    every = sweep_data([*whole, dark], full.approaches, full.hazard_free)
+    assert set(every.recordings) == set(whole) and every.missing == ()

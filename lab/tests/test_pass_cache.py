@@ -1,0 +1,143 @@
+"""What passes over recordings gave: kept whole, by content, and made again where it is damaged."""
+
+import os
+
+import hypothesis.extra.numpy as npst
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worldstate_lab.trials.pass_cache import FingerprintMemo, PassCache, fingerprint
+
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.recordings.hop_table import HopTable, load_named, load_tables, save_named
+
+DTYPES = st.sampled_from([np.float64, np.float32, np.int64, np.bool_, "<U7"])
+NAMES = st.text("abc_", min_size=1, max_size=4)
+
+
+@st.composite
+def tables(draw):
+    n = draw(st.integers(0, 3))
+    tails = st.sampled_from([(), (4,), (0,), (2, 3)])
+    columns = {
+        name: draw(npst.arrays(draw(DTYPES), (n, *draw(tails))))
+        for name in draw(st.lists(NAMES, max_size=3, unique=True))
+    }
+    about = draw(st.dictionaries(NAMES, st.one_of(st.booleans(), st.floats(), st.text()), max_size=2))
+    return HopTable(columns, draw(st.text(max_size=3)), draw(NAMES), draw(st.floats()), about)
+
+
+def assert_same(first, second):
+    assert list(first) == list(second)
+    for name in first:
+        one, other = first[name], second[name]
+        assert list(one.columns) == list(other.columns)
+        for column in one.columns:
+            assert one.columns[column].dtype == other.columns[column].dtype
+            np.testing.assert_array_equal(one.columns[column], other.columns[column])
+        # JSON text compares NaN as equal, which `==` does not.
+        assert repr((one.name, one.label, one.t0_s, one.about)) == repr(
+            (other.name, other.label, other.t0_s, other.about)
+        )
+
+
+@settings(max_examples=40, deadline=None)
+@given(named=st.dictionaries(NAMES, tables(), max_size=3))
+def test_named_tables_of_any_columns_come_back_as_they_were(named, tmp_path_factory):
+    path = tmp_path_factory.mktemp("named") / "a.npz"
+    save_named(path, named)
+    assert_same(load_named(path, "tables"), named)
+
+
+def never():
+    raise AssertionError("was to be read, not made")
+
+
+def some_tables():
+    boxes = HopTable({"label": np.array(["car", "bus"]), "box_px": np.ones((2, 4))}, about={"site": "SA1"})
+    return {"boxes": boxes, "none": HopTable({"label": np.zeros(0, "<U3")})}
+
+
+def test_a_pass_is_made_once_for_each_key(tmp_path):
+    cache = PassCache(tmp_path / "cache")
+    assert_same(cache.tables("sound", {"a": 1}, some_tables), some_tables())
+    assert_same(cache.tables("sound", {"a": 1}, never), some_tables())
+    assert cache.tables("sound", {"a": 2}, dict) == {} == cache.tables("sound", {"a": 2}, never)
+    with pytest.raises(AssertionError):
+        cache.tables("camera", {"a": 1}, never)
+
+
+def test_a_pass_that_fails_leaves_no_file(tmp_path):
+    with pytest.raises(AssertionError):
+        PassCache(tmp_path).tables("sound", 1, never)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:100], lambda data: bytes(len(data))])
+def test_a_damaged_file_is_made_again_with_a_warning(damage, tmp_path):
+    cache = PassCache(tmp_path)
+    cache.tables("sound", 1, some_tables)
+    [path] = tmp_path.rglob("*.npz")
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.warns(UserWarning, match="made again"):
+        assert_same(cache.tables("sound", 1, some_tables), some_tables())
+    assert_same(cache.tables("sound", 1, never), some_tables())
+
+
+def test_tables_of_one_kind_are_no_streams_of_a_user(tmp_path):
+    save_named(tmp_path / "a.npz", some_tables())
+    assert load_tables(tmp_path / "a.npz", "hop streams") == []
+
+
+def recording(folder):
+    folder.mkdir()
+    for name in ("out_multi.wav", "camera_baseline_results.json", "truth.json"):
+        (folder / name).write_text(name)
+    return folder
+
+
+def test_a_fingerprint_is_of_the_content_and_of_nothing_else(tmp_path):
+    memo = FingerprintMemo(tmp_path / "memo")
+    one, other = recording(tmp_path / "one"), recording(tmp_path / "other")
+    same = fingerprint(one, memo)
+    assert fingerprint(other, memo) == same == fingerprint(one, FingerprintMemo(tmp_path / "another"))
+    (one / "notes.txt").write_text("windy")
+    os.utime(one / "out_multi.wav")
+    assert fingerprint(one, memo) == same
+    seen = {same}
+    for name in ("out_multi.wav", "truth.json", "ueye_stereo_vid.mp4"):
+        (one / name).write_text(f"{name} changed")
+        seen.add(fingerprint(one, memo))
+    (one / "truth.json").unlink()
+    seen.add(fingerprint(one, memo))
+    assert len(seen) == 5
+
+
+def test_unchanged_files_are_not_read_again(tmp_path):
+    memo, place = FingerprintMemo(tmp_path / "memo"), recording(tmp_path / "one")
+    before = fingerprint(place, memo)
+    sound = place / "out_multi.wav"
+    state = sound.stat()
+    # Same size and time with other content: only reading would tell.
+    sound.write_text("X" * state.st_size)
+    os.utime(sound, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert fingerprint(place, memo) == before
+    assert fingerprint(place, FingerprintMemo(tmp_path / "new")) != before
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[]", '{"out_multi.wav": "0"}', "\xff"])
+def test_a_damaged_memory_costs_a_reading(damage, tmp_path):
+    memo, place = FingerprintMemo(tmp_path / "memo"), recording(tmp_path / "one")
+    before = fingerprint(place, memo)
+    [path] = memo.folder.iterdir()
+    path.write_text(damage, encoding="latin-1")
+    assert fingerprint(place, memo) == before
+
+
+def test_a_single_sound_file_has_a_fingerprint_and_nothing_has_none(tmp_path):
+    memo = FingerprintMemo(tmp_path / "memo")
+    (tmp_path / "a.wav").write_text("sound")
+    assert len(fingerprint(tmp_path / "a.wav", memo)) == 32
+    with pytest.raises(InputFileError, match=r"out_multi\.wav"):
+        fingerprint(tmp_path, memo)

@@ -1,0 +1,164 @@
+"""A place behind the corner: paths against brute force, likelihood and filter by their laws, end to end."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from worldstate_lab.places.estimate import KnownPlace
+from worldstate_lab.places.place_exam import followed_places
+from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter
+from worldstate_lab.places.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate_lab.places.simulated_passes import simulated_pass
+from worldstate_lab.places.sound_paths import sound_paths
+from worldstate_lab.places.spectrum_model import SpectrumModel
+from worldstate_lab.places.street_walls import StreetWalls
+
+from worldstate.frontend import MicrophoneArray
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement import Measurement, PositionScan
+
+AZIMUTHS = np.radians(np.linspace(90.0, -90.0, 61))
+HZ = np.arange(200.0, 2000.0, 300.0)
+ROWS = [[x, y, 0.0] for x in (-0.2, 0.0, 0.2) for y in (-0.3, -0.1, 0.1, 0.3)]
+
+
+def model_of(left_m: float, right_m: float, facing_m: float | None = 9.9) -> SpectrumModel:
+    walls = StreetWalls(4.45, left_m, right_m, 7.15, facing_m)
+    return SpectrumModel.of(walls, MicrophoneArray(np.array(ROWS)), AZIMUTHS, HZ, draws=8)
+
+
+MODEL = model_of(2.8, 2.8)
+PLACES = PlaceFilter(MODEL)
+
+
+def plane_waves(*azimuths_deg: float) -> np.ndarray:
+    array = MicrophoneArray(np.array(ROWS))
+    beams = array.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1)
+    return (np.abs(beams @ array.steering(HZ, np.radians(azimuths_deg))) ** 2).sum(axis=(0, 2))
+
+
+@pytest.mark.parametrize(
+    ("number", "along_m", "wall"),
+    [(1, -1.5, ("side", 2.8)), (2, 5.0, ("side", -2.8)), (17, 1.5, ("facing", 9.9))],
+)
+def test_a_reflection_is_the_shortest_way_by_its_wall(
+    number: int, along_m: float, wall: tuple[str, float]
+) -> None:
+    # Fermat: of all points of the wall, sound takes the one with the shortest way.
+    path = sound_paths(MODEL.walls, 7.15, np.array([along_m]), HZ)[number]
+
+    def length(at: np.ndarray) -> float:
+        met = (at[0], wall[1]) if wall[0] == "side" else (wall[1], at[0])
+        return float(np.hypot(7.15 - met[0], along_m - met[1]) + np.hypot(*met))
+
+    shortest = minimize(length, [1.0], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12})
+    met = (shortest.x[0], wall[1]) if wall[0] == "side" else (wall[1], shortest.x[0])
+    assert path.length_m[0] == pytest.approx(shortest.fun, abs=1e-8)
+    assert path.azimuth_rad[0] == pytest.approx(np.arctan2(met[1], met[0]), abs=1e-4)
+
+
+def test_who_is_out_of_sight_is_heard_from_the_near_corner() -> None:
+    direct = sound_paths(MODEL.walls, 7.15, np.array([-20.0, -4.6, 4.6, 20.0]), HZ)[0]
+    corner = np.arctan2(2.8, 4.45)
+    assert direct.azimuth_rad == pytest.approx([-corner, -corner, corner, corner])
+    # Maekawa: 5 dB at the edge of the shadow, more the farther behind it and the higher the tone.
+    assert -10 * np.log10(direct.passed[1]) == pytest.approx(np.full(len(HZ), 4.9), abs=0.4)
+    assert (direct.passed[0] < direct.passed[1]).all() and (np.diff(direct.passed[0]) < 0).all()
+
+
+@given(st.floats(1e-6, 1e6), st.floats(-1e3, 1e3), st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_scale_and_offset_of_a_spectrum_say_nothing(scale: float, offset: float, seed: int) -> None:
+    spectrum = np.random.default_rng(seed).normal(size=len(AZIMUTHS))
+    like, nobody = MODEL.log_likelihood(spectrum)
+    again, _ = MODEL.log_likelihood(scale * (spectrum + offset))
+    assert again == pytest.approx(like, abs=1e-5)
+    assert np.isfinite(like).all() and nobody > 0.0
+
+
+def test_a_mirrored_street_mirrors_the_likelihood() -> None:
+    spectrum = np.random.default_rng(3).normal(size=len(AZIMUTHS))
+    even, mirrored = model_of(2.0, 3.5), model_of(3.5, 2.0)
+    # Draws give the left and the right wall different factors; both orders of them are the same street.
+    like = np.mean(even.heard_share, axis=0)
+    assert np.mean(mirrored.heard_share, axis=0)[::-1] == pytest.approx(like, abs=0.05)
+    found, other = even.log_likelihood(spectrum)[0], mirrored.log_likelihood(spectrum[::-1])[0]
+    assert np.corrcoef(found, other[::-1])[0, 1] > 0.9
+
+
+def test_a_vehicle_in_view_is_where_its_bearing_meets_the_lane() -> None:
+    for azimuth_deg in (-25.0, -10.0, 15.0):
+        like, nobody = MODEL.log_likelihood(plane_waves(azimuth_deg))
+        along_m = 7.15 * np.tan(np.radians(azimuth_deg))
+        assert MODEL.along_m[like.argmax()] == pytest.approx(along_m, abs=1.5)
+        assert like.max() > nobody
+
+
+@pytest.mark.parametrize("bad", [np.zeros(61), np.zeros(60), np.full(61, np.nan)])
+def test_a_spectrum_that_says_nothing_is_refused(bad: np.ndarray) -> None:
+    with pytest.raises(InvalidArgumentError, match="spectrum"):
+        MODEL.log_likelihood(bad)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 2.0))
+@settings(max_examples=20, deadline=None)
+def test_probabilities_sum_to_one(seed: int, dt_s: float) -> None:
+    rng, belief = np.random.default_rng(seed), PLACES.unknown
+    for _ in range(3):
+        belief = PLACES.update(PLACES.predict(belief, round(dt_s, 1)), rng.normal(size=len(AZIMUTHS)))
+        assert np.exp(belief.log_present).sum() + np.exp(belief.log_nobody) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_prediction_moves_the_mean_by_its_speed() -> None:
+    # One vehicle at -5 m that goes left at 4 m/s; its speed may change, equally up and down.
+    sharp = np.full_like(PLACES.unknown.log_present, -700.0)
+    speed = 15 + 6
+    sharp[speed, np.abs(MODEL.along_m + 5.0).argmin()] = 0.0
+    belief = PlaceBelief(sharp, -700.0)
+    for _ in range(10):
+        belief = PLACES.predict(belief, 0.1)
+    assert PLACES.estimate(belief).mean_m == pytest.approx(-1.0, abs=0.05)
+    at_once = PLACES.predict(PlaceBelief(sharp, -700.0), 1.0)
+    assert PLACES.estimate(at_once).mean_m == pytest.approx(-1.0, abs=0.05)
+
+
+def test_what_is_passed_on_completes_what_was_known() -> None:
+    adapter, heard = PlaceMeasurements(PLACES), plane_waves(-62.0, 32.0)
+    sent: list[Measurement | PositionScan] = []
+    for hop in range(1, 31):
+        sent += adapter.measure(SpatialSpectrum(hop * 100_000_000, heard))
+    scans = [one for one in sent if isinstance(one, PositionScan)]
+    assert isinstance(adapter.estimate.place, KnownPlace)
+    # The first scan alone is nearly the belief: before it nothing was known.
+    (first,) = scans[0].positions
+    assert first.position_m[1] == pytest.approx(adapter.estimate.mean_m, abs=2.0)
+    assert first.position_m[1] > MODEL.walls.sight_m[1]
+    with pytest.raises(InvalidArgumentError, match="stamp_ns"):
+        adapter.measure(SpatialSpectrum(1, heard))
+
+
+def test_the_example_gives_an_entity_its_place() -> None:
+    example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "examples" / "place.py"))
+    (car,) = example["behind_the_corner"](25).entities
+    assert car.status == "hidden" and car.direction == "left"
+    assert car.position_m[1] == pytest.approx(7.0, abs=2.0)
+
+
+@pytest.mark.slow
+def test_a_simulated_pass_is_followed_round_the_corner() -> None:
+    from worldstate_lab.places.junctions import WALLS, place_models
+
+    models = place_models()
+    for seed, site in enumerate(WALLS):
+        _, table = simulated_pass(site, np.random.default_rng([9, seed]))
+        said = followed_places(PlaceFilter(models[site]), table)
+        right, left = WALLS[site].sight_m
+        hidden = (table.along_m < right) | (table.along_m > left)
+        sides = np.array([one.left_probability > 0.5 for one in said])
+        assert np.mean(sides[hidden] == (table.along_m[hidden] > 0.0)) > 0.9
+        errors = np.array([one.mean_m for one in said]) - table.along_m
+        assert np.sqrt(np.mean(errors[~hidden] ** 2)) < 2.0

@@ -1,0 +1,120 @@
+"""Planners at blind corners: whom they hit, when they brake, and whether they drive as a car can."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+from worldstate_lab.planner.believed_stream import BelievedStream, with_chances
+from worldstate_lab.planner.closed_loop import drive_through
+from worldstate_lab.planner.ego_vehicle import FROM_STANDING, EgoVehicle
+from worldstate_lab.planner.encounters import STEP_S, Encounters
+from worldstate_lab.planner.planner_exam import (
+    CHANCE,
+    FULL,
+    NOBODY,
+    PHANTOM,
+    draw_corners,
+    every_planner,
+    planner_figures,
+    safe_threshold,
+)
+
+from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.metrics.alarm_rate import share_interval
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.simulation.scene.junction import site
+
+PACE_MPS, ENTRY_Y_M, ENTRIES_S = 4.5, 4.0, (40.0, 80.0, 120.0, 160.0)
+
+
+def stream(name: str = "SB2", entries_s: tuple[float, ...] = ENTRIES_S, known: bool = True) -> BelievedStream:
+    """Return vehicles from the left and from the right by turns, the chance one in the 3 s before each T0."""
+    rows, near_m = [], site(name).lanes_m
+    for number, entry_s in enumerate(entries_s):
+        side = number % 2
+        for time_s in np.round(np.arange(entry_s - 8.0, entry_s + 5.0, 0.1), 1):
+            way_m = ENTRY_Y_M - PACE_MPS * (time_s - entry_s)
+            rows.append((number, time_s, near_m[side], (1 - 2 * side) * way_m, abs(way_m) <= ENTRY_Y_M, 60.0))
+    time_s = np.round(np.arange(1.0, 220.0, 0.1), 1)
+    chances = np.zeros((len(time_s), 2, 4), np.float32)
+    for number, entry_s in enumerate(entries_s if known else ()):
+        chances[(time_s > entry_s - 3.0) & (time_s < entry_s), number % 2] = 1.0
+    n, names = len(entries_s), ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
+    kinds = ["light"] * (n - n // 4) + ["bicycle"] * (n // 4)
+    told = {
+        "vehicle": np.arange(n),
+        "flow": np.array(["left"] * n, np.str_),
+        "kind": np.array(kinds, np.str_),
+        "arm": np.array(["left", "right"] * n, np.str_)[:n],
+        "entry_s": np.array(entries_s),
+        "hazard": np.ones(n, bool),
+    }
+    table = HopTable({"time_s": time_s}, about={"site": name})
+    columns = dict(zip(names, np.array(rows).reshape(-1, 6).T, strict=True))
+    columns["in_view"] = columns["in_view"].astype(bool)
+    heard = HeardStream(table, HopTable(told), HopTable(columns))
+    return with_chances(heard, HopTable({"time_s": time_s, "within": chances}))
+
+
+EVERY = (stream(), stream("SA1"), stream(entries_s=()))
+
+
+@pytest.mark.parametrize("ego", [EgoVehicle(), FROM_STANDING])
+def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego: EgoVehicle) -> None:
+    corners = draw_corners(EVERY, 40, ego, np.random.default_rng(1))
+    figures = planner_figures(corners, every_planner(corners, 0.5, 0.5, ego), np.random.default_rng(2))
+    nobody, phantom, full, chance = (figures[name] for name in (NOBODY, PHANTOM, FULL, CHANCE))
+    assert nobody["loud_collisions"] > 0 and nobody["empty_needless_s"] == 0.0
+    assert [one["loud_collisions"] + one["quiet_collisions"] for one in (phantom, full, chance)] == [0, 0, 0]
+    assert chance["empty_needless_s"] == 0.0 < full["empty_needless_s"] < phantom["empty_needless_s"]
+    assert chance["empty_took_s"] == nobody["empty_took_s"] < phantom["empty_took_s"]
+    assert chance["loud_recorded"] == 6 and chance["quiet_recorded"] == 2
+    assert 0.9 < chance["less_at_0.05_low"] <= chance["less_at_0.05"] <= chance["less_at_0.05_high"] <= 1.0
+    assert phantom["less_at_0.2"] == 0.0
+
+
+def test_a_chance_that_says_nothing_of_those_who_come_is_not_trusted() -> None:
+    ego, rng = EgoVehicle(), np.random.default_rng(3)
+    knowing = draw_corners(EVERY, 20, ego, rng)
+    unheard = draw_corners([stream(known=False), EVERY[2]], 20, ego, rng)
+    assert safe_threshold([knowing.quiet], ego) == 0.0453
+    assert safe_threshold([unheard.loud], ego) == 0.0
+
+
+def with_within(encounters: Encounters, within: np.ndarray) -> Encounters:
+    from dataclasses import replace
+
+    return replace(encounters, within=np.broadcast_to(within, encounters.within.shape))
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.95))
+def test_whatever_is_said_no_car_brakes_or_accelerates_beyond_its_limits(seed: int, threshold: float) -> None:
+    ego, rng = EgoVehicle(), np.random.default_rng(seed)
+    corners = draw_corners(EVERY, 8, ego, rng)
+    told = with_within(corners.loud, rng.random((8, corners.loud.within.shape[1], 2, 4)))
+    driven = drive_through(told, threshold, ego)
+    speed = np.diff(driven.front_m, axis=1) / STEP_S
+    moving = np.diff(driven.front_m[:, 1:], axis=1) > 0.0
+    change = np.diff(speed, axis=1)[moving] / STEP_S
+    assert speed.min() >= 0.0 and speed.max() <= ego.limit_mps + 1e-6
+    assert change.min() >= -ego.full_mps2 - 1e-6 and change.max() <= ego.acceleration_mps2 + 1e-6
+    always = drive_through(told, 0.0, ego)
+    np.testing.assert_array_equal(always.front_m, drive_through(corners.loud, 0.0, ego).front_m)
+
+
+def test_streams_without_what_is_asked_for_are_refused() -> None:
+    with pytest.raises(InvalidArgumentError, match="60 replays of approaches"):
+        draw_corners([EVERY[2]], 60, EgoVehicle(), np.random.default_rng(0))
+    with pytest.raises(InvalidArgumentError, match="60 moments without anybody"):
+        draw_corners([EVERY[0]], 60, EgoVehicle(), np.random.default_rng(0))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 2000), st.floats(0.0, 1.0))
+def test_the_interval_of_a_share_is_that_of_clopper_and_pearson(of: int, share: float) -> None:
+    count = round(share * of)
+    exact = binomtest(count, of).proportion_ci(0.95, "exact")
+    assert share_interval(count, of) == pytest.approx((exact.low, exact.high), abs=1e-9)

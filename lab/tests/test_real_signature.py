@@ -1,0 +1,144 @@
+"""Golden runs of the method on the released windows of OVAD, beside what it has to beat."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from released_data import FOLDER, needs_released_windows
+from released_data import TABLE as NAME
+from worldstate_lab.features.comparison import comparison, run_passes
+from worldstate_lab.features.feature_report import report
+from worldstate_lab.features.held_out import predict_held_out
+
+from worldstate.adapters.datasets.feature_table import read_features, read_ids
+from worldstate.cli.main import execute
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.serialisation import encode
+from worldstate.operations.training.methods import row_of
+from worldstate.operations.training.training import TrainingSettings, train_model
+
+TABLE = FOLDER and FOLDER / NAME
+pytestmark = needs_released_windows
+
+
+def compared(group, protocol, others=(), seeds=1, reference="curated"):
+    row = row_of("worldstate", protocol, reference)
+    whole = read_features(TABLE)
+    table = whole.group(group)
+    train = whole.group("static") if protocol == "transfer" else None
+    passes = run_passes((row, *others), table, protocol, seeds=seeds, alpha=0.02, train=train)
+    return comparison(table, passes, row, 0.02, draws=60)
+
+
+def test_a_standing_ego_at_a_junction_never_seen():
+    figures = compared("static", "lojo", ("loudest_direction",))
+    assert figures["auroc_macro"] >= 0.97
+    assert figures["auroc_pooled"] >= 0.965
+    assert figures["worst_group_auroc"] >= 0.95
+    assert figures["accuracy"] >= 0.88
+    assert figures["tpr"] >= 0.75
+    assert figures["fpr_p_value"] >= 0.05
+    assert figures["ece"] <= figures["ece_floor"] + 2 * figures["ece_floor_std"]
+    for key in ("auroc_macro", "auroc_pooled", "tpr"):
+        assert figures["gains"]["loudest_direction"][key]["low"] > 0
+
+
+def test_a_moving_ego_at_a_junction_never_seen():
+    # Three of five junctions here, so that each classifier learns from two.
+    figures = compared("dynamic", "lojo")
+    assert figures["auroc_macro"] >= 0.86
+    assert figures["auroc_pooled"] >= 0.82
+    assert figures["accuracy"] >= 0.69
+    assert figures["tpr"] >= 0.42
+    assert figures["fpr_p_value"] >= 0.05
+    assert figures["ece"] <= figures["ece_floor"] + 2 * figures["ece_floor_std"]
+
+
+@pytest.mark.slow
+def test_what_a_stream_brings_lies_between_nothing_and_the_curated_windows():
+    # A moving ego's level says little at a junction unless the junction is known; three passes, one table.
+    table = read_features(TABLE).group("dynamic")
+    rows = [row_of("worldstate", "lojo", reference) for reference in ("cold", "run", "curated")]
+    passes = run_passes(rows, table, "lojo", seeds=1, alpha=0.02)
+    cold, run, curated = (comparison(table, passes, row, 0.02, draws=2)["auroc_pooled"] for row in rows)
+    assert cold + 0.02 < run < curated - 0.02
+
+
+@pytest.mark.slow
+def test_new_recordings_of_known_junctions():
+    figures = compared("static", "cv")
+    assert figures["auroc_pooled"] >= 0.98
+    assert figures["accuracy"] >= 0.915
+    assert figures["tpr"] >= 0.84
+    assert figures["fpr_p_value"] >= 0.05
+
+
+def test_from_a_standing_to_a_moving_ego():
+    figures = compared("dynamic", "transfer")
+    assert figures["auroc_macro"] >= 0.83
+    assert figures["auroc_pooled"] >= 0.82
+    assert figures["fpr_p_value"] >= 0.05
+    assert figures["ece"] <= figures["ece_floor"] + 2 * figures["ece_floor_std"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["lojo", "cv", "transfer"])
+@pytest.mark.parametrize("row", ["baseline", "baseline_absent", "loudest_direction"])
+def test_a_moving_ego_gains_on_every_other_row(protocol, row):
+    figures = compared("dynamic", protocol, ("baseline", "loudest_direction"))
+    assert figures["gains"][row]["auroc_pooled"]["gain"] > 0
+    assert figures["gains"][row]["brier"]["gain"] < 0
+
+
+def command(*words):
+    return execute(["evaluate-features", str(TABLE), *map(str, words)])
+
+
+@pytest.mark.slow
+def test_the_command_prints_every_row_and_writes_what_it_scored(tmp_path, capsys):
+    out = tmp_path / "p.csv"
+    words = ("--group", "dynamic", "--protocol", "transfer", "--method", "worldstate", "--seeds", 1)
+    assert command(*words, "--json", "--predictions", out) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert set(figures["rows"]) == {
+        "baseline", "baseline_absent", "loudest_direction", "distant_site_cold", "distant_site_curated",
+        "ensemble_run",
+    }  # fmt: skip
+    for row in (figures, *figures["rows"].values()):
+        for key, (low, high) in row["intervals"].items():
+            assert low <= high
+            assert key == "ece" or low - 1e-9 <= row[key] <= high + 1e-9
+    rows = list(csv.DictReader(out.open()))
+    hazard_free = [row for row in rows if row["class"] == "none"]
+    assert np.mean([int(row["decision"]) for row in hazard_free]) == pytest.approx(figures["fpr"])
+    for row in rows[:20]:
+        left, right, none = (float(row[key]) for key in ("p_left", "p_right", "p_none"))
+        assert float(row["score"]) == pytest.approx((left + right) / (left + right + none))
+    assert command(*words[:-2], "--seeds", 1) == 0
+    assert "gain over loudest_direction" in capsys.readouterr().out
+    with pytest.raises(InvalidArgumentError, match="transfer"):
+        command("--group", "static", "--protocol", "transfer")
+
+
+def test_no_row_of_the_data_ships_and_the_official_test_recordings_hold():
+    table = read_features(TABLE).group("static")
+    ids = read_ids(TABLE.parent / "timeHorizonStaticTestset.csv")
+    settings = TrainingSettings(repeats=1, method="worldstate")
+    model = train_model(table.without(ids), settings, dataset="OVAD", group="static")
+    figures = report(
+        table.only(ids), [predict_held_out(model, table.only(ids), 0.02, "curated", np.random.default_rng(0))]
+    )
+    assert figures["accuracy"] >= 0.88
+    assert figures["auroc_pooled_absent"] >= 0.975
+    written = {f"{value:.6f}" for value in leaves(encode(model.signature))}
+    for row in np.concatenate([table.features, np.log(table.features)]):
+        assert len(written & {f"{value:.6f}" for value in row}) < 10
+
+
+def leaves(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [leaf for item in value for leaf in leaves(item)]
+    return [value] if isinstance(value, float) else []

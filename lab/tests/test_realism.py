@@ -1,0 +1,310 @@
+"""The comparison of simulated with real windows, on sets whose answer is known and on the released ones."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.signal
+from released_data import FOLDER, TABLE, needs_released_windows
+from worldstate_lab.cli import realism as command
+from worldstate_lab.streets.groupings import halves
+from worldstate_lab.streets.measures import MEASURES, describe_windows, spread_values
+from worldstate_lab.streets.realism import Realism, measure_realism
+from worldstate_lab.streets.set_figures import set_figures
+from worldstate_lab.streets.side import odd_profiles, side_accuracy
+from worldstate_lab.streets.simulated_windows import (
+    DECIMATION,
+    NFFT,
+    RATE_HZ,
+    WindowPlan,
+    permuted_array,
+    simulated_windows,
+    window_features,
+    windows_of_recording,
+)
+from worldstate_lab.streets.transfer import published_transfer
+from worldstate_lab.streets.two_sample import measure_areas, two_sample_areas
+
+from worldstate.abduction.signature.mirror import mirror_features
+from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.cli.main import main
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.direction.feature import published_feature
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.simulation.scene.presets import preset
+
+LABELS = ("left", "right", "none", "front")
+PLACES = ("SA1", "SA2", "SB1", "SB2")
+
+
+def windows(rng: np.random.Generator, n: int = 24, louder: float = 1.5, scale: float = 1.0) -> FeatureTable:
+    """Smooth made-up windows of four junctions, two louder; hazards are `louder`, their peak aside."""
+    labels = np.repeat(LABELS, n)
+    middle = np.select([labels == "left", labels == "right"], [22.0, 7.0], 14.5)[:, None]
+    bump = np.exp(-0.5 * ((np.arange(30) - middle - rng.normal(0, 3, (4 * n, 1))) / 4.0) ** 2)
+    gain = np.where(labels == "none", 1.0, louder)[:, None] * rng.lognormal(0.0, 0.1, (4 * n, 1))
+    gain *= np.tile([0.93, 1.07, 1.07, 0.93], n)[:, None]
+    features = scale * gain * np.tile(0.1 + 0.1 * bump, (1, 2)) * rng.lognormal(0.0, 0.05, (4 * n, 60))
+    keys = np.array([str(i) for i in range(4 * n)])
+    return FeatureTable(features, labels, keys, np.tile(PLACES, n), keys, (None,) * (4 * n))
+
+
+def row(found: Realism, figure: str, of: str):
+    return next(one for one in found.rows if (one.figure, one.windows) == (figure, of))
+
+
+def test_sets_of_one_kind_cannot_be_told_apart():
+    rng = np.random.default_rng(1)
+    one = windows(rng)
+    areas = [two_sample_areas(one, other, rng)["all"] for other in (windows(rng), windows(rng, scale=2.0))]
+    assert 0.3 < areas[0] < 0.65
+    assert areas[1] > 0.9
+
+
+def test_what_real_junctions_are_to_one_another_is_inside():
+    rng = np.random.default_rng(1)
+    sets = {"alike": windows(rng), "louder": windows(rng, scale=2.0)}
+    found = measure_realism(windows(rng), sets, rng, classifiers=False)
+    assert row(found, "AUROC of level", "none").inside == {"alike": True, "louder": False}
+    medians = [one.inside for one in found.rows if one.figure.startswith("median of level, type")]
+    assert len(medians) == 2 * 3
+    assert all(inside == {"alike": True, "louder": False} for inside in medians)
+    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["groupings"][0] == "SA1 SB1 | SA2 SB2"
+
+
+def test_a_gain_over_the_scalar_has_an_interval_around_the_difference():
+    rng = np.random.default_rng(3)
+    one = published_transfer(windows(rng, louder=1.1), windows(rng, louder=1.1), rng, draws=100)
+    assert one.gain is not None
+    assert one.gain[0] <= one.auroc - one.scalar <= one.gain[1]
+
+
+def test_shape_does_not_depend_on_the_level():
+    features = windows(np.random.default_rng(4)).features
+    one, two = describe_windows(features), describe_windows(3.0 * features)
+    logs, logs_of_louder = spread_values(features), spread_values(3.0 * features)
+    for name in MEASURES:
+        scales = name in ("level", "peak", "change")
+        np.testing.assert_allclose(two[name], (3.0 if scales else 1.0) * one[name], rtol=1e-9, atol=1e-12)
+        shift = np.log(3.0) if scales else 0.0
+        np.testing.assert_allclose(logs_of_louder[name] - logs[name], shift, atol=1e-9)
+
+
+def test_the_areas_do_not_depend_on_the_order_of_the_sets():
+    rng = np.random.default_rng(5)
+    one, other = windows(rng), windows(rng, scale=1.1)
+    areas = measure_areas(one, other)
+    assert areas == pytest.approx(measure_areas(other, one))
+    assert min(areas.values()) >= 0.5
+
+
+def test_windows_without_a_class_are_compared_by_the_others():
+    table = windows(np.random.default_rng(10))
+    found = measure_realism(
+        table, {"made": table.select(table.labels != "front")}, np.random.default_rng(0), classifiers=False
+    )
+    assert {one.windows for one in found.rows if one.figure.startswith("AUROC")} == {"hidden", "none"}
+
+
+def test_the_side_is_learned_from_other_junctions_and_is_chance_where_labels_are_shuffled():
+    rng = np.random.default_rng(6)
+    table = windows(rng, n=60)
+    assert min(side_accuracy(table, table).values()) > 0.9
+    shuffled = FeatureTable(
+        table.features,
+        np.concatenate([rng.permutation(table.labels[:120]), table.labels[120:]]),
+        *(table.ids, table.environments, table.recordings, table.t0_frames),
+    )
+    assert 0.3 < np.mean(list(side_accuracy(shuffled, shuffled).values())) < 0.7
+
+
+def test_the_mirrored_street_has_the_same_side():
+    """Left and right exchanged, features and labels: the same accuracy, and the same odd profile."""
+    table = windows(np.random.default_rng(7))
+    swapped = np.select([table.labels == "left", table.labels == "right"], ["right", "left"], table.labels)
+    about = table.ids, table.environments, table.recordings, table.t0_frames
+    mirrored = FeatureTable(mirror_features(table.features), swapped, *about)
+    assert side_accuracy(table, mirrored) == side_accuracy(table, table)
+    for site, profile in odd_profiles(table).items():
+        np.testing.assert_allclose(odd_profiles(mirrored)[site], profile, atol=1e-12)
+        assert profile[:, 4:12].min() > 0.0  # the far side is the louder one
+
+
+def test_the_share_between_sites_is_that_of_their_offsets():
+    """Sites that differ by known offsets in pattern and in level, in random windows."""
+    rng = np.random.default_rng(8)
+    table = windows(rng, n=400)
+    offsets = dict(zip(PLACES, rng.normal(0.0, 0.2, (len(PLACES), 60)), strict=True))
+    noise = rng.normal(0.0, 0.2, (1600, 60))
+    levels = noise + np.array([offsets[name] for name in table.environments])
+    about = table.labels, table.ids, table.environments, table.recordings, table.t0_frames
+    figures = set_figures(FeatureTable(np.exp(levels), *about))
+    assert figures["between-site share of pattern", "none"] == pytest.approx(0.43, abs=0.06)
+    assert figures["sd of pattern", "none"] == pytest.approx(0.26, abs=0.02)
+
+
+def test_junctions_are_grouped_so_that_both_halves_hold_both_types():
+    assert len(halves(["SA1", "SA2", "SB1", "SB2", "SB3"])) == 6
+    assert [str(one) for one in halves(["DA1", "DB1", "DB2"])] == [
+        "DA1 | DB1 DB2",
+        "DB1 | DA1 DB2",
+        "DB2 | DA1 DB1",
+    ]
+
+
+def test_a_set_without_hazards_is_refused():
+    rng = np.random.default_rng(5)
+    calm = windows(rng)
+    with pytest.raises(InvalidArgumentError, match="seed 1"):
+        measure_realism(windows(rng), {"seed 1": calm.select(calm.hazard_free)}, rng)
+
+
+@needs_released_windows
+def test_the_released_windows_have_the_known_figures():
+    """Figures of the released windows that were computed by another program (review of the simulation)."""
+    real = read_features(FOLDER / TABLE).group("static")
+    figures = set_figures(real)
+    for windows_of, sd in (("hidden", 0.151), ("front", 0.130), ("none", 0.264)):
+        assert figures["sd of log level", windows_of] == pytest.approx(sd, abs=5e-4)
+    assert figures["between-site share of pattern", "hidden"] == pytest.approx(0.57, abs=5e-3)
+    assert figures["between-site share of level", "none"] == pytest.approx(0.42, abs=5e-3)
+    assert figures["sd of pattern", "none"] == pytest.approx(0.148, abs=5e-4)
+    assert figures["iqr of log prominence", "none"] == pytest.approx(0.131, abs=5e-4)
+    assert figures["share of peaks at 40 to 65 deg", "hidden"] == pytest.approx(0.89, abs=5e-3)
+    assert figures["area of the second half's peak", "hidden, none"] == pytest.approx(0.945, abs=1e-3)
+    sides = side_accuracy(real, real)
+    assert len(sides) == 5
+    assert min(sides.values()) > 0.8
+    far = np.array([odd_profiles(real)[name][1, 4:8] for name in ("SB1", "SB2", "SB3")])
+    assert 0.01 < far.min() < far.max() < 0.14
+    # Two tuning junctions against the rest: an area near the lower end of .92 to .96.
+    held = halves(sorted(set(real.environments.tolist())))[-1]
+    assert str(held) == "SA2 SB3 | SA1 SB1 SB2"
+    assert two_sample_areas(*held.tables(real), np.random.default_rng(1))["all"] == pytest.approx(
+        0.92, abs=0.015
+    )
+
+
+def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
+    """Band-limited noise from one side, at both rates: the same bins, hence the same feature."""
+    rng, n = np.random.default_rng(6), 48_000
+    offsets = ovad_array().centred_m
+    spectrum = np.fft.rfft(rng.standard_normal(n + DECIMATION * NFFT))
+    frequency = np.fft.rfftfreq(n + DECIMATION * NFFT, 1 / (DECIMATION * RATE_HZ))
+    spectrum[frequency > 3000.0] = 0.0
+    delays = -offsets @ np.array([np.cos(0.7), np.sin(0.7), 0.0]) / 343.0
+    sound = np.fft.irfft(
+        spectrum * np.exp(-2j * np.pi * frequency * delays[:, None]), n + DECIMATION * NFFT
+    ).T
+    sound += 0.3 * scipy.signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(sound.shape), axis=0)
+    full = published_feature(sound[:n], ovad_array(), DECIMATION * RATE_HZ)
+    arrays = ovad_array(), permuted_array()
+    quarter, permuted = window_features(sound[:n:DECIMATION].astype(np.float32), arrays)
+    assert full.max() > 1.2 * full.mean()
+    # The independent noise beyond 6 kHz folds back at the lower rate; it is 20 dB down at 1 kHz.
+    np.testing.assert_allclose(quarter, full, atol=0.12 * full.max())
+    assert np.argmax(quarter[:30]) == np.argmax(full[:30])
+    # With permuted positions no beam adds up at high frequencies; at low ones the microphones stand together.
+    assert np.ptp(permuted) < 0.7 * np.ptp(quarter)
+
+
+def test_the_windows_of_a_simulated_approach_are_features_by_right_and_permuted_positions():
+    plan = WindowPlan(0, "SB1", "left", np.random.SeedSequence(3))
+    rows = windows_of_recording(preset(), plan)
+    assert [row[1:] for row in rows] == [("left", "SB1", "0"), ("front", "SB1", "0")]
+    right, permuted = np.array([row[0] for row in rows]).transpose(1, 0, 2)
+    assert right.shape == (2, 60)
+    assert (right > 0.0).all()
+    assert (permuted > 0.0).all()
+    assert not np.allclose(permuted, right, rtol=0.01)
+
+
+def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
+    """They end at T0, a frame, or half a second later if the ego moves; the front window 1.5 s after."""
+    ends, entries = {}, []
+
+    def rendered(scene, rng):
+        entries.append(scene.entry_s)
+        return SimpleNamespace(audio=np.arange(round(scene.duration_s * RATE_HZ)))
+
+    def feature(cut, arrays):
+        assert len(cut) == round(RATE_HZ)
+        ends.setdefault(len(entries), []).append(cut[-1] / RATE_HZ - entries[-1])
+        return np.zeros((2, 60))
+
+    monkeypatch.setattr("worldstate_lab.streets.simulated_windows.simulate_recording", rendered)
+    monkeypatch.setattr("worldstate_lab.streets.simulated_windows.window_features", feature)
+    table = simulated_windows(20, 1, sites=("SA1", "DA1"))
+    assert table.labels[:6].tolist() == ["left", "front", "right", "front", "none", "none"]
+    assert len(np.unique(table.recordings)) == 160
+    hidden = np.array([found[0] for found in ends.values()])
+    moving = np.array([name == "DA1" for name in table.environments[table.labels != "front"]])
+    assert (np.abs(hidden[~moving] - 0.05) <= 0.0502).all()
+    assert (np.abs(hidden[moving] - 0.55) <= 0.0502).all()
+    assert np.ptp(hidden[moving]) > 0.08
+    later = [found[1] - found[0] for found in ends.values() if len(found) == 2]
+    assert len(later) == 80
+    np.testing.assert_allclose(later, 1.5, atol=1e-3)
+
+
+def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
+    """Windows that were made before, at some of the junctions, without simulating."""
+    rng = np.random.default_rng(9)
+    write_features(tmp_path / "real.csv", windows(rng))
+    made = windows(rng)
+    write_features(tmp_path / "made.csv", made)
+    write_features(tmp_path / "wrong.csv", made)
+    words = ["realism", str(tmp_path / "real.csv"), "--sites", "SA1", "SB1", "--json"]
+    given = [*words, "--simulated", str(tmp_path / "made.csv"), "--out", str(tmp_path / "r")]
+    given += ["--permuted", str(tmp_path / "wrong.csv")]
+    assert main(given) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / "r" / "realism.json").read_text()) == report
+    assert report["groupings"] == ["SA1 | SB1"]
+    assert {name for one in report["rows"] for name in one["simulated"]} == {"made"}
+    assert [
+        one["simulated"]["made"] > 0.9 for one in report["rows"] if one["figure"].startswith("transfer")
+    ] == [True] * 2
+    # The same features twice: nothing is lost by the positions, which is not as asked.
+    lost = [one for one in report["rows"] if one["figure"] == "loss by permuted positions: shipped model"]
+    assert [(one["simulated"], one["met"]) for one in lost] == [({"made": 0.0}, {"made": False})]
+    assert (tmp_path / "r" / "realism.png").stat().st_size > 50_000
+    assert main([*words, "--real-only", "--measures-only"]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    spans = [
+        {(one["figure"], one["windows"]): one["halves"] for one in found["rows"]} for found in (report, alone)
+    ]
+    assert spans[0]["AUROC of peak", "none"] == spans[1]["AUROC of peak", "none"]
+    assert not any(figure in ("C2ST", "transfer") or figure.startswith("side") for figure, _ in spans[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("group", "sites"), [("static", ("SA1", "SB1")), ("dynamic", ("DA1", "DB1"))])
+def test_the_command_simulates_the_junctions_of_a_table(group, sites, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "WINDOWS", 2)
+    monkeypatch.setattr(command, "SEEDS", (4,))
+    table = windows(np.random.default_rng(0))
+    write_features(tmp_path / "real.csv", replace(table, environments=np.tile(sites, len(table) // 2)))
+    words = ["realism", str(tmp_path / "real.csv"), "--group", group, "--out", str(tmp_path / "r"), "--json"]
+    assert main(words) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert set(report["profiles"]) == {"real", "seed 4"}
+    assert set(report["profiles"]["seed 4"]) == set(sites)
+    pair = [read_features(tmp_path / "r" / f"{name}-4.csv") for name in ("windows", "permuted")]
+    assert pair[0].labels.tolist() == pair[1].labels.tolist()
+    given = [*words, "--simulated", str(tmp_path / "r" / "windows-4.csv"), "--measures-only"]
+    assert main(given) == 0
+    again = {
+        (one["figure"], one["windows"]): one["simulated"]
+        for one in json.loads(capsys.readouterr().out)["rows"]
+    }
+    first = {(one["figure"], one["windows"]): one["simulated"] for one in report["rows"]}
+    assert again["sd of log level", "none"] == {"windows-4": first["sd of log level", "none"]["seed 4"]}
+
+
+def test_a_table_without_the_group_is_refused_before_the_work(tmp_path, capsys):
+    write_features(tmp_path / "real.csv", windows(np.random.default_rng(0), n=2))
+    assert main(["realism", str(tmp_path / "real.csv"), "--group", "dynamic"]) == 2
+    assert "dynamic" in capsys.readouterr().err

@@ -1,0 +1,379 @@
+"""The report: whole files, nothing from outside as markup, the paper's numbers beside ours."""
+
+import csv
+import io
+import math
+from base64 import b64decode
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
+from worldstate_lab.degradation.beta_curves import Band, BetaCurves
+from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, Condition
+from worldstate_lab.degradation.degradation_study import (
+    DegradationSettings,
+    DegradationStudy,
+    DetectorSweep,
+)
+from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
+from worldstate_lab.evaluation.front_end_study import front_end_study
+from worldstate_lab.evaluation.paper_values import PAPER_VALUES, paper_value
+from worldstate_lab.evaluation.protocol_run import ProtocolRun
+from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC
+from worldstate_lab.evaluation.report.approach_timeline import ApproachTimeline, approach_figure
+from worldstate_lab.evaluation.report.contents import evaluation_document
+from worldstate_lab.evaluation.report.csv_table import csv_text
+from worldstate_lab.evaluation.report.cueing_panels import roc_curve
+from worldstate_lab.evaluation.report.document import (
+    Curves,
+    Document,
+    ReportFigure,
+    ReportTable,
+    Section,
+    Value,
+)
+from worldstate_lab.evaluation.report.html_page import html_page
+from worldstate_lab.evaluation.report.markdown_page import markdown_page
+from worldstate_lab.evaluation.report.study_sections import signature_values
+from worldstate_lab.evaluation.report.writing import write_document
+from worldstate_lab.evaluation.scores import Score
+from worldstate_lab.methods.calibrated_cue import CalibratedCue
+from worldstate_lab.methods.line_of_sight import VisionOnly
+from worldstate_lab.methods.published_rule import PublishedRule
+from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
+from worldstate_lab.trials.takes import Take, TakeList
+from worldstate_lab.trials.trial import Trial
+
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.recordings.hop_table import HopTable
+
+HOSTILE = '<script src="http://x/y.js">a|b</script> `*_\n| "q" & [t](http://x)'
+
+
+class Page(HTMLParser):
+    """What a browser would load, and whether every tag is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.loads, self.links, self.ids, self.text = [], [], [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.tags.append(tag)
+        self.loads += [given["src"]] if "src" in given else []
+        self.links += [given["href"]] if "href" in given else []
+        self.ids += [given["id"]] if "id" in given else []
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def plot(canvas):
+    canvas.subplots().plot([0, 1], [1, 0])
+
+
+def small_document(text, draw=plot):
+    table = ReportTable(
+        "t", text, (text, "v"), ((text, Value(0.5, 0.4, 0.6, note=text, paper=Value(1.0))),), text
+    )
+    figure = ReportFigure("f", text, text, draw, Curves(("x", text), [(0.1, text)]))
+    return Document(text, text, (Section(text, (text,), (table, figure)),), ((text, text),))
+
+
+def test_what_comes_from_outside_is_text_and_never_markup():
+    document = small_document(HOSTILE)
+    page = Page(html_page(document, {"f": b"png"}, "report_files"))
+    assert page.open == []
+    assert "script" not in page.tags
+    assert [load.partition(",")[0] for load in page.loads] == ["data:image/png;base64"]
+    assert not any("//" in link for link in page.links)
+    assert HOSTILE in page.text
+    text = markdown_page(document, "report_files")
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    # A bar or a line break of a name would change the number of cells.
+    assert {line.replace("\\|", "").count("|") for line in rows} == {3}
+    assert "<script" not in text
+    assert "\\[t](http" in text
+
+
+@settings(max_examples=30)
+@given(st.lists(st.tuples(st.text(max_size=8), st.floats(-1e6, 1e6)), min_size=1, max_size=5))
+def test_csv_gives_every_number_back_to_the_last_bit(rows):
+    table = ReportTable("t", "", ("name", "x"), tuple((name, Value(x, x - 1.0)) for name, x in rows))
+    read = list(csv.reader(io.StringIO(csv_text(table), newline="")))
+    assert read[0] == ["name", "x value", "x low"]
+    assert [(float(a), float(b)) for _, a, b in read[1:]] == [(x, x - 1.0) for _, x in rows]
+
+
+def test_a_value_says_why_it_is_missing_and_never_prints_minus_zero():
+    assert Value(math.nan, note="states none").text == "states none"
+    assert Value(-0.001, -0.004, 0.1).text == "0.00 [0.00, 0.10]"
+    assert Value(1.0, math.nan, 2.0).text == "1.00"
+
+
+def test_a_picture_that_fails_leaves_the_last_report_as_it_was(tmp_path):
+    write_document(small_document("first"), tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    def fail(canvas):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        write_document(small_document("second", fail), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
+        "f.csv", "f.png", "report.html", "report.md", "report_files", "t.csv",
+    ]  # fmt: skip
+    (page,) = Page((tmp_path / "report.html").read_text()).loads
+    assert b64decode(page.partition(",")[2]) == (tmp_path / "report_files" / "f.png").read_bytes()
+
+
+def test_a_file_of_the_user_is_not_taken_for_an_old_report(tmp_path):
+    (tmp_path / "report_files").write_text("mine")
+    with pytest.raises(InputFileError, match="earlier report"):
+        write_document(small_document("x"), tmp_path)
+    assert (tmp_path / "report_files").read_text() == "mine"
+
+
+def test_numbers_of_the_paper_agree_with_each_other():
+    def of(row, figure, group="static"):
+        return paper_value(group, row, figure).value
+
+    rate, sustained = (of(row, "false_alarms_per_hour") for row in ("proposed .02", "published, sustained"))
+    assert 1.0 - rate / sustained == pytest.approx(
+        of("against the sustained rule", "fewer_false_alarms"), abs=0.005
+    )
+    assert 1.0 / of("proposed .02", "hazard_free_hours") == pytest.approx(9.7, abs=0.05)
+    # Onsets are whole: every rate of the static set is a multiple of the quantum, up to rounding.
+    for one in PAPER_VALUES:
+        if one.figure == "false_alarms_per_hour" and one.group == "static":
+            onsets = one.value * of("proposed .02", "hazard_free_hours")
+            assert onsets == pytest.approx(round(onsets), abs=0.06), one
+    assert of("proposed .02", "detection") * 42 == pytest.approx(37, abs=0.05)
+    assert len({(one.group, one.row, one.figure) for one in PAPER_VALUES}) == len(PAPER_VALUES)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_area_under_the_drawn_curve_is_the_auroc(seed):
+    rng = np.random.default_rng(seed)
+    # Rounded, so that scores tie.
+    high, low = rng.normal(1.0, 1.0, 30).round(1), rng.normal(0.0, 1.0, 40).round(1)
+    area = auroc(np.concatenate([high, low]), np.arange(70) < 30)
+    assert np.trapezoid(*roc_curve(high, low)[::-1]) == pytest.approx(area)
+
+
+def heard(name, site, label, seed):
+    """A recording whose likelihoods rise in the last two seconds before T0."""
+    rng = np.random.default_rng(seed)
+    time_s = 1.0 + 0.1 * np.arange(60)
+    near = (label != "none") & (time_s > 3.0) & (time_s < 5.0)
+    logits = rng.normal(0.0, 0.8, (60, 4)) + 2.5 * near[:, None] * np.eye(4)[0 if label == "left" else 1]
+    posterior = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
+    seen = np.where((label != "none") & (time_s > 5.0), 0.3, np.nan)
+    columns = {
+        "time_s": time_s, "shipped": posterior, "published": posterior, "reference_rad": seen,
+        "bearing_rad": np.full(60, 0.31), "srp_rad": np.full(60, 0.31), "music_rad": np.full(60, 0.4),
+        "prominence": 1.0 + rng.random(60), "log_slope_hz": rng.normal(0.0, 1.0, 60),
+        "approach": np.full(60, np.nan),
+        "answer": np.zeros(60, np.int64), "miss_rate": np.ones(60), "clutter_rate": np.zeros(60),
+        "seen": np.isfinite(seen), "there": np.isfinite(seen), "features": np.zeros((60, 60)),
+    }  # fmt: skip
+    about = {
+        "site": site, "moving": False, "fingerprint": name, "doppler": "no tone", "pass_s": 6.0,
+        "prior": {"shipped": [0.25] * 4, "published": [0.25] * 4},
+    }  # fmt: skip
+    return Trial(HopTable(columns, name, label, math.nan if label == "none" else 5.0, about))
+
+
+METHODS = (
+    VisionOnly(),
+    PublishedRule("published"),
+    PublishedRule("published, sustained", sustained=True),
+    *(CalibratedCue(f"proposed {text}", float(text)) for text in (".01", ".02", ".05")),
+    CalibratedCue("curve 0.02", 0.02),
+)
+
+
+def run_of(protocol, trials):
+    """What `run_protocol` gives, without a classifier: the trials hold its posteriors already."""
+    said = {method.name: {} for method in METHODS}
+    for calibration, tested in protocol.parts(trials, np.random.default_rng(0)):
+        for method in METHODS:
+            decide = method.fit([trials[i] for i in calibration], np.random.default_rng(0))
+            said[method.name] |= {i: decide(trials[i]) for i in tested}
+    passes = {name: (tuple(one[i] for i in range(len(trials))),) for name, one in said.items()}
+    return ProtocolRun(protocol, tuple(trials), passes, (0,), "all")
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory):
+    sides = ("left", "none", "right", "none")
+    trials = [
+        heard(f"{site}_{i}", site, sides[i % 4], 10 * j + i)
+        for j, site in enumerate(("SA1", "SB1"))
+        for i in range(8)
+    ]
+    root = tmp_path_factory.mktemp("streets")
+    takes = TakeList(root, tuple(Take(root / t.name, t.name, t.site, t.label) for t in trials), (), (), False)
+    runs = {one.name: run_of(one, trials) for one in (STATIC, FIXED)}
+    scores = {
+        name: {m: Score.of(run.trials, p) for m, p in run.decisions.items()} for name, run in runs.items()
+    }
+    rng = np.random.default_rng(0)
+    draws = {
+        name: stratified_draws([(t.label, t.site) for t in run.trials], rng, 50) for name, run in runs.items()
+    }
+    lacking = {one.name: "needs more" for one in (DYNAMIC, RETRAINED)}
+    study = front_end_study(trials, rng, 20)
+    return Evaluation(
+        takes, tuple(trials), (), lacking, runs, scores, draws, study, None, EvaluationSettings(draws=50)
+    )
+
+
+def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(evaluation, tmp_path):
+    document = evaluation_document(evaluation, configuration=(("--seed", "7"),))
+    blocks = {block.name: block for block in document.all_blocks}
+    assert ("--seed", "7") in document.facts
+    assert len(blocks) == len(document.all_blocks), "two blocks would share a file"
+    assert len(blocks["paper"].rows) == len(PAPER_VALUES)
+    row = next(row for row in blocks["table_i"].rows if row[0] == "proposed .02")
+    cells = dict(zip(blocks["table_i"].columns, row, strict=True))
+    figures = evaluation.scores["static"]["proposed .02"].figures()
+    detected = cells["detected (share)"]
+    assert (detected.value, detected.paper.value) == (figures["detection"], 0.881)
+    assert detected.low <= detected.value <= detected.high
+    rate = cells["false alarms (1/h)"]
+    assert (rate.low, rate.high) == evaluation.scores["static"]["proposed .02"].poisson()
+    assert len(blocks["array"].rows) == 7
+    for _, here, paper, _ in blocks["array"].rows:
+        assert here.value == pytest.approx(paper.value, rel=0.025), "the bounds need no sound"
+    write_document(document, tmp_path)
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.open == []
+    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    assert {link for link in page.links if not link.startswith("#")} <= {
+        f"report_files/{path.name}" for path in (tmp_path / "report_files").iterdir()
+    }
+    assert "not run: needs more" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(evaluation, tmp_path):
+    blocks = {block.name: block for block in evaluation_document(evaluation).all_blocks}
+    hours = 8 * 60 * 0.1 / 3600.0
+    told = f"16 recordings: 8 approaches and 8 hazard-free, {hours:.3f} h."
+    assert {"table_i", "alpha", "calibration", "strata", "ablations", "protocol_junctions_fixed"} <= {
+        name for name, block in blocks.items() if block.caption.startswith(told)
+    }
+    assert {row[2] for row in blocks["junctions"].rows} == {"8"}
+    assert {row[1] for row in blocks["differences"].rows} == {"16"}
+    table = blocks["table_i"]
+    row = next(row for row in table.rows if row[0] == "proposed .02")
+    sites = evaluation.scores["static"]["proposed .02"].by_site()
+    rate = dict(zip(table.columns, row, strict=True))["false alarms (1/h)"]
+    worst = max(sites, key=lambda site: sites[site]["false_alarms_per_hour"])
+    assert rate.note == f"worst {worst} {sites[worst]['false_alarms_per_hour']:.0f}"
+    assert rate.note in csv_text(table)
+    fewer = next(row for row in blocks["paper"].rows if row[2].endswith("false alarms saved"))[5]
+    assert fewer.low <= fewer.value <= fewer.high
+
+
+def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evaluation, tmp_path):
+    why = "<b>: not the array of the model"
+    refused = {"static": {"shipped model": why, "shipped scores .02": why}}
+    document = evaluation_document(replace(evaluation, refused=refused))
+    blocks = {block.name: block for block in document.all_blocks}
+    for name, method in (("table_i", "shipped model"), ("grounded", "shipped scores .02")):
+        (cells,) = (row[1:] for row in blocks[name].rows if row[0] == method)
+        assert cells[0].number == "not scored: the model was not made for this sound"
+        assert not any(math.isfinite(cell.value) for cell in cells)
+        assert blocks[name].caption.endswith(f"Not scored: {why}.")
+    assert not any(row[0] == "shipped model" for row in blocks["calibration"].rows)
+    write_document(document, tmp_path)
+    assert "&lt;b&gt;: not the array of the model" in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_an_approach_without_video_is_drawn_without_images_and_says_so():
+    times = 1.0 + 0.1 * np.arange(20)
+    figure = approach_figure(
+        ApproachTimeline(
+            "a", times, np.linspace(0, 1, 20), 0.5, 0.02, times > 1.5, np.array([2.0, 2.01]), 1.9
+        )
+    )
+    assert "left out" in figure.caption
+    # The boxes of one image are counted at its hop, each once.
+    assert sum(row[3] for row in figure.numbers.rows) == 2
+
+
+def degradation(detectors):
+    """A sweep in which beta is .1 a level and awareness .98 less .01 a level."""
+    shape = (len(FAMILIES), 5)
+    overall = np.broadcast_to(0.05 + 0.1 * np.arange(5), shape)
+    wide = np.broadcast_to(overall[:, None], (shape[0], 3, shape[1]))
+    by_azimuth = wide + np.array([0.0, 0.01, 0.02])[:, None]
+    conditions = [Condition(CLEAN), *(Condition(f, level) for f in FAMILIES for level in range(1, 5))]
+    rows = tuple(
+        AwarenessRow(
+            one, one.degradation, 0.1, Estimate(0.95 - 0.1 * one.level, 0.4, 1.0), 0.9,
+            Estimate(0.98 - 0.01 * one.level, 0.9, 1.0), None, 0.8, None,
+            Estimate(10.0, 1.0, 40.0), Estimate(10.0, 1.0, 40.0), 0.1,
+        )
+        for one in conditions
+    )  # fmt: skip
+    half = Estimate(0.5, 0.4, 0.6)
+    sweeps = tuple(
+        DetectorSweep(
+            name,
+            BetaCurves(
+                (0.0, 10.0, 20.0, 36.0), np.full(by_azimuth.shape, 30.0), Band(*[by_azimuth] * 3),
+                Band(*[overall] * 3), (),
+            ),
+            Awareness(rows, (CommonCause(1, 6.0, half, half, half, half, half),), 100, 0.03),
+        )
+        for name in detectors
+    )  # fmt: skip
+    return DegradationStudy(sweeps, ("a", "b"), ("c", "d"), {}, (), DegradationSettings())
+
+
+def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation, tmp_path):
+    document = evaluation_document(replace(evaluation, degradation=degradation(("first", "<b>second"))))
+    names = [block.name for block in document.all_blocks]
+    assert len(set(names)) == len(names)
+    assert {"cueing_awareness_1", "cueing_awareness_2", "degradation_2", "rain_2"} <= set(names)
+    paper = {row[2]: row[3:6] for block in document.all_blocks if block.name == "paper" for row in block.rows}
+    least, _, found = paper["after line-of-sight entry: least hazard awareness"]
+    assert (least.value, found.value) == (0.87, pytest.approx(0.94))
+    _, _, found = paper["miss rate of the camera: clean, 20 to 30 deg"]
+    assert found.value == pytest.approx(0.07)
+    (panel,) = (block for block in document.all_blocks if block.name == "cueing_awareness_1")
+    (worst,) = (row[2:4] for row in panel.numbers.rows if row[0] == "blur" and row[1] == 4)
+    assert worst == pytest.approx((0.45, 0.94))
+    write_document(document, tmp_path)
+    assert "<b>second" not in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_signature_rows_fill_the_paper_s_numbers_and_a_range_its_two_ends():
+    rows = tuple(
+        SignatureRow(str(i), "roadside", "AUROC", value, paper=paper)
+        for i, (value, paper) in enumerate(
+            ((0.99, (0.999, 0.999)), *((v, (0.76, 0.9)) for v in (0.7, 0.8, 0.75)), (None, (0.997, 0.997)))
+        )
+    )
+    values = signature_values(SignatureStudy(rows, True, None, ()))
+    assert {place[2]: value.value for place, value in values.items()} == {
+        "auroc_studio": 0.99,
+        "auroc_shape_least": 0.7,
+        "auroc_shape_most": 0.8,
+    }

@@ -1,0 +1,255 @@
+"""The signature study: what a linear signature tells, on other recordings and on the other corpus."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worldstate_lab.signatures.clip_signatures import ClipSignatures, signature, signature_edges_hz
+from worldstate_lab.signatures.separability import (
+    area,
+    balanced_accuracy,
+    held_out,
+    interval,
+    scores_of,
+    transferred,
+)
+from worldstate_lab.signatures.signature_study import signature_study
+from worldstate_lab.signatures.simulated_corpora import (
+    CITY_STREET,
+    RATE_HZ,
+    TOWN_ROAD,
+    simulated_recording,
+)
+from worldstate_lab.trials.pass_cache import PassCache
+
+from worldstate.adapters.datasets.melaudis import KINDS
+from worldstate.adapters.datasets.traffic_clips import BACKGROUND, ClipLabels
+from worldstate.cli.main import main
+
+RECORDINGS = {TOWN_ROAD: 4, CITY_STREET: 2}
+
+
+@pytest.fixture(scope="module")
+def clips():
+    """What two simulated corpora hold: labels and samples by street."""
+    return {
+        street: [
+            clip
+            for number, rng in enumerate(np.random.default_rng(5).spawn(count))
+            for clip in simulated_recording(street, number, rng)
+        ]
+        for street, count in RECORDINGS.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def folders(clips, tmp_path_factory):
+    """Return the same clips in the layouts of IDMT-Traffic and of MELAUDIS."""
+    return write_as_idmt(tmp_path_factory.mktemp("idmt"), clips[TOWN_ROAD]), write_as_melaudis(
+        tmp_path_factory.mktemp("melaudis"), clips[CITY_STREET]
+    )
+
+
+def write_sound(path, samples):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    soundfile.write(path, np.repeat(samples, 2, axis=1), int(RATE_HZ), subtype="PCM_24")
+
+
+def write_as_idmt(root, clips):
+    letters = {"car": "C", "truck": "T"}
+    lists = {"idmt_traffic_all": [], "eusipco_2021_train": [], "eusipco_2021_test": []}
+    for middle, (labels, samples) in enumerate(clips):
+        if labels.kind not in (*letters, BACKGROUND):
+            continue
+        number = labels.recording.split()[-1]
+        what = "" if labels.kind == BACKGROUND else f"_M_D_{letters[labels.kind]}L"
+        microphone = "SE_CH34" if labels.microphone == "studio" else "ME_CH12"
+        end = "-BG" if labels.kind == BACKGROUND else ""
+        site = f"Site{int(number) // 2 % 2}"
+        name = f"2019-11-12-15-3{number}_{site}_50Kmh_{middle}{what}_{microphone}{end}.wav"
+        write_sound(root / "audio" / name, samples)
+        for file in ("idmt_traffic_all", f"eusipco_2021_{labels.split}"):
+            lists[file].append(name)
+    (root / "annotation").mkdir()
+    for file, names in lists.items():
+        (root / "annotation" / f"{file}.txt").write_text("\n".join(names))
+    return root
+
+
+def write_as_melaudis(root, clips):
+    tokens = {kind: token for token, kind in KINDS.items()}
+    for middle, (labels, samples) in enumerate(clips):
+        spot = f"2024-01-1{labels.recording.split()[-1]}_13-{middle}-0.0-Fitzroy1"
+        if labels.kind == BACKGROUND:
+            write_sound(root / "MELAUDIS_BG" / f"{spot}.wav", samples)
+        elif labels.kind in tokens:
+            name = f"{spot}_FF_1V-{tokens[labels.kind]}_L1_2Lanes_LR_stereo.wav"
+            write_sound(root / "MELAUDIS_Vehicles" / "Final_Veh" / "Fit1" / name, samples)
+    return root
+
+
+def corpus(clips, street):
+    rows = [(labels, signature(samples, RATE_HZ)) for labels, samples in clips[street]]
+    return ClipSignatures.of(street.name, rows, simulated=True)
+
+
+def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
+    """Draw a corpus of clips: each recording of one class, with a mark of its own, vehicles `lift` louder."""
+    rows = []
+    for number in range(recordings):
+        kind = ("car", BACKGROUND)[number % 2]
+        mark = fingerprint * rng.standard_normal(16) + lift * (kind == "car")
+        labels = ClipLabels(kind, "studio", str(number), "here")
+        rows += [(labels, mark + rng.standard_normal(16)) for _ in range(clips)]
+    return ClipSignatures.of("drawn", rows)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-40.0, 20.0), st.sampled_from((44_100.0, 32_000.0, 24_000.0)))
+def test_a_tone_lies_in_its_band_at_its_level_whatever_the_sample_rate(level_db, rate_hz):
+    amplitude, band = 0.1 * 10.0 ** (level_db / 20.0), 9
+    edges = signature_edges_hz()
+    tone = np.sin(2.0 * np.pi * np.mean(edges[band : band + 2]) * np.arange(2 * rate_hz) / rate_hz)
+    found = signature(np.float32(amplitude * tone)[:, None], rate_hz)
+    assert found.argmax() == band
+    assert found[band] == pytest.approx(np.log(amplitude**2 / 2.0), abs=0.05)
+
+
+def test_a_recording_is_never_scored_by_a_model_that_learned_it():
+    learned, kept = [], []
+    for rng in np.random.default_rng(0).spawn(6):
+        table = drawn(rng, recordings=14, clips=4, fingerprint=5.0)
+        learned.append(area(scores_of(table, transferred(table, table, "level"), table.motor)))
+        scored, score, how = held_out(table, "level", rng)
+        kept.append(area(scores_of(scored, score, scored.motor)))
+    assert np.mean(learned) > 0.97, "the marks of so few recordings can be learned by heart"
+    assert 0.25 < np.mean(kept) < 0.7
+    assert how == "5 folds by recording"
+
+
+def test_another_gain_moves_the_threshold_and_not_the_area():
+    rng = np.random.default_rng(2)
+    home, away = (drawn(rng, recordings=10, clips=20, lift=3.0) for _ in range(2))
+    louder = ClipSignatures.of(
+        "louder",
+        [
+            (ClipLabels(k, "phone", r, ""), e + 9.0)
+            for k, r, e in zip(away.kinds, away.recordings, away.energy, strict=True)
+        ],
+    )
+    by_level, by_shape = (
+        scores_of(louder, transferred(home, louder, by), louder.motor) for by in ("level", "shape")
+    )
+    assert area(by_level) > 0.99
+    assert balanced_accuracy(by_level) == 0.5, "everything is called a vehicle"
+    unmoved = scores_of(away, transferred(home, away, "shape"), away.motor)
+    np.testing.assert_allclose(by_shape.score, unmoved.score, atol=1e-9)
+
+
+def test_clips_repeated_within_their_recordings_do_not_narrow_the_interval():
+    table = drawn(np.random.default_rng(3), recordings=12, clips=5, fingerprint=1.0, lift=0.3)
+    once = scores_of(table, table.energy.mean(axis=1), table.motor)
+    often = once.select(np.repeat(np.arange(len(once.score)), 7))
+    low, high = interval(area, once, np.random.default_rng(4))
+    assert interval(area, often, np.random.default_rng(4)) == pytest.approx((low, high))
+    assert low < area(once) < high
+
+
+def test_simulated_road_users_are_as_loud_as_their_kind(clips):
+    heard = corpus(clips, CITY_STREET)
+    # Above the wind, in which a bicycle drowns.
+    level = {kind: heard.energy[heard.kinds == kind, 9:13].mean() for kind in np.unique(heard.kinds)}
+    assert level["truck"] > level["car"] > level[BACKGROUND] + 0.5
+    assert level["bicycle"] == pytest.approx(level[BACKGROUND], abs=1.0)
+
+
+def test_a_simulated_recording_is_a_function_of_its_generator(clips):
+    labels, samples = next(simulated_recording(TOWN_ROAD, 0, np.random.default_rng(5).spawn(1)[0]))
+    assert labels == clips[TOWN_ROAD][0][0]
+    np.testing.assert_array_equal(samples, clips[TOWN_ROAD][0][1])
+
+
+def test_simulated_corpora_fill_every_row_and_leave_the_published_ones_open(clips):
+    study = signature_study(*(corpus(clips, street) for street in RECORDINGS), np.random.default_rng(0))
+    filled = [row for row in study.rows if row.value is not None]
+    opened = [row for row in study.rows if row.value is None]
+    assert len(filled) == len(opened)
+    assert all("SIMULATED" in row.corpus for row in filled)
+    assert {row.name for row in filled} == {row.name for row in opened}
+    assert all("SIMULATED" not in row.corpus and row.note for row in opened)
+    areas = [row.value for row in filled if row.figure != "Hz"]
+    assert areas == sorted(areas)
+
+
+def test_a_corpus_that_is_kept_in_a_file_gives_the_same_study(tmp_path):
+    made = drawn(np.random.default_rng(3), 6, 4, lift=1.0)
+    cache = PassCache(tmp_path)
+    kept = [cache.tables("signatures", 1, lambda: {"roads": made.table()})["roads"] for _ in range(2)]
+    studies = [
+        signature_study(corpus, None, np.random.default_rng(0))
+        for corpus in (made, *map(ClipSignatures.from_table, kept))
+    ]
+    assert studies[0].rows == studies[1].rows == studies[2].rows
+
+
+def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_path, capsys):
+    idmt, melaudis = folders
+    broken = next((idmt / "audio").glob("*_CL_SE_*"))
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[: len(whole) // 2])
+    try:
+        code = main(
+            [
+                "evaluate-signatures",
+                "--idmt",
+                str(idmt),
+                "--melaudis",
+                str(melaudis),
+                "--out",
+                str(tmp_path),
+                "--json",
+            ]
+        )
+    finally:
+        broken.write_bytes(whole)
+    report = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert report == json.loads((tmp_path / "signatures.json").read_text())
+    assert (tmp_path / "signatures.png").stat().st_size > 10_000
+    assert not report["simulated"]
+    assert "SIMULATED" not in (tmp_path / "signatures.txt").read_text()
+    rows = {(row["name"], row["corpus"], row["figure"]): row for row in report["rows"]}
+    assert {row["name"].split()[0] for row in rows.values() if row["value"] is None} == {"electric"}
+    studio = rows["vehicle by level, studio microphones", "IDMT-Traffic", "AUROC"]
+    assert studio["paper"] == [0.999, 0.999]
+    assert "official split; worst site" in studio["note"]
+    assert studio["low"] <= studio["value"] <= studio["high"]
+    assert studio["value"] > 0.9
+    # Two recordings for the test, each with a car, two trucks and three clips of background.
+    assert rows["vehicle by level, mems microphones", "IDMT-Traffic", "AUROC"]["n_clips"] == 12
+    assert [problem for problem in report["left_out"] if broken.name in problem] == report["left_out"] != []
+
+
+def test_the_rows_of_a_corpus_that_is_not_there_say_what_fills_them(clips):
+    city = replace(corpus(clips, CITY_STREET), simulated=False)
+    rows = signature_study(None, city, np.random.default_rng(0)).rows
+    notes = {row.note for row in rows if row.value is None}
+    assert "worldstate-lab corpora --idmt DIR" in notes
+    assert "worldstate-lab corpora --idmt DIR --melaudis DIR" in notes
+    assert all(row.value is not None for row in rows if row.name == "tram by level, phone microphones")
+
+
+def test_a_wrong_folder_is_one_line_and_exit_code_two(tmp_path, capsys):
+    assert main(["evaluate-signatures", "--idmt", str(tmp_path)]) == 2
+    assert "missing: annotation/idmt_traffic_all.txt" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_without_a_folder_the_command_simulates_and_says_so(tmp_path, capsys):
+    assert main(["evaluate-signatures", "--recordings", "4", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.startswith("SIMULATED sound")
+    assert json.loads((tmp_path / "signatures.json").read_text())["simulated"]

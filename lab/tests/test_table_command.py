@@ -1,0 +1,187 @@
+"""`worldstate-lab table` from end to end on four simulated recordings."""
+
+import json
+import os
+import shutil
+import time
+
+import numpy as np
+import pytest
+import soundfile
+
+from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.cli.main import main
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.simulation.dataset.dataset import write_dataset
+from worldstate.simulation.dataset.plan import DatasetSettings
+
+TABLE_ONE = (
+    "Vision-only",
+    "Radar field-of-view model",
+    "OC-SORT recovery (stock)",
+    "OC-SORT recovery (coasting)",
+    "published",
+    "published, sustained",
+    "proposed .01",
+    "proposed .02",
+    "proposed .05",
+    "proposed .02 + looming",
+    "with absence .02",
+    "shipped model",
+    "+ site adaptation",
+    "world-state advisory",
+)
+
+
+def test_every_row_of_the_table_is_there(smoke):
+    _, report = smoke
+    assert set(TABLE_ONE) <= set(report["protocols"]["static"])
+    assert set(report["protocols"]) == {"static", "junctions_fixed", "junctions_retrained"}
+    assert "dynamic" in report["lacking"] and "moving ego" in report["lacking"]["dynamic"]
+    assert "SIMULATED" in report["data"]
+    # Two recordings of either kind say nothing, and the report says that.
+    assert len(report["cautions"]["static"]) == 2
+
+
+def test_line_of_sight_says_nothing_before_sight(smoke):
+    rows = smoke[1]["protocols"]["static"]
+    for name in TABLE_ONE[:3]:
+        assert rows[name]["detection"] == 0.0
+
+
+def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, capsys):
+    """With two streams that cannot be heard: they are named and left out, and every table says so."""
+    out, report = smoke
+    kept = {path: path.stat().st_mtime_ns for path in (out / "cache").rglob("*.npz")}
+    broken = [tmp_path / name for name in ("cut.wav", "two.wav")]
+    for path, channels in zip(broken, (56, 2), strict=True):
+        soundfile.write(path, np.zeros((9600, channels)), 48_000)
+    broken[0].write_bytes(broken[0].read_bytes()[:-1000])
+    write_array_xml(tmp_path / "array.xml", ovad_array())
+    more = ["--hazard-free", *map(str, broken), "--against", str(out)]
+    assert main(["evaluate", "--smoke", "--jobs", "2", "--out", str(out), *more]) == 0
+    again = json.loads((out / "evaluation.json").read_text())
+    assert {path: path.stat().st_mtime_ns for path in (out / "cache").rglob("*.npz")} == kept
+    assert again["protocols"] == report["protocols"]
+    assert "cut short" in again["failed"]["cut"] and "expected 56 channels" in again["failed"]["two"]
+    counts = {"recordings": 4, "approaches": 2, "hazard_free": 2}
+    for name in again["protocols"]:
+        assert counts.items() <= again["stands_on"][name].items()
+    for page in ("report.md", "report.html"):
+        text = (out / page).read_text(encoding="utf-8")
+        assert "2 recordings could not be heard" in text
+        assert text.count("4 recordings: 2 approaches and 2 hazard-free") > 5
+    differences = [one["differences"]["detection"] for one in again["against"]]
+    assert differences and all(value == [0.0, 0.0, 0.0] for value in differences)
+    said = capsys.readouterr().out
+    assert "less the other evaluation" in said and "not heard: cut:" in said
+
+
+@pytest.mark.slow
+def test_a_stream_of_the_same_quiet_recordings_can_be_added(smoke, tmp_path):
+    out, report = smoke
+    quiet = sorted((out / "smoke").glob("S*/none/*/out_multi.wav"))
+    parts = [soundfile.read(path, dtype="int32")[0] for path in quiet]
+    soundfile.write(tmp_path / "quiet.wav", np.concatenate(parts), 47_998, subtype="PCM_24")
+    (tmp_path / "array.xml").write_bytes((out / "smoke" / "array.xml").read_bytes())
+    more = ["--hazard-free", str(tmp_path / "quiet.wav"), "--out", str(tmp_path / "out")]
+    features = next((out / "cache").glob("windows-*.csv"))
+    assert main(["evaluate", str(out / "smoke"), "--features", str(features), *more]) == 0
+    found = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    before = report["protocols"]["static"]["published"]["hazard_free_hours"]
+    # The stream has no edges: it is scored from its first second to its last.
+    assert found["protocols"]["static"]["published"]["hazard_free_hours"] > 1.9 * before
+
+
+def test_partial_data_are_refused_with_what_is_missing(smoke, tmp_path, capsys):
+    out, _ = smoke
+    broken = tmp_path / "broken"
+    shutil.copytree(out / "smoke", broken, ignore=shutil.ignore_patterns("out_multi.wav"))
+    started = time.monotonic()
+    assert main(["evaluate", str(broken), "--out", str(tmp_path / "no")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("out_multi.wav") == 4 and "4 things are missing" in said
+    assert main(["evaluate", str(tmp_path), "--out", str(tmp_path / "no")]) == 2
+    assert "DataLog.csv" in capsys.readouterr().err
+    assert main(["evaluate", str(broken), "--stage-streams", "--out", str(tmp_path / "no")]) == 2
+    assert "expected streams with --hazard-free" in capsys.readouterr().err
+    assert time.monotonic() - started < 10.0
+    assert not (tmp_path / "no" / "cache").exists()
+
+
+@pytest.mark.slow
+def test_streets_whose_simulation_was_interrupted_are_completed(smoke, tmp_path):
+    out, report = smoke
+    again = tmp_path / "again"
+    shutil.copytree(out / "smoke", again / "smoke")
+    shutil.copytree(out / "cache", again / "cache")
+    log = again / "smoke" / "DataLog.csv"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-1]))
+    assert main(["evaluate", "--smoke", "--out", str(again)]) == 0
+    found = json.loads((again / "evaluation.json").read_text())
+    assert found["recordings"] == report["recordings"]
+    assert found["protocols"] == report["protocols"]
+
+
+@pytest.mark.slow
+def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys):
+    """Three recordings are left, and no protocol can be run on one approach."""
+    out, _ = smoke
+    shutil.copytree(out / "smoke", tmp_path / "smoke", copy_function=os.link)
+    shutil.copytree(out / "cache", tmp_path / "cache")
+    sound = next((tmp_path / "smoke").glob("S*/left/*/out_multi.wav"))
+    whole = sound.read_bytes()
+    sound.unlink()
+    sound.write_bytes(whole[: len(whole) // 2])
+    assert main(["evaluate", "--smoke", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "2 approaches with a T0, found 1" in said
+    assert f"not heard: {sound.parent.name}: " in said and "cut short" in said
+    assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_figures(smoke, tmp_path, monkeypatch):
+    """Two workers, which were started in another folder than the command and its relative paths."""
+    import distributed
+
+    out, report = smoke
+    shutil.copytree(out / "smoke", tmp_path / "again" / "smoke", copy_function=os.link)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
+        monkeypatch.chdir(tmp_path)
+        there = ["--engine", "dask", "--scheduler", workers.scheduler_address]
+        assert main(["evaluate", "--smoke", "--out", "again", *there]) == 0
+    found = json.loads((tmp_path / "again" / "evaluation.json").read_text())
+    assert found.pop("against") == []
+    assert found == {name: value for name, value in report.items() if name != "against"}
+
+
+@pytest.mark.slow
+def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
+    """The others are scored, and the model that ships, which was made for another array, is not."""
+    root, out = tmp_path / "data", tmp_path / "out"
+    eight = MicrophoneArray(ovad_array().positions_m[::7], "eight microphones")
+    write_dataset(root, DatasetSettings(n_static=6, duration_s=8.0), array=eight)
+    cut, two = (next(root.glob(f"SB1/{side}/*/out_multi.wav")) for side in ("left", "none"))
+    cut.write_bytes(cut.read_bytes()[:5_000_000])
+    soundfile.write(two, np.zeros((48_000, 2)), 47_998, subtype="PCM_24")
+    assert main(["evaluate", str(root), "--out", str(out)]) == 0
+    found = json.loads((out / "evaluation.json").read_text())
+    assert set(found["failed"]) == {cut.parent.name, two.parent.name}
+    assert found["recordings"] == found["stands_on"]["static"]["recordings"] == 4
+    ours = {"shipped model", "+ site adaptation", "world-state advisory", "shipped scores .02"}
+    assert ours <= set(found["refused"]["static"])
+    assert not ours & set(found["protocols"]["static"])
+    assert "8 microphones, expected 56" in found["refused"]["static"]["shipped model"]
+    assert found["protocols"]["static"]["published"]["hazard_free_hours"] > 0.003
+    text = (out / "report.md").read_text(encoding="utf-8")
+    assert "shipped model | not scored: the model was not made for this sound" in text
+    assert "not scored: " in capsys.readouterr().out
+    # A model that is named is refused at once: somebody asked for it.
+    save_model(tmp_path / "model.json", read_model())
+    model = ["--model", str(tmp_path / "model.json")]
+    assert main(["evaluate", str(root), "--out", str(tmp_path / "no"), *model]) == 2
+    said = capsys.readouterr().err
+    assert "not the array of the model" in said and "--uncalibrated" not in said

@@ -1,0 +1,205 @@
+"""GOSPA on bearing of the world-state beside trackers, for vehicles that come and for vehicles in view.
+
+Run: python -m worldstate_lab.benchmarks.gospa_trackers
+streams/S??-*.npz [--model model.json] [--seconds 120] [--json]
+
+Streams that were listened to (`worldstate model make` keeps them) are followed hop by hop. Cut off at 60
+degrees, p = 1, alpha = 2. Hidden are those who will come into view within five seconds, visible those in line
+of sight and in the image. Every method states who is hidden and who is visible. The world-state says so
+itself; of a tracker, which knows no occlusion, whoever is where the stream's boxes stand is visible.
+"""
+
+import argparse
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+
+from worldstate import WorldFilter
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import NotUsable
+from worldstate.measurement.measurement import Measurement
+from worldstate.operations.recordings.advisories import LONGEST_LEAD_S
+from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.state import WorldState
+from worldstate_lab.methods.oc_sort import OcSort
+from worldstate_lab.metrics.gospa import gospa_bearing
+from worldstate_lab.passes.stream_camera import stream_detections
+from worldstate_lab.passes.world_exam import stream_measurements
+
+from .stone_soup_trackers import GmPhd, Jpda, scans, stamp_of
+
+SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
+OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"
+PHASES, PARTS = ("hidden", "visible"), ("localised", "missed", "false")
+EXISTS, ALPHA = 0.5, 0.02
+Row = dict[str, float | None]
+Costs = tuple[dict[str, FloatArray], FloatArray]
+Said = dict[str, tuple[Sequence[float], Sequence[float]]]  # By method: Who is hidden and who is visible
+
+
+def stated(
+    heard: HeardStream, measured: Iterable[Measurement], start: WorldFilter
+) -> Iterator[tuple[int, Said]]:
+    """Yield the number of every hop of a stream, in tenths of a second, and what every method states."""
+    taken = list(measured)
+    view, boxes = _view(taken), _oc_sort(heard)
+    world, deaf, phd, jpda = start, start, GmPhd(), Jpda()
+    for one in taken:
+        world, deaf = world.update(one), deaf.update(_unheard(one))
+        both, when, hop = scans(one, view), stamp_of(one), round(one.stamp_ns * 1e-9 / HOP_S)
+        yield (
+            hop,
+            {
+                SILENCE: ((), ()),
+                WORLD: _by_phase(world.state),
+                BOXES: ((), [box.azimuth_rad for box in one.sightings]),
+                UNHEARING: _by_phase(deaf.state),
+                OC_SORT: ((), boxes[hop]),
+                GM_PHD: _by_place(phd.step(both, when), view),
+                JPDA: _by_place(jpda.step(both, when), view),
+            },
+        )
+
+
+def _view(measured: Sequence[Measurement]) -> tuple[float, float]:
+    """Return the sector in which boxes stand, from right to left, known beforehand to the trackers."""
+    azimuths = [box.azimuth_rad for one in measured for box in one.sightings]
+    right, left = np.quantile(azimuths or [0.0], [0.01, 0.99])
+    return float(right), float(left)
+
+
+def _unheard(one: Measurement) -> Measurement:
+    silent = NotUsable("not listened to")
+    even = SignatureEvidence(one.signature.directions, (0.0, 0.0), 0.0, 0.0)
+    return replace(one, signature=even, bearing=silent, approach=silent, sequence=None)
+
+
+def _by_phase(state: WorldState) -> tuple[list[float], list[float]]:
+    """Return who is believed hidden, to come within five seconds, and who is believed in view."""
+    # A cue states a time where somebody is likelier than not to come within five seconds.
+    coming_s = {cue.direction: cue.time_to_visible_s[1] for cue in state.cues if cue.time_to_visible_s}
+    there = [one for one in state.entities if one.existence_probability >= EXISTS]
+    hidden = [one for one in there if one.status == "hidden"]
+    soon = [one for one in hidden if coming_s.get(str(one.direction), math.inf) <= LONGEST_LEAD_S]
+    # Whoever has left the view is remembered for some seconds; the camera is not asked about him.
+    seen = [one for one in there if one.status != "hidden" and one.visibility.answer != "unqueried"]
+    return [one.azimuth_rad for one in soon], [one.azimuth_rad for one in seen]
+
+
+def _by_place(azimuths: Sequence[float], view: tuple[float, float]) -> tuple[list[float], list[float]]:
+    seen = [one for one in azimuths if view[0] <= one <= view[1]]
+    return [one for one in azimuths if one not in seen], seen
+
+
+def _oc_sort(heard: HeardStream) -> list[list[float]]:
+    """Return the azimuths of the tracks that OC-SORT emits, image by image."""
+    sort, camera = OcSort(), PinholeCamera()
+    emitted = []
+    for frame in stream_detections(heard, np.random.default_rng(0)).frames:
+        tracks = [one for one in sort.step(frame.boxes_px, frame.scores) if one.certain]
+        emitted.append([float(camera.azimuth(0.5 * (one.box_px[0] + one.box_px[2]))) for one in tracks])
+    return emitted
+
+
+def true_azimuths(heard: HeardStream) -> dict[int, tuple[list[float], list[float]]]:
+    """Return the azimuths of the hidden and of the visible vehicles, by the number of the hop."""
+    rows, right_left = heard.rows, PinholeCamera().view_rad
+    hazards = heard.vehicles.vehicle[heard.vehicles.hazard]
+    entry_s = dict(zip(hazards.tolist(), heard.vehicles.entry_s[heard.vehicles.hazard].tolist(), strict=True))
+    lead_s = np.array([entry_s.get(one, np.inf) for one in rows.vehicle.tolist()]) - rows.time_s
+    azimuth = np.arctan2(rows.y_m, rows.x_m)
+    in_image = (azimuth >= right_left[0]) & (azimuth <= right_left[1])
+    hidden = (lead_s > 0.0) & (lead_s <= LONGEST_LEAD_S) & ~rows.in_view
+    there: dict[int, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
+    for phase, mask in enumerate((hidden, rows.in_view & in_image)):
+        for hop, angle in zip(
+            np.round(rows.time_s[mask] / HOP_S).astype(int).tolist(), azimuth[mask].tolist(), strict=True
+        ):
+            there[hop][phase].append(angle)
+    return there
+
+
+@cache
+def _parts_deg(estimates: tuple[float, ...], truths: tuple[float, ...]) -> FloatArray:
+    one = gospa_bearing(estimates, truths)
+    return np.degrees([one.localisation, one.missed, one.false])
+
+
+def costs(heard: HeardStream, measured: Iterable[Measurement], start: WorldFilter) -> Costs:
+    """Return every method's summed costs by phase and part, degrees, and the hops with anybody, by phase."""
+    truths, summed = true_azimuths(heard), dict[str, FloatArray]()
+    hops = np.zeros(len(PHASES))
+    for hop, said in stated(heard, measured, start):
+        there = truths.get(hop, ((), ()))
+        hops += [bool(one) for one in there]
+        for method, estimates in said.items():
+            parts = [_parts_deg(tuple(a), tuple(b)) for a, b in zip(estimates, there, strict=True)]
+            summed[method] = summed.get(method, 0.0) + np.array(parts)
+    return summed, hops
+
+
+def report_of(paths: Sequence[Path], model: Model, seconds: float) -> dict[str, dict[str, dict[str, Row]]]:
+    """Return the figures by junction (and of all), method and phase."""
+    summed: dict[tuple[str, str], FloatArray] = {}
+    hops: dict[str, FloatArray] = defaultdict(lambda: np.zeros(len(PHASES)))
+    for path in paths:
+        heard, measured = stream_measurements(path, model, "all", 0)
+        taken = takewhile(lambda one: one.stamp_ns * 1e-9 <= seconds, measured)
+        costs_deg, there = costs(heard, taken, WorldFilter(policy=model.policies.for_alpha(ALPHA)))
+        for name in (str(heard.hops.about["site"]), "all"):
+            hops[name] = hops[name] + there
+            for method, cost in costs_deg.items():
+                summed[name, method] = summed.get((name, method), 0.0) + cost
+    found: dict[str, dict[str, dict[str, Row]]] = defaultdict(dict)
+    for (name, method), cost in sorted(summed.items(), key=lambda one: one[0][0]):
+        total = cost.sum(axis=1)
+        # Hidden ones beside what silence costs, visible ones beside what a tracker of boxes does.
+        beside = [summed[name, SILENCE][0].sum(), summed[name, OC_SORT][1].sum()]
+        found[name][method] = {
+            phase: {
+                **dict(zip(PARTS, (cost[k] / max(hops[name][k], 1)).round(2).tolist(), strict=True)),
+                "gospa_deg": round(float(total[k] / max(hops[name][k], 1)), 2),
+                "share": round(float(total[k] / beside[k]), 3) if beside[k] else None,
+            }
+            for k, phase in enumerate(PHASES)
+        }
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("streams", type=Path, nargs="+", metavar="NPZ")
+    parser.add_argument("--model", type=Path, help="with a sequence; the one that ships otherwise")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="of every stream; all otherwise")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    found = report_of(options.streams, read_model(options.model), options.seconds)
+    if options.json:
+        print(json.dumps(found, indent=1))
+        return
+    junctions = [name for name in found if name != "all"]
+    for k, phase in enumerate(PHASES):
+        beside = (SILENCE, OC_SORT)[k]
+        parts = "".join(f"{part:>12}" for part in PARTS)
+        print(f"{phase:28}{'GOSPA':>8}{parts}  of {beside}, worst")
+        for method, rows in found["all"].items():
+            row, shares = rows[phase], {one: found[one][method][phase]["share"] or 0.0 for one in junctions}
+            worst = max(shares, key=lambda one: shares[one])
+            parts = "".join(f"{row[part]:12.2f}" for part in PARTS)
+            print(f"{method:28}{row['gospa_deg']:8.2f}{parts}", end="")
+            print(f"  {row['share']:.3f}  {shares[worst]:.3f} ({worst})")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""Cost of a step of the fixed-lag smoother at 10 Hz, beside filterpy's RTS smoother over the same lag.
+
+Run: python -m worldstate_lab.benchmarks.smoothing [--json] [--seconds 40]
+
+Three entities, lag 15 s, two corners, four walls. Each entity is heard by bearing and approach rate and, at
+every tenth hop, by its image in a wall; past its corner it is seen by bearing and box height, and looks say
+on which side of the edge it is. The peer filters and smooths the same lag anew at every hop, as who has no
+incremental smoother must: constant velocity in Cartesian coordinates, positions measured. Processor time of
+one thread, in ms; `smoothing_times` is for other benchmarks and tests to call.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from worldstate.measurement import Approach, Bearing
+from worldstate.smoothing import AngularHeight, FixedLagSmoother, PastEdge, ReflectedBearing
+
+HOP_S, HOP_NS, LAG_HOPS, PASS_HOPS = 0.1, 100_000_000, 150, 160
+WALLS = ("opposite", "west", "back", "east")
+
+
+def smoothing_times(hops: int, rng: np.random.Generator, entities: int = 3) -> tuple[list[float], int]:
+    """Milliseconds of processor time per step, and the factor slots at the end."""
+    smoother = FixedLagSmoother()
+    smoother.add_corner("left", 1, (5.0, 3.0), (1.0, 0.5))
+    smoother.add_corner("right", -1, (5.0, -3.0), (1.0, 0.5))
+    for number, name in enumerate(WALLS):
+        smoother.add_wall(name, number * math.pi / 2.0, 8.0, (0.05, 0.5))
+    spent = []
+    for hop in range(hops):
+        seen = {}
+        for number in range(entities):
+            # Each comes again when it has passed, under another name: 16 s, 24 m to 40 m away at first.
+            after, passes = (hop + 53 * number) % PASS_HOPS, (hop + 53 * number) // PASS_HOPS
+            seen[f"{number}-{passes}"] = observed(after, number, rng)
+        spent.append(_spent(lambda hop=hop, seen=seen: smoother.update(hop * HOP_NS, seen)))
+    return spent, smoother.n_factor_slots
+
+
+def observed(hop: int, number: int, rng: np.random.Generator) -> list[object]:
+    side = 1 if number % 2 == 0 else -1
+    x, y, speed = 8.0 + number, side * (24.0 - 0.3 * hop), 3.0
+    azimuth, r = math.atan2(y, x), math.hypot(x, y)
+    inverse_tta = side * y * speed / r**2
+    heard: list[object] = [
+        Bearing(azimuth + rng.normal(0.0, 0.07), 0.07),
+        Approach(inverse_tta + rng.normal(0.0, 0.25), 0.25),
+    ]
+    hidden = side * y / x > 0.6
+    corner = "left" if side > 0 else "right"
+    if hop % 10 == 0:
+        image = math.atan2(y, 16.0 - x)
+        heard.append(ReflectedBearing("opposite", image + rng.normal(0.0, 0.1), 0.1))
+    if abs(side * y / x - 0.6) < 0.2:
+        heard.append(PastEdge(corner, seen=not hidden))
+    if not hidden:
+        heard[0] = Bearing(azimuth + rng.normal(0.0, 0.01), 0.01)
+        heard.append(AngularHeight(1.5 / r * math.exp(rng.normal(0.0, 0.03)), 0.03))
+    return heard
+
+
+def rts_times(hops: int, rng: np.random.Generator, entities: int = 3) -> list[float]:
+    """Milliseconds of processor time per hop: filter and RTS over the lag, for every entity."""
+    from filterpy.kalman import KalmanFilter
+
+    peer = KalmanFilter(dim_x=4, dim_z=2)
+    peer.F, peer.H = np.eye(4) + HOP_S * np.eye(4, k=2), np.eye(2, 4)
+    t = HOP_S
+    peer.Q = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
+    measured = rng.standard_normal((LAG_HOPS, 2))
+
+    def smooth() -> None:
+        peer.x, peer.P = np.zeros(4), 10.0 * np.eye(4)
+        means, covariances, *_ = peer.batch_filter(measured)
+        peer.rts_smoother(means, covariances)
+
+    return [_spent(lambda: [smooth() for _ in range(entities)]) for _ in range(hops)]
+
+
+def _spent(call: Callable[[], object]) -> float:
+    start = time.process_time()
+    call()
+    return 1e3 * (time.process_time() - start)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--seconds", type=float, default=40.0, help="of stream")
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    spent, slots = smoothing_times(round(options.seconds / HOP_S), rng)
+    # The first lag is cheaper: nothing is marginalised yet.
+    steady = np.array(spent[LAG_HOPS:] or spent)
+    peer = float(np.mean(rts_times(10, rng)))
+    figures = {
+        "mean_ms": float(steady.mean()),
+        "p99_ms": float(np.percentile(steady, 99)),
+        "rts_over_the_lag_ms": peer,
+        "of_rts": float(steady.mean() / peer),
+        "factor_slots": slots,
+    }
+    print(
+        json.dumps(figures, indent=2)
+        if options.json
+        else "\n".join(f"{k:22s} {v:9.3f}" for k, v in figures.items())
+    )
+
+
+if __name__ == "__main__":
+    main()

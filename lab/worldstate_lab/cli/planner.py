@@ -1,0 +1,109 @@
+"""`worldstate-lab planner`: what a planner gains that reads the chances of the state at a blind corner.
+
+A simulated car nears blind corners in a closed loop while the states of recorded streams are replayed; their
+vehicles cross as they did and do not mind it. Three planners drive the same car under the same stopping law:
+one knows nothing and brakes for whom it sees, one assumes a vehicle behind both corners at every time, and
+one assumes it only from a chance of the state on, which is set on streams of other seeds (`--set-on`).
+Printed are collisions, braking that nobody made necessary, and time.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.output import CommandResult, write_report
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate_lab.planner.believed_stream import BelievedStream
+
+EXAMPLE = """\
+examples:
+  worldstate-lab planner streams/*-200[23]*.npz --set-on streams/*-approaches-2001*.npz --cache chances
+  worldstate-lab planner streams/SB1-*.npz --threshold 0.005 --count 100 --figure planner.png"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("streams", type=Path, nargs="+", metavar="NPZ", help="streams with and without approaches")
+    set_on = parser.add_mutually_exclusive_group(required=True)
+    of_others = "streams of other seeds: one step below the largest chance up to which nobody is hit there"
+    set_on.add_argument("--set-on", type=Path, nargs="+", metavar="NPZ", help=of_others)
+    chance = "chance within three seconds from which on a vehicle is assumed"
+    set_on.add_argument("--threshold", type=float, metavar="P", help=chance)
+    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
+    add("--count", type=int, default=1000, help="approaches, and corners without one (default: %(default)s)")
+    standing = (
+        "the car begins at rest 3.5 m before the line, where the states were recorded, not 30 m at 25 km/h"
+    )
+    add("--from-standing", action="store_true", help=standing)
+    add("--cache", type=Path, metavar="DIR", help="keep what the filter said of each stream here")
+    add("--seed", type=int, default=0, help="of the replays (default: %(default)s)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+    add("--report", type=Path, metavar="JSON", help="write the figures")
+    add("--figure", type=Path, metavar="PNG", help="draw a corner, a way through one, and all thresholds")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    import numpy as np
+
+    from worldstate.ground.checks import in_range
+    from worldstate_lab.planner.ego_vehicle import FROM_STANDING, EgoVehicle
+    from worldstate_lab.planner.planner_exam import (
+        THRESHOLDS,
+        approaches_drawn,
+        draw_corners,
+        drives_of,
+        every_planner,
+        planner_figures,
+        safe_threshold,
+    )
+    from worldstate_lab.planner.planner_figure import write_planner_figure
+
+    check_outputs(arguments, "report", figures=("figure",))
+    count = int(in_range("--count", arguments.count, 10, 100_000))
+    ego, rng = (
+        FROM_STANDING if arguments.from_standing else EgoVehicle(),
+        np.random.default_rng(arguments.seed),
+    )
+    others = _believed(arguments, arguments.set_on or [])
+    chance = for_loud = arguments.threshold
+    if others:
+        loud, quiet = approaches_drawn(others, count, ego, rng)
+        chance, for_loud = safe_threshold([loud, quiet], ego), safe_threshold([loud], ego)
+    corners = draw_corners(_believed(arguments, arguments.streams), count, ego, rng)
+    planners = every_planner(corners, chance, for_loud, ego)
+    named = {f"{one:g}": drives_of(corners, one, ego) for one in THRESHOLDS[::2]}
+    told = planner_figures(corners, planners | named, rng)
+    figures, curve = {name: told[name] for name in planners}, {name: told[name] for name in named}
+    if arguments.figure is not None:
+        write_planner_figure(corners, planners, list(curve.values()), figures, ego, arguments.figure)
+    report = {"threshold": chance, "threshold_loud": for_loud, "planners": figures, "thresholds": curve}
+    if arguments.report is not None:
+        write_report(arguments.report, report)
+    lines = [
+        f"thresholds {chance:g}, {for_loud:g} (loud)",
+        f"{'':24}" + "".join(f"{name:>22}" for name in figures),
+    ]
+    for name in figures["phantom"]:
+        lines.append(f"{name:24}" + "".join(f"{one[name]:>22.4g}" for one in figures.values()))
+    return CommandResult(report, table={}, lines=lines)
+
+
+def _believed(arguments: argparse.Namespace, paths: list[Path]) -> "list[BelievedStream]":
+    from functools import partial
+
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate.adapters.parallel import in_processes
+    from worldstate_lab.planner.believed_stream import believed_stream
+
+    follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)
+    found = []
+    with progress_bar("following", len(paths)) as bar:
+        for one in in_processes(follow, paths, arguments.jobs):
+            found.append(one)
+            bar.advance()
+    return found

@@ -1,0 +1,148 @@
+"""`worldstate-lab reach`: what any detector could reach with an array and on a data set.
+
+Print bounds that no method can beat ("Evidence of Absence", section VI).
+
+Of an array: the smallest standard deviation of a bearing, over azimuth, for a noise-like source in --band
+with --snr-db at each microphone and --snapshots independent snapshots, alone and with a camera of
+--camera-std; "share" is the bearing information relative to the best direction, which falls to nothing
+towards endfire, while presence and approach speed remain.
+
+Of --features, a table of labelled feature windows: the entropy of the class (front, left, none, right), what
+is known of the class from the features, by three estimates, and Fano's bound on the error of any classifier,
+beside the error that the classifier of --method makes on recordings that it was not trained on.
+
+Of --recordings, a data set in the OVAD layout: the Fisher ratio of each band between windows with a vehicle
+and without one, by level and by the shape of the spectrum alone, and the range in which shape tells most.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.feature_options import add_which_windows
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import track
+
+if TYPE_CHECKING:
+    from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData
+    from worldstate_lab.signatures.fisher_profile import BandProfile
+
+# Both ways to endfire of an array across the vehicle, where the bound diverges.
+AZIMUTHS_DEG = tuple(range(-90, 91, 15))
+
+EXAMPLE = """\
+examples:
+  worldstate-lab reach --array mics.xml --snr-db -5 --figure bounds.png
+  worldstate-lab reach --features features.csv --json
+  worldstate sim make --out sim --static 40 && worldstate-lab reach --recordings sim"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add_array_options(parser, "the 56-microphone roof array")
+    add("--features", type=Path, metavar="CSV", help="labelled feature windows")
+    add_which_windows(parser, "of them")
+    add("--recordings", type=Path, metavar="DATASET", help="labelled recordings")
+    add("--band", type=float, nargs=2, default=[300.0, 1800.0], metavar="HZ", help="(default: 300 1800)")
+    add("--snr-db", type=float, default=-10.0, metavar="DB", help="in each bin (default: %(default)g)")
+    add("--snapshots", type=int, default=20, metavar="N", help="independent ones (default: %(default)s)")
+    add("--camera-std", type=float, default=1.0, metavar="DEG", help="of its bearings (default: %(default)g)")
+    add("--seed", type=int, default=0, help="folds and bootstrap (default: %(default)s)")
+    add("--figure", type=Path, metavar="PNG", help="draw what was found")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from dataclasses import asdict
+
+    from worldstate_lab.paper.identifiability_figure import write_identifiability_figure
+
+    check_outputs(arguments, figures=("figure",))
+    array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
+    if arguments.figure is not None:
+        write_identifiability_figure(arguments.figure, array, data, bands)
+    found = {"array": array, "features": data, "bands": bands}
+    report = {name: _plain(asdict(one)) for name, one in found.items() if one is not None}
+    return CommandResult(report, table={}, lines=_lines(array, data, bands))
+
+
+def _array(arguments: argparse.Namespace) -> "ReachOfArray":
+    import numpy as np
+
+    from worldstate.frontend.array.microphone_array import roof_array_56
+    from worldstate.ground.checks import in_range
+    from worldstate_lab.paper.identifiability import reach_of_array
+
+    array = given_array(arguments) or roof_array_56()
+    low, high = arguments.band
+    in_range("--band", low, 1.0, high)
+    in_range("--snr-db", arguments.snr_db, -100.0, 100.0)
+    in_range("--snapshots", arguments.snapshots, 1, 1e6)
+    frequencies = np.linspace(low, high, 16)
+    snr = np.full(frequencies.size, 10.0 ** (arguments.snr_db / 10.0))
+    camera_rad = np.radians(in_range("--camera-std", arguments.camera_std, 0.0, 180.0, open_low=True))
+    return reach_of_array(
+        array, np.radians(AZIMUTHS_DEG), frequencies, snr, arguments.snapshots, vision_std_rad=camera_rad
+    )
+
+
+def _data(arguments: argparse.Namespace) -> "ReachOnData | None":
+    if arguments.features is None:
+        return None
+    import numpy as np
+
+    from worldstate.adapters.datasets.feature_table import read_features
+    from worldstate_lab.paper.identifiability import reach_on_table
+
+    table = read_features(arguments.features).group(arguments.group)
+    return reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
+
+
+def _bands(arguments: argparse.Namespace) -> "BandProfile | None":
+    if arguments.recordings is None:
+        return None
+    import numpy as np
+
+    from worldstate.adapters.datasets.feature_extraction import read_windows
+    from worldstate.adapters.datasets.sample_windows import sample_windows
+    from worldstate_lab.signatures.fisher_profile import band_profile
+
+    windows = sample_windows(arguments.recordings)[0]
+    vehicle = np.array([window.label != "none" for window in windows], dtype=bool)
+    return band_profile(track(read_windows(windows), "reading", len(windows)), vehicle)
+
+
+def _plain(value: object) -> object:
+    """Return arrays as lists; what is not finite, a bound that says nothing, is None."""
+    import numpy as np
+
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray):
+        return [_plain(one) for one in value.tolist()]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _lines(array: "ReachOfArray", data: "ReachOnData | None", bands: "BandProfile | None") -> list[str]:
+
+    from dataclasses import asdict
+
+    import numpy as np
+
+    lines = [f"{'azimuth':>8} {'std, deg':>10} {'with camera':>12} {'share':>7}"]
+    columns = np.degrees(array.azimuths_rad), np.degrees(array.std_rad), np.degrees(array.with_vision_rad)
+    for azimuth, std, both, share in zip(*columns, array.endfire, strict=True):
+        lines.append(f"{azimuth:8.0f} {std:10.3g} {both:12.3g} {share:7.3f}".replace("inf", "  -"))
+    if data is not None:
+        lines += ["", *(f"{name:24} {value:.4g}" for name, value in asdict(data).items())]
+    if bands is not None:
+        lines += ["", f"{'band, Hz':>16} {'by level':>10} {'by shape':>10}"]
+        for low, high, *ratios in zip(
+            bands.edges_hz[:-1], bands.edges_hz[1:], bands.by_level, bands.by_shape, strict=True
+        ):
+            lines.append(f"{low:7.0f} - {high:6.0f} {ratios[0]:10.3g} {ratios[1]:10.3g}")
+        lines.append("shape tells most from {:.0f} to {:.0f} Hz".format(*bands.range_hz))
+    return lines

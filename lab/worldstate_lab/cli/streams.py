@@ -1,0 +1,75 @@
+"""`worldstate-lab streams`: what the whole world-state makes of simulated streams, vehicle by vehicle.
+
+Streams that were listened to, as `worldstate model make` keeps them, go through the filter hop by hop, with
+boxes of a camera drawn from their truth. Printed for every junction and for all: approaches warned of and how
+early, onsets an hour where nobody comes, whether both of two are found, whether a vehicle keeps its identity
+when it comes into view, what is warned of after it has passed, and how true times and bearings are.
+
+The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
+"""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.common.output import CommandResult, write_report
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+
+EXAMPLE = """\
+examples:
+  worldstate-lab streams streams/*-2001-*.npz --model my_model.json
+  worldstate-lab streams streams/SA1-*.npz --model my_model.json --camera none --report figures.json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("streams", type=Path, nargs="+", metavar="NPZ", help="streams that were listened to")
+    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
+    cameras = "boxes of everybody, of cars above 100 pixels, none; dead from every T0 on; one more car before"
+    add("--camera", choices=("all", "cars", "none", "dies", "mover"), default="all", help=cameras)
+    place = "give the filter the corners and lanes of the junction (default: those of a usual one)"
+    add("--known-place", action="store_true", help=place)
+    add(
+        "--sides", action=argparse.BooleanOptionalAction, default=True,
+        help="learn what either arm sounds like from whoever comes into view (default: on)",
+    )  # fmt: skip
+    add("--seed", type=int, default=0, help="of the camera's misses (default: %(default)s)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+    add("--report", type=Path, metavar="JSON", help="write the figures")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from functools import partial
+
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate.adapters.parallel import in_processes
+    from worldstate_lab.passes.pass_outcomes import PassedStream, pass_figures
+    from worldstate_lab.passes.world_exam import passed_stream
+
+    check_outputs(arguments, "report")
+    model = read_model(arguments.model)
+    given = {"camera": arguments.camera, "seed": arguments.seed, "known_place": arguments.known_place}
+    given["learns"] = arguments.sides
+    follow = partial(passed_stream, model=model, **given)
+    streams: dict[str, list[PassedStream]] = {}
+    with progress_bar("following", len(arguments.streams)) as bar:
+        for one in in_processes(follow, arguments.streams, arguments.jobs):
+            streams.setdefault(one.heard.site, []).append(one)
+            bar.advance()
+    figures = {site: pass_figures(streams[site]) for site in sorted(streams)}
+    figures["all"] = pass_figures([one for every in streams.values() for one in every])
+    report = {**given, "junctions": figures}
+    if arguments.report is not None:
+        write_report(arguments.report, report)
+    lines = [f"{'':24}" + "".join(f"{site:>9}" for site in figures)]
+    for name in figures["all"]:
+        lines.append(f"{name:24}" + "".join(f"{_shown(one[name]):>9}" for one in figures.values()))
+    return CommandResult(report, table={}, lines=lines)
+
+
+def _shown(value: float | int | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:d}" if isinstance(value, int) else f"{value:.3f}"

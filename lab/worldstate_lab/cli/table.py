@@ -1,0 +1,442 @@
+"""`worldstate-lab table`: every row of Table I on a data set, as one report.
+
+Listen to every recording once, then let every method decide: vision alone, radar, track recovery, the
+published acoustic classifier, the proposed method at three budgets, and this library's own advisory. What is
+fitted is fitted on other recordings than it is scored on: five folds, one junction left out with the
+classifier fixed, and with the classifier retrained without it.
+
+DATASET is a folder in OVAD's layout: the real data set, or recordings of your own with DataLog.csv. Without
+one, streets are simulated into OUT/streets (12 GB) and the report says so. The tested recordings are those
+of the official lists where they lie in the folder (or --static-ids, --dynamic-ids), else all.
+
+The published classifier is trained on --features, a table of windows such as the released one, whose windows
+of tested recordings are left out; else on the recordings that are not tested; on simulated streets on other
+simulated recordings; else on the calibration recordings of each fold.
+
+OUT/report.html and OUT/report.md hold every table and figure beside the paper's, OUT/report_files the same as
+PNG and CSV.
+
+What was heard is kept in OUT/cache by the content of each recording: an interrupted run goes on where it
+stopped, and a second one takes a minute. Least data: two approaches and two hazard-free recordings, and for
+leaving junctions out two junctions that have both; what a protocol lacks is said before anything is heard.
+
+--stage-streams lets camera and rain fail on the streams of --hazard-free as well, and prints advisories an
+hour in every state beside those of the clean camera, on the same minutes: half an hour for each hour.
+
+A recording that cannot be heard is named and left out. Rows of a model that was not made for the array of the
+recordings are named and not scored.
+"""
+
+import argparse
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.detector_options import detector_filter, detector_maker, detector_name
+from worldstate.cli.common.output import CommandResult, write_report
+from worldstate.cli.common.outputs import output_folder
+from worldstate.cli.common.progress import Bar, progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.operations.recordings.hop_table import HopTable
+    from worldstate_lab.degradation.degradation_study import DegradationSettings
+    from worldstate_lab.evaluation.against import Comparison
+    from worldstate_lab.evaluation.evaluation import Evaluation
+    from worldstate_lab.evaluation.operating_curve import EqualDetection
+    from worldstate_lab.evaluation.scores import Score
+    from worldstate_lab.signatures.signature_study import SignatureStudy
+    from worldstate_lab.trials.classification import Classifiers
+    from worldstate_lab.trials.takes import TakeList
+
+EXAMPLE = """\
+examples:
+  worldstate-lab table --smoke --out smoke
+  worldstate-lab table --out streets --jobs 2
+  worldstate-lab table ovad_dataset --features extracted_features.csv --out report --jobs 2
+  worldstate-lab table mine --hazard-free quiet_hour.wav --out report --against before"""
+
+# Recordings of the simulated streets: 42 approaches and 41 hazard-free ones, and 59 of a moving ego.
+STATIC, DYNAMIC = 83, 59
+SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 6.0
+# Images of OVAD's size take more than half of the time of a simulated recording.
+SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
+FULL_SEEDS = 5
+# Simulated recordings of each roadside corpus, a second of work each: half of those of `evaluate-signatures`.
+PASSAGES = 6
+# What two evaluations must have in common for their figures to be comparable.
+COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
+# Where the work is done and what is printed of it.
+_NO_FIGURE = ("run", "json", "dataset", "out", "jobs", "engine", "scheduler", "against")
+COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("dataset", type=Path, nargs="?", metavar="DATASET", help="recordings (default: simulated streets)")
+    add("--out", type=Path, default=Path("evaluation"), metavar="DIR", help="(default: %(default)s)")
+    add("--features", type=Path, metavar="CSV", help="windows to train the published classifier on")
+    add("--model", type=Path, metavar="FILE", help="this library's model (default: the one that ships)")
+    add("--static-ids", type=Path, metavar="CSV", help="tested recordings of a standing ego")
+    add("--dynamic-ids", type=Path, metavar="CSV", help="tested recordings of a moving ego")
+    add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="more time without a vehicle")
+    add("--hazard-free-hours", type=float, metavar="H", help="score so many hours of it (default: all)")
+    add("--stage-streams", action="store_true", help="let camera and rain fail on the streams of it, too")
+    add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
+    add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
+    add("--idmt", type=Path, metavar="DIR", help="IDMT-Traffic, for the signature study")
+    add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, for the signature study")
+    add("--against", type=Path, metavar="DIR", help="a finished evaluation to compare this one with")
+    add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
+    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times, all filmed recordings swept")
+    add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    add("--jobs", type=int, default=cores, help="processes (default: one a core)")
+    add_choice(parser, "--engine", "where the work is done", "local", "dask")
+    add("--scheduler", metavar="ADDRESS", help="of the Dask cluster, which sees the same paths")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate_lab.evaluation.against import save_scores
+    from worldstate_lab.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
+    from worldstate_lab.evaluation.report.contents import evaluation_document
+    from worldstate_lab.evaluation.report.writing import write_document
+    from worldstate_lab.trials.engine import Engine
+    from worldstate_lab.trials.hearing import Hearing
+
+    _check(arguments)
+    if arguments.scheduler is not None:
+        _in_full(arguments)
+    output_folder(arguments.out, "evaluation.json")
+    takes = _takes(arguments)
+    lacking_data(takes)
+    classifiers = _classifiers(arguments, takes)
+    seeds = tuple(range(arguments.seed, arguments.seed + (FULL_SEEDS if arguments.full else 1)))
+    with ExitStack() as stack:
+        found = evaluate(
+            takes,
+            Hearing(arguments.out / "cache", arguments.model),
+            classifiers,
+            Engine(arguments.jobs, arguments.scheduler, (takes.root, arguments.out)),
+            _Bars(stack),
+            EvaluationSettings(
+                seeds,
+                arguments.hazard_free_hours,
+                degradation=_degradation(arguments, classifiers, takes),
+                stage_streams=arguments.stage_streams,
+            ),
+        )
+    save_scores(arguments.out, found.scores, COMPARABLE)
+    compared = _compared(arguments)
+    report = _report(found) | {"against": [_difference(one) for one in compared]}
+    write_report(arguments.out / "evaluation.json", report)
+    signatures = None if arguments.smoke else _signatures(arguments)
+    write_document(evaluation_document(found, signatures, _configuration(arguments)), arguments.out)
+    shown = {"out": str(arguments.out), "data": takes.origin, "windows": classifiers.told}
+    return CommandResult(report, table=shown, lines=[*_lines(found), *_against_lines(compared)])
+
+
+def _signatures(arguments: argparse.Namespace) -> "SignatureStudy":
+    """Return the signature study on the corpora that were given, else on simulated passages."""
+    import numpy as np
+
+    from worldstate_lab.signatures.clip_signatures import ClipSignatures
+    from worldstate_lab.signatures.signature_study import QUESTIONS, signature_study
+    from worldstate_lab.signatures.simulated_corpora import LAYOUT, STREETS, simulated_corpora
+    from worldstate_lab.trials.pass_cache import PassCache
+
+    from .corpora import published_corpora
+
+    # Apart, so that more recordings leave the folds and draws of a row as they are.
+    simulation, draws = np.random.default_rng(arguments.seed).spawn(2)
+    if arguments.idmt is not None or arguments.melaudis is not None:
+        return signature_study(*published_corpora(arguments), draws)
+
+    def simulate() -> "dict[str, HopTable]":
+        with progress_bar("simulating passages", PASSAGES * len(STREETS)) as bar:
+            made = simulated_corpora(PASSAGES, simulation, arguments.jobs, bar.advance)
+        return {name: corpus.table() for name, corpus in zip(("roads", "city"), made, strict=True)}
+
+    kept = PassCache(arguments.out / "cache").tables(
+        "signatures", [LAYOUT, PASSAGES, arguments.seed], simulate
+    )
+    roads, city = (ClipSignatures.from_table(kept[name]) for name in ("roads", "city"))
+    with progress_bar("measuring signatures", len(QUESTIONS)) as bar:
+        return signature_study(roads, city, draws, bar.advance)
+
+
+def _degradation(
+    arguments: argparse.Namespace, classifiers: "Classifiers", takes: "TakeList"
+) -> "DegradationSettings":
+    """Return the sweep over camera states; in a smoke test of one detector on small images.
+
+    It listens with --model, else with the model that ships, and where that was not made for this sound with
+    one that is trained on the training windows.
+    """
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate_lab.degradation.degradation_study import DegradationSettings
+    from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
+    from worldstate_lab.evaluation.camera_failure import whole_sweep
+    from worldstate_lab.trials.listening import model_refusal
+    from worldstate_lab.trials.training_windows import model_from_windows
+
+    detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
+    foreign = any(model_refusal(take, read_model(None)) for take in takes.static if take.filmed)
+    if foreign and model is None and classifiers.windows is not None and not arguments.smoke:
+        model = model_from_windows(classifiers.windows, arguments.out / "cache", seed)
+    if arguments.smoke:
+        return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
+    if arguments.onnx_model is not None:
+        onnx = argparse.Namespace(**vars(arguments), detector="onnx")
+        second = detector_name(onnx), detector_maker(onnx), detector_filter(onnx)
+        detectors = detectors[0], StagedDetector(*second)
+    settings = DegradationSettings(detectors, model, seed=seed)
+    return whole_sweep(takes, settings) if arguments.full else settings
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from worldstate.ground.checks import in_range
+    from worldstate.ground.errors import InvalidArgumentError
+
+    in_range("--jobs", arguments.jobs, 1, 256)
+    if (arguments.engine == "dask") != (arguments.scheduler is not None):
+        raise InvalidArgumentError("--engine dask and --scheduler ADDRESS: expected both or neither")
+    if arguments.stage_streams and not arguments.hazard_free:
+        raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
+    if arguments.dataset is not None and arguments.smoke:
+        raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
+
+
+def _in_full(arguments: argparse.Namespace) -> None:
+    """Name all files in full: the workers of a cluster were started in folders of their own."""
+    for name, value in vars(arguments).items():
+        if isinstance(value, Path):
+            setattr(arguments, name, value.absolute())
+        elif isinstance(value, list) and all(isinstance(one, Path) for one in value):
+            setattr(arguments, name, [one.absolute() for one in value])
+
+
+def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:
+    """Return the options that figures may depend on, as they were given or by default."""
+    names = [name for name in vars(arguments) if name not in _NO_FIGURE]
+    return [(f"--{name.replace('_', '-')}", _told(getattr(arguments, name))) for name in names]
+
+
+def _told(value: object) -> str:
+    if isinstance(value, list):
+        return " ".join(map(_told, value)) or "none"
+    return "none" if value is None else value.name if isinstance(value, Path) else str(value)
+
+
+def _compared(arguments: argparse.Namespace) -> "tuple[Comparison, ...]":
+    import numpy as np
+
+    from worldstate_lab.evaluation.against import compare
+
+    if arguments.against is None:
+        return ()
+    return compare(arguments.out, arguments.against, np.random.default_rng(arguments.seed))
+
+
+def _difference(one: "Comparison") -> dict[str, object]:
+    """Return JSON-able values; a figure that neither evaluation has is left out."""
+    known = {name: values for name, values in one.differences.items() if values[0] == values[0]}
+    return {"protocol": one.protocol, "method": one.method, "shared": one.shared, "differences": known}
+
+
+def _against_lines(compared: "tuple[Comparison, ...]") -> list[str]:
+    """Show the differences of the main figures to the other evaluation, with their intervals."""
+    lines = []
+    for one in compared:
+        shown = [
+            f"{name} {ours:+.3g} [{low:+.3g}, {high:+.3g}]"
+            for name in COMPARED
+            for ours, low, high in (one.differences[name],)
+            if ours == ours
+        ]
+        lines.append(f"{one.protocol}, {one.method}, {one.shared} shared: {'; '.join(shown) or 'nothing'}")
+    return ["", "less the other evaluation:", *lines] if lines else []
+
+
+class _Bars:
+    """One progress bar a step, each in the place of the last."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self._bar: Bar | None = None
+
+    def begin(self, description: str, parts: int) -> None:
+        self._stack.pop_all().close()
+        self._bar = self._stack.enter_context(progress_bar(description, parts))
+
+    def advance(self) -> None:
+        if self._bar is not None:
+            self._bar.advance()
+
+
+def _takes(arguments: argparse.Namespace) -> "TakeList":
+    from worldstate_lab.trials.takes import find_takes
+
+    if arguments.model is not None:
+        _check_model(arguments.model, arguments.dataset)
+    root = arguments.dataset or _simulated(arguments)
+    return find_takes(
+        root,
+        static_ids=arguments.static_ids,
+        dynamic_ids=arguments.dynamic_ids,
+        hazard_free=arguments.hazard_free,
+    )
+
+
+def _check_model(model: Path, dataset: Path | None) -> None:
+    """Refuse a model that was made for another array: every row of it would be of no meaning."""
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.files.acoustic_domain import check_array
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate.frontend.array.ovad_array import ovad_array
+
+    domain = read_model(model).domain
+    if domain is not None:
+        # Streets are simulated with OVAD's array: a mismatch is found before, not after a quarter of an hour.
+        check_array(domain, ovad_array() if dataset is None else choose_array(dataset))
+
+
+def _simulated(arguments: argparse.Namespace) -> Path:
+    """Simulate the streets that are not there yet."""
+    from dataclasses import replace
+
+    from worldstate.adapters.datasets.ovad import OvadDataset
+    from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+    from worldstate.simulation.dataset.dataset import write_dataset
+    from worldstate.simulation.dataset.plan import DatasetSettings
+
+    root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
+    static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
+    # A log of fewer recordings is that of a simulation that was interrupted.
+    if (root / LOG_NAME).is_file() and len(OvadDataset(root)) == static + dynamic:
+        return root
+    # A moving ego has no video: its camera moves, and every box with it.
+    streets = DatasetSettings(static, seed=arguments.seed, duration_s=length_s, video=True)
+    parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
+    if dynamic:
+        parts.append(DatasetSettings(n_static=0, n_dynamic=dynamic, seed=arguments.seed + 1))
+    with progress_bar("simulating streets", static + dynamic) as bar:
+        for part in parts:
+            write_dataset(root, part, jobs=arguments.jobs, progress=lambda row: bar.advance())
+    return root
+
+
+def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifiers":
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.files.array_match import microphone_order
+    from worldstate.frontend.array.ovad_array import ovad_array
+    from worldstate.simulation.scene.junction import MOVING_SITES, SITES
+    from worldstate_lab.trials import training_windows as windows
+    from worldstate_lab.trials.classification import Classifiers
+
+    folder = arguments.out / "cache"
+    folder.mkdir(parents=True, exist_ok=True)
+    if arguments.features is not None:
+        return Classifiers(*windows.windows_from_table(arguments.features, takes))
+    found = windows.windows_from_recordings(takes, folder)
+    # Windows are simulated with OVAD's array: those of another one would teach another feature.
+    usual = microphone_order(ovad_array().positions_m, choose_array(takes.root)) is not None
+    if found is None and takes.simulated and usual:
+        count = SMOKE_WINDOWS if arguments.smoke else windows.PER_APPROACH
+        sites = sorted({take.site for take in (*takes.static, *takes.dynamic)} & {*SITES, *MOVING_SITES})
+        with progress_bar("simulating windows", 4 * count * len(sites)) as bar:
+            found = windows.windows_from_simulation(
+                folder,
+                arguments.seed,
+                per_approach=count,
+                sites=sites,
+                jobs=arguments.jobs,
+                progress=bar.advance,
+            )
+    return Classifiers(*(found or (None, "the calibration recordings of each fold")))
+
+
+def _report(found: "Evaluation") -> dict[str, object]:
+    import math
+    from dataclasses import asdict
+
+    from worldstate_lab.degradation.degradation_report import degradation_record
+    from worldstate_lab.degradation.stream_sweep import stream_record
+
+    def known(values: "dict[str, float]") -> dict[str, float | None]:
+        return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+    return {
+        "data": found.takes.origin,
+        "recordings": len(found.trials),
+        "failed": {one.name: one.problem for one in found.failed},
+        "stands_on": {name: run.stands_on for name, run in found.runs.items()},
+        "refused": {name: refused for name, refused in found.refused.items() if refused},
+        "lacking": dict(found.lacking),
+        "cautions": {name: run.cautions for name, run in found.runs.items()},
+        "protocols": {
+            name: {
+                method: known(score.figures() | {"false_alarms_upper_90": score.poisson_upper()})
+                for method, score in scores.items()
+            }
+            for name, scores in found.scores.items()
+        },
+        "equal_detection": {
+            name: [known(asdict(one)) for one in every] for name, every in found.equal.items()
+        },
+        "degradation": None if found.degradation is None else degradation_record(found.degradation),
+        "staged_streams": None if found.staged is None else stream_record(found.staged),
+        "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
+    }
+
+
+def _lines(found: "Evaluation") -> list[str]:
+    from worldstate_lab.degradation.degradation_report import degradation_lines
+    from worldstate_lab.degradation.stream_sweep import stream_lines
+
+    lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
+    lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
+    for name, scores in found.scores.items():
+        run = found.runs[name]
+        hours = next(iter(scores.values())).figures()["hazard_free_hours"]
+        head = f"{run.protocol.title}: {len(run.trials)} recordings, {hours:.3f} h of them hazard-free"
+        lines += ["", head, *run.cautions]
+        lines.append(
+            f"{'':36}{'lead s':>8}{'detected':>10}{'random':>8}{'FA/h':>8}{'(95 %)':>14}{'< (90 %)':>10}"
+            f"{'bearing deg':>13}"
+        )
+        lines += [_row(name, score) for name, score in scores.items() if not name.startswith("curve")]
+        lines += [_equal_line(one) for one in found.equal.get(name, ())]
+        refused = found.refused.get(name, {})
+        lines += [f"{method:36}not scored" for method in refused]
+        lines += [f"not scored: {why}" for why in dict.fromkeys(refused.values())]
+    lines += [] if found.degradation is None else degradation_lines(found.degradation)
+    return lines if found.staged is None else [*lines, *stream_lines(found.staged)]
+
+
+def _equal_line(one: "EqualDetection") -> str:
+    """Say what the two ways to warn cost where both detect as much, each at its best threshold."""
+    return (
+        f"where both detect {one.detected:.2f}, alarms an hour: world-state {one.ours:.0f}, "
+        f"published, sustained {one.baseline:.0f}; ratio {one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}]"
+    )
+
+
+def _row(method: str, score: "Score") -> str:
+    figures, (low, high) = score.figures(), score.poisson()
+    forms = {
+        "lead_s": ".2f",
+        "detection": ".2f",
+        "random_detection": ".2f",
+        "false_alarms_per_hour": ".0f",
+        "bearing_deg": ".1f",
+    }
+    lead, detected, random, alarms, bearing = (
+        "-" if figures[name] != figures[name] else format(figures[name], form) for name, form in forms.items()
+    )
+    interval = f"[{low:.0f}, {high:.0f}]" if low == low else "-"
+    upper = f"{score.poisson_upper():.0f}" if low == low else "-"
+    return f"{method:36}{lead:>8}{detected:>10}{random:>8}{alarms:>8}{interval:>14}{upper:>10}{bearing:>13}"

@@ -1,0 +1,182 @@
+"""Miss rates of a detector over azimuth and degradation, with their spread over recordings."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise
+from operator import add
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from worldstate.adapters.camera.degradation import LEVELS
+from worldstate.adapters.camera.detections import DetectionLog
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, AbsenceTally
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.metrics.recording_draws import middle
+
+from .conditions import FAMILIES, at_level
+from .looks import detections_in, health_of
+
+# How misses are counted in every sweep, so that rates are those of `measure-absence`.
+SETTINGS = AbsenceSettings(families=FAMILIES)
+# With fewer looks, one vehicle more or less in a bin moves its rate by more than what is compared.
+FEWEST_LOOKS = 20
+
+Counts = Mapping[str, FamilyCounts]
+
+
+class Band(NamedTuple):
+    """Values with the middle 95 % over recordings drawn again, arrays of one shape."""
+
+    value: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Fall:
+    """A place at which beta falls where it ought to rise.
+
+    Examples
+    --------
+    >>> Fall("azimuth", "blur 0.5 at 20-30 deg", 0.08, -0.1, 0.3).certain
+    False
+    """
+
+    along: Literal["degradation", "azimuth"]
+    where: str  # The step at whose end it is lower than at its start
+    by: float
+    low: float  # Middle 95 % over recordings drawn again
+    high: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether no draw of the middle 95 % shows a rise."""
+        return self.low > 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BetaCurves:
+    """beta(theta, d) of one detector as it was counted: misses over looks, NaN without a look."""
+
+    azimuth_deg: tuple[float, ...]  # Edges of the bins off the optical axis
+    looks: FloatArray  # shape (families, bins, levels)
+    by_azimuth: Band  # Same shape; families as in `FAMILIES`, level 0 the clean camera
+    overall: Band  # shape (families, levels): All azimuths
+    falls: tuple[Fall, ...]  # The largest first
+
+    @property
+    def bins(self) -> tuple[str, ...]:
+        """The azimuth bins in words."""
+        edges = self.azimuth_deg
+        return tuple(f"{low:.0f}-{high:.0f} deg" for low, high in pairwise(edges))
+
+
+def absence_counts(reference: DetectionLog, boxes: HopTable) -> dict[str, FamilyCounts]:
+    """Count what a detector missed of the reference of one recording, in every condition."""
+    tally = AbsenceTally(PinholeCamera(), SETTINGS)
+    for family in FAMILIES:
+        for level in range(len(LEVELS)):
+            # The clean camera belongs to every family and is counted once.
+            if level or family == FAMILIES[0]:
+                for number, found in enumerate(detections_in(boxes, at_level(family, level).name).frames):
+                    tally.count(reference, number, found, family, level)
+    return tally.counts()
+
+
+def counts_table(counts: Counts) -> HopTable:
+    """Return counts as a table for a cache: a row an azimuth bin of each family, its last one of clutter."""
+    rows = [
+        (family, *row)
+        for family, one in counts.items()
+        for row in (*zip(one.looks, one.misses, strict=True), (one.sectors, one.clutter))
+    ]
+    return HopTable.of_rows(("family", "looks", "misses"), rows)
+
+
+def counts_of(table: HopTable) -> dict[str, FamilyCounts]:
+    """Return what `counts_table` was made of."""
+    counts = {}
+    for family in FAMILIES:
+        chosen = table.family == family
+        looks, misses = (_rows(table.columns[name][chosen]) for name in ("looks", "misses"))
+        counts[str(family)] = FamilyCounts(looks[:-1], misses[:-1], looks[-1], misses[-1])
+    return counts
+
+
+def pooled_rates(
+    counts: Sequence[Counts], readings: Sequence[HopTable], provenance: Mapping[str, str]
+) -> MissRates:
+    """Return the miss rates that several recordings give together, with the scale of their camera."""
+    families: dict[str, FamilyCounts] = {
+        family: reduce(add, [one[family] for one in counts]) for family in FAMILIES
+    }
+    if not np.sum(families[FAMILIES[0]].looks):
+        raise InvalidArgumentError(
+            "recordings: expected moving objects in view, found none to measure beta on"
+        )
+    edges = SETTINGS.edges_deg(PinholeCamera())
+    return MissRates(edges, families, provenance, health_of(readings), SETTINGS.repeats)
+
+
+def beta_curves(counts: Sequence[Counts], draws: IndexArray) -> BetaCurves:
+    """Return the curves of all recordings; `draws` (draws, recordings) says which make each draw."""
+    edges = SETTINGS.edges_deg(PinholeCamera())
+    looks, misses = (
+        np.array([[getattr(one[family], name) for family in FAMILIES] for one in counts])
+        for name in ("looks", "misses")
+    )
+    # How often each recording is in each draw, so that a draw is a product and no loop.
+    weight = np.stack([np.bincount(drawn, minlength=len(counts)) for drawn in draws]).astype(float)
+    drawn_bins = _ratio(np.tensordot(weight, misses, 1), np.tensordot(weight, looks, 1))
+    drawn_all = _ratio(
+        np.tensordot(weight, misses.sum(axis=2), 1), np.tensordot(weight, looks.sum(axis=2), 1)
+    )
+    total, missed = looks.sum(axis=0), misses.sum(axis=0)
+    by_azimuth = _band(_ratio(missed, total), drawn_bins)
+    overall = _band(_ratio(missed.sum(axis=1), total.sum(axis=1)), drawn_all)
+    found = BetaCurves(edges, total, by_azimuth, overall, ())
+    falls = sorted(_falls(found, drawn_bins, drawn_all), key=lambda fall: -fall.by)
+    return BetaCurves(edges, total, by_azimuth, overall, tuple(falls))
+
+
+def _falls(curves: BetaCurves, drawn_bins: FloatArray, drawn_all: FloatArray) -> Iterable[Fall]:
+    for i, family in enumerate(FAMILIES):
+        for level in range(1, len(LEVELS)):
+            where = f"{family} {LEVELS[level - 1]:g} to {LEVELS[level]:g}"
+            step = drawn_all[:, i, level - 1] - drawn_all[:, i, level]
+            by = curves.overall.value[i, level - 1] - curves.overall.value[i, level]
+            yield from _fall("degradation", where, by, step)
+        for level in range(0 if i == 0 else 1, len(LEVELS)):
+            beta = curves.by_azimuth.value[i, :, level]
+            known = np.flatnonzero(curves.looks[i, :, level] >= FEWEST_LOOKS)
+            for a, b in pairwise(known):
+                where = f"{at_level(family, level).name}, {curves.bins[a]} to {curves.bins[b]}"
+                step = drawn_bins[:, i, a, level] - drawn_bins[:, i, b, level]
+                yield from _fall("azimuth", where, beta[a] - beta[b], step)
+
+
+def _fall(
+    along: Literal["degradation", "azimuth"], where: str, by: float, drawn: FloatArray
+) -> Iterable[Fall]:
+    if by > 0.0:
+        yield Fall(along, where, float(by), *middle(drawn))
+
+
+def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, values.tolist()))
+
+
+def _ratio(part: FloatArray, whole: FloatArray) -> FloatArray:
+    return np.asarray(np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0))
+
+
+def _band(value: FloatArray, drawn: FloatArray) -> Band:
+    flat = drawn.reshape(len(drawn), -1)
+    low, high = np.array([middle(column) for column in flat.T]).T.reshape(2, *value.shape)
+    return Band(value, low, high)

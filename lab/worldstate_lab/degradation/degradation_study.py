@@ -1,0 +1,363 @@
+"""The degradation sweep of the paper: miss rates of two detectors, and awareness while the camera fails."""
+
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.datasets.ovad import Recording
+from worldstate.adapters.files.model_file import model_to_dict, read_model
+from worldstate.adapters.listen import ListenSettings, open_source
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.typing import BoolArray, IndexArray
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.degradation import looks, staged_filter
+from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.metrics.recording_folds import FOLDS, deal_folds
+
+from .awareness import Awareness, AwarenessRow, AwarenessSettings, hazard_awareness
+from .beta_curves import (
+    BetaCurves,
+    Counts,
+    absence_counts,
+    beta_curves,
+    counts_of,
+    counts_table,
+    pooled_rates,
+)
+from .conditions import FAMILIES
+from .looks import READINGS, StagedDetector, look, motion_detectors
+from .rain import RAIN_DB
+from .staged_filter import by_condition, cameras, filter_in_conditions
+from .sweep_data import sweep_data
+
+Tables = Mapping[str, HopTable]
+# Keeps what a pass over a recording gave: name of the pass, what it depends on, and how to make it.
+Keep = Callable[[str, object, Callable[[], Tables]], Tables]
+# Does the work on every item, in order. What is no mapping says, as text, why a recording failed.
+Over = Callable[[Callable[["Item"], Tables], Sequence["Item"]], Iterable[object]]
+
+
+@dataclass(frozen=True, slots=True)
+class DegradationSettings:
+    """What is swept.
+
+    Parameters
+    ----------
+    detectors : tuple of StagedDetector
+        Tried in every condition; both kinds of background subtraction by default.
+    model : Path, optional
+        Signature model; the one that ships where not given.
+    miss_rates : mapping of str to MissRates
+        By detector, measured elsewhere; those of the other folds' recordings for a detector without.
+    alpha : float
+        False-positive budget of the thresholds.
+    approaches, hazard_free : int
+        Recordings of each kind.
+    folds : int
+        Thresholds and miss rates of a recording come from those of the other folds.
+    width_px : int
+        Images are reduced to this width once, before anything is staged; detectors then find them small
+        enough.
+    seed : int
+        Noise, folds and intervals.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a number is out of range or two detectors have one name.
+
+    Examples
+    --------
+    >>> DegradationSettings().alpha
+    0.02
+    """
+
+    detectors: tuple[StagedDetector, ...] = field(default_factory=motion_detectors)
+    model: Path | None = None
+    miss_rates: Mapping[str, MissRates] = field(default_factory=dict)
+    alpha: float = 0.02
+    approaches: int = 12
+    hazard_free: int = 12
+    folds: int = FOLDS
+    width_px: int = 640
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        names = {one.name for one in self.detectors}
+        if not names or len(names) < len(self.detectors) or READINGS in names:
+            raise InvalidArgumentError(f"detectors: expected names of their own, got {sorted(names)}")
+        if not set(self.miss_rates) <= names:
+            raise InvalidArgumentError(
+                f"miss_rates: expected those of {sorted(names)}, got {sorted(self.miss_rates)}"
+            )
+        in_range("width_px", self.width_px, 64, 8192)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectorSweep:
+    """Everything about one detector."""
+
+    detector: str
+    beta: BetaCurves
+    awareness: Awareness
+
+    @property
+    def least_awareness(self) -> AwarenessRow:
+        """The condition of the paper's sweep in which awareness is least."""
+        return min(self._paper(), key=lambda row: row.awareness.value)
+
+    @property
+    def least_vision(self) -> AwarenessRow:
+        """The condition of the paper's sweep in which vision alone is least."""
+        return min(self._paper(), key=lambda row: row.vision.value)
+
+    def family(self, name: str) -> list[AwarenessRow]:
+        """Return the clean row and those of a family, by level."""
+        rows = self.awareness.rows
+        return [rows[0], *(row for row in rows if row.condition.family == name)]
+
+    def _paper(self) -> list[AwarenessRow]:
+        return [row for family in FAMILIES for row in self.family(family)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DegradationStudy:
+    """Miss rates and awareness of every detector on the same recordings.
+
+    Parameters
+    ----------
+    sweeps : tuple of DetectorSweep
+        In the order of the settings.
+    approaches, hazard_free : tuple of str
+        Recordings that the figures stand on.
+    skipped : mapping of str to str
+        Recordings that failed, and why.
+    missing : tuple of str
+        What there ought to be more of, in words.
+    settings : DegradationSettings
+        As they were given.
+    """
+
+    sweeps: tuple[DetectorSweep, ...]
+    approaches: tuple[str, ...]
+    hazard_free: tuple[str, ...]
+    skipped: Mapping[str, str]
+    missing: tuple[str, ...]
+    settings: DegradationSettings
+
+    @property
+    def beta_shift(self) -> float:
+        """Mean over families and levels of the last detector's beta less that of the first."""
+        first, last = (sweep.beta.overall.value for sweep in (self.sweeps[0], self.sweeps[-1]))
+        return float(np.nanmean(last - first))
+
+    @property
+    def largest_awareness_difference(self) -> float:
+        """Over all conditions, between the first and the last detector."""
+        rows = zip(self.sweeps[0].awareness.rows, self.sweeps[-1].awareness.rows, strict=True)
+        return max(abs(a.awareness.value - b.awareness.value) for a, b in rows)
+
+
+def _made(name: str, key: object, make: Callable[[], Tables]) -> Tables:
+    """Keep nothing."""
+    return make()
+
+
+def degradation_study(
+    recordings: Sequence[Recording],
+    settings: DegradationSettings | None = None,
+    *,
+    over: Over = map,
+    keep: Keep = _made,
+    fingerprint: Callable[[Path], str] = str,
+) -> DegradationStudy:
+    """Stage blur, darkness, noise and rain, four levels each, and say what vision and the filter still hold.
+
+    Nobody is told what is staged: d is read from the images, and beta from a table that was measured on the
+    recordings of other folds with the same detector. Thresholds are gamma(alpha) on the hazard-free
+    recordings of other folds.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Those with video and detections and a standing ego are chosen from, evenly over the junctions.
+    settings : DegradationSettings, optional
+        What is swept.
+    over : callable
+        Does the work on every recording, in order; ``map``, or `Engine.over`. What it gives in place of
+        tables says why a recording failed, which is then skipped.
+    keep : callable
+        Keeps what a pass gave, such as `PassCache.tables`.
+    fingerprint : callable
+        Names the content of a recording's folder, for `keep`.
+
+    Returns
+    -------
+    DegradationStudy
+        Curves of beta, a row for each condition, and what rain takes beside its two effects alone.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are fewer than two filmed approaches or hazard-free recordings.
+    OutOfDomainError
+        If the model was made for another array or rate.
+
+    References
+    ----------
+    "Evidence of Absence", section IX and ablation (c).
+
+    Examples
+    --------
+    >>> try:
+    ...     degradation_study([])
+    ... except InvalidArgumentError as error:
+    ...     print(str(error).partition(";")[0])
+    recordings: a sweep needs 2 filmed approaches and 2 filmed hazard-free recordings
+    """
+    chosen = settings or DegradationSettings()
+    data = sweep_data(recordings, chosen.approaches, chosen.hazard_free)
+    if data.lacks is not None:
+        raise InvalidArgumentError(f"recordings: a sweep {data.lacks}")
+    passes = _Passes(chosen, {one.recording_id: fingerprint(one.path) for one in data.recordings}, keep)
+    rng, skipped = np.random.default_rng(chosen.seed), dict[str, str]()
+    seen = _done(over, passes.look, [Item(one) for one in data.recordings], skipped)
+    counts = [{name: counts_of(one.tables[f"{name} misses"]) for name in passes.names} for one in seen]
+    folds = _folds(seen, chosen.folds, rng)
+    rates = {fold: passes.rates(folds != fold, seen, counts) for fold in set(folds.tolist())}
+    items = [replace(one, rates=rates[fold]) for one, fold in zip(seen, folds.tolist(), strict=True)]
+    believed = _done(over, passes.filter, items, skipped)
+    # By kind alone: a junction and side has one recording or two, which would hardly vary.
+    draws = stratified_draws([one.hazard_free for one in believed], rng)
+    policy = read_model(chosen.model).policies.policies[0]
+    judging = AwarenessSettings(policy.reference_prior, chosen.alpha, policy.sustain_hops, chosen.folds)
+    left = {str(one) for one in believed}
+    counts = [one for one, its in zip(counts, seen, strict=True) if str(its) in left]
+    # The same folds for every detector: what differs between them is no draw of the folds.
+    fold_seed = int(rng.integers(2**32))
+
+    def sweep(name: str) -> DetectorSweep:
+        staged = [by_condition(one.tables[name]) for one in believed]
+        awareness = hazard_awareness(staged, judging, draws, np.random.default_rng(fold_seed))
+        return DetectorSweep(name, beta_curves([one[name] for one in counts], draws), awareness)
+
+    names = {free: tuple(str(one) for one in believed if one.hazard_free == free) for free in (False, True)}
+    sweeps = tuple(sweep(name) for name in passes.names)
+    return DegradationStudy(sweeps, names[False], names[True], skipped, data.missing, chosen)
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One recording on its way through the passes; its text is its name."""
+
+    recording: Recording
+    tables: Tables = field(default_factory=dict)  # What the pass before gave
+    rates: Mapping[str, MissRates] = field(default_factory=dict)  # By detector, of other recordings
+
+    def __str__(self) -> str:
+        return self.recording.recording_id
+
+    @property
+    def hazard_free(self) -> bool:
+        """Whether nothing approaches."""
+        return self.recording.label == "none"
+
+
+@dataclass(frozen=True, slots=True)
+class _Passes:
+    """The two passes over a recording, in any process: over its images, and over its sound."""
+
+    settings: DegradationSettings
+    fingerprints: Mapping[str, str]
+    keep: Keep
+
+    @property
+    def names(self) -> list[str]:
+        """Of the detectors."""
+        return [one.name for one in self.settings.detectors]
+
+    def look(self, item: Item) -> Tables:
+        """Return what every detector reported in every condition of the camera, and what it missed."""
+        recording = item.recording
+
+        def make() -> Tables:
+            reference = recording.read_detections()
+            if reference is None:
+                raise InputFileError(recording.path, "expected camera detections")
+            video, rng = open_video(recording.path / VIDEO_NAME), np.random.default_rng(self._seed(item))
+            tables = look(video, self.settings.detectors, rng, self.settings.width_px)
+            missed = {f"{n} misses": counts_table(absence_counts(reference, tables[n])) for n in self.names}
+            return {**tables, **missed}
+
+        return self.keep("degraded-looks", self._look_key(item), make)
+
+    def filter(self, item: Item) -> Tables:
+        """Return what the filter believed in every condition, a table a detector."""
+        recording, model = item.recording, read_model(self.settings.model)
+        rates = {name: one.to_dict() for name, one in item.rates.items()}
+        key = [
+            staged_filter.VERSION,
+            self._look_key(item),
+            rates,
+            model_to_dict(model),
+            list(map(repr, RAIN_DB)),
+        ]
+
+        def make() -> Tables:
+            source = open_source(recording.path, model=model, settings=ListenSettings(alpha=None))
+            seen = cameras(self.settings.detectors, item.rates, item.tables)
+            about: dict[str, Any] = {
+                "name": recording.recording_id,
+                "label": recording.label,
+                "t0_s": np.nan if source.t0_s is None else source.t0_s,
+                "about": {"site": recording.environment},
+            }
+            filtered = filter_in_conditions(source, seen, self._seed(item))
+            return {name: table.replace(**about) for name, table in filtered.items()}
+
+        return self.keep("degraded-beliefs", key, make)
+
+    def rates(
+        self, others: BoolArray, seen: Sequence[Item], counts: Sequence[Mapping[str, Counts]]
+    ) -> dict[str, MissRates]:
+        """Return the miss rates of every detector: as they were given, or measured on `others`."""
+        chosen = np.flatnonzero(others).tolist()
+        readings = [seen[i].tables[READINGS] for i in chosen]
+        return {
+            name: self.settings.miss_rates.get(name)
+            or pooled_rates([counts[i][name] for i in chosen], readings, {"detector": name})
+            for name in self.names
+        }
+
+    def _look_key(self, item: Item) -> list[object]:
+        chosen = self.settings
+        return [looks.VERSION, self.fingerprints[str(item)], self.names, chosen.width_px, chosen.seed]
+
+    def _seed(self, item: Item) -> tuple[int, int]:
+        """No recording's noise depends on which others there are."""
+        return self.settings.seed, zlib.crc32(str(item).encode())
+
+
+def _done(
+    over: Over, work: Callable[[Item], Tables], items: Sequence[Item], skipped: dict[str, str]
+) -> list[Item]:
+    """Do a pass; return the items with what it gave, and write down those that failed."""
+    done = []
+    for item, tables in zip(items, over(work, items), strict=True):
+        if isinstance(tables, Mapping):
+            done.append(replace(item, tables=tables))
+        else:
+            skipped[str(item)] = str(tables)
+    return done
+
+
+def _folds(seen: Sequence[Item], folds: int, rng: np.random.Generator) -> IndexArray:
+    labels = [str(one.recording.label) for one in seen]
+    return deal_folds(labels, [str(one.recording.environment) for one in seen], rng, folds)

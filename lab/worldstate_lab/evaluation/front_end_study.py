@@ -1,0 +1,144 @@
+"""Front-end accuracy and approach rate on the trials of a protocol: the figures of the paper's section IX."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.recordings.bearing_gating import bearing_figures
+from worldstate.operations.recordings.hop_table import HopTable, joined
+from worldstate_lab.metrics.recording_draws import middle, stratified_draws
+from worldstate_lab.trials.trial import Trial
+
+# The paper's figure of looming is of the last three seconds before the pass.
+IMMINENT_S = 3.0
+# A slope read as a time: beyond this there is nothing that approaches.
+LONGEST_TTA_S = 30.0
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SiteError:
+    """Median error of the SRP bearings in view at one site, with its interval over recordings."""
+
+    median_deg: float
+    interval_deg: Interval
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrontEndStudy:
+    """Bearings against the camera, prominence, looming and tonal Doppler, with intervals over recordings."""
+
+    # `bearing_srp_deg`, `bearing_music_deg`, `bearing_gated_deg`, `prominence_in_view`,
+    # `prominence_in_silence`, `looming_auroc`, `looming_correlation`, `doppler_usable` (count).
+    figures: Mapping[str, float]
+    intervals: Mapping[str, Interval]
+    by_site: Mapping[str, SiteError]
+    frames: int  # Line-of-sight frames with a moving box to compare with
+    approaches: int
+    checked: HopTable  # `prominence` and `error_rad` of every hop, for the gating curve
+
+
+def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: int = 500) -> FrontEndStudy:
+    """Count the figures, and draw recordings again for their intervals."""
+    approaches = [trial for trial in trials if not trial.hazard_free]
+    strata = [(trial.label, trial.site) for trial in trials]
+    drawn = stratified_draws(strata, rng, draws)
+    found = _figures(trials, np.arange(len(trials)))
+    samples = [_figures(trials, rows) for rows in drawn]
+    by_site = {
+        site: _site_error([trial.hops for trial in approaches if trial.site == site], rng, draws)
+        for site in sorted({trial.site for trial in approaches})
+    }
+    by_site = {site: error for site, error in by_site.items() if error.frames}
+    checked = [_checked(trial.hops) for trial in approaches]
+    return FrontEndStudy(
+        found,
+        {name: middle(np.array([one[name] for one in samples])) for name in found},
+        by_site,
+        sum(error.frames for error in by_site.values()),
+        len(approaches),
+        joined(checked) if checked else HopTable({"prominence": np.empty(0), "error_rad": np.empty(0)}),
+    )
+
+
+def _figures(trials: Sequence[Trial], rows: IndexArray) -> dict[str, float]:
+    approaches = [trials[i].hops for i in rows.tolist() if not trials[i].hazard_free]
+    calm = [trials[i].hops for i in rows.tolist() if trials[i].hazard_free]
+    gated = (
+        bearing_figures(joined([_checked(hops) for hops in approaches]))["bearing_gated_deg"]
+        if approaches
+        else None
+    )
+    seen = _pooled(approaches, lambda hops: hops.prominence[np.isfinite(hops.reference_rad)])
+    return {
+        "bearing_srp_deg": _median_deg(approaches, "srp_rad"),
+        "bearing_music_deg": _median_deg(approaches, "music_rad"),
+        "bearing_gated_deg": np.nan if gated is None else gated,
+        "prominence_in_view": _median(seen),
+        "prominence_in_silence": _median(_pooled(calm, lambda hops: hops.prominence)),
+        "doppler_usable": float(sum(hops.about["doppler"] == "" for hops in approaches)),
+        **_looming(approaches, calm),
+    }
+
+
+def _looming(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[str, float]:
+    """How well the slope tells the last seconds before the pass from silence, and the time itself."""
+    passing = [hops for hops in approaches if hops.about["pass_s"] is not None]
+    left_s = [float(hops.about["pass_s"]) - hops.time_s for hops in passing]
+    imminent = [
+        hops.log_slope_hz[(left > 0.0) & (left < IMMINENT_S)]
+        for hops, left in zip(passing, left_s, strict=True)
+    ]
+    hidden = [hops.before_sight() & (hops.log_slope_hz > 2.0 / LONGEST_TTA_S) for hops in passing]
+    read = [2.0 / hops.log_slope_hz[use] for hops, use in zip(passing, hidden, strict=True)]
+    true = [left[use] for left, use in zip(left_s, hidden, strict=True)]
+    high, low = _known(_flat(imminent)), _known(_pooled(calm, lambda hops: hops.log_slope_hz))
+    area = auroc(np.concatenate([high, low]), np.arange(high.size + low.size) < high.size)
+    enough = sum(map(len, read)) > 2
+    return {
+        "looming_auroc": np.nan if area is None else area,
+        "looming_correlation": float(np.corrcoef(_flat(read), _flat(true))[0, 1]) if enough else np.nan,
+    }
+
+
+def _site_error(approaches: Sequence[HopTable], rng: np.random.Generator, draws: int) -> SiteError:
+    errors = [_known(_error(hops, "srp_rad")) for hops in approaches]
+    drawn = rng.integers(len(errors), size=(draws, len(errors)))
+    medians = [_median(_flat([errors[i] for i in rows])) for rows in drawn.tolist()]
+    every = _flat(errors)
+    interval = middle(np.degrees(np.array(medians)))
+    return SiteError(float(np.degrees(_median(every))), interval, every.size)
+
+
+def _checked(hops: HopTable) -> HopTable:
+    """Bearings of one recording beside the prominence of their windows."""
+    return HopTable({"prominence": hops.prominence, "error_rad": hops.srp_rad - hops.reference_rad})
+
+
+def _error(hops: HopTable, name: str) -> FloatArray:
+    return np.asarray(np.abs(hops.columns[name] - hops.reference_rad))
+
+
+def _median_deg(approaches: Sequence[HopTable], name: str) -> float:
+    return float(np.degrees(_median(_known(_pooled(approaches, lambda hops: _error(hops, name))))))
+
+
+def _pooled(tables: Sequence[HopTable], of: Callable[[HopTable], FloatArray]) -> FloatArray:
+    return _flat([of(hops) for hops in tables])
+
+
+def _flat(parts: Sequence[FloatArray]) -> FloatArray:
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _known(values: FloatArray) -> FloatArray:
+    return values[np.isfinite(values)]
+
+
+def _median(values: FloatArray) -> float:
+    return float(np.median(values)) if values.size else np.nan

@@ -1,0 +1,103 @@
+"""Which recordings calibrate and which are tested: folds, junctions left out, and the least data of each."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate_lab.metrics.recording_folds import deal_folds
+from worldstate_lab.trials.classification import TrainedOn, junction_of
+from worldstate_lab.trials.takes import Take
+from worldstate_lab.trials.trial import Trial
+
+FOLDS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """One way to part recordings into calibration and test."""
+
+    name: str
+    title: str
+    moving: bool = False  # Whether it is about the recordings of a moving ego
+    by_junction: bool = False  # Leave one junction out, instead of folds over recordings
+    trained_on: TrainedOn = "all"  # What the published classifier is trained on
+
+    def lacks(self, takes: Sequence[Take]) -> str | None:
+        """Say what is missing for this protocol, before anything is heard; None where nothing is."""
+        chosen = [take for take in takes if take.moving == self.moving]
+        counts = Counter("none" if take.hazard_free else "approach" for take in chosen)
+        least = {"approach": 2, "none": 2}
+        wanted = [
+            f"{least[kind]} {name}, found {counts[kind]}"
+            for kind, name in (("approach", "approaches with a T0"), ("none", "hazard-free recordings"))
+            if counts[kind] < least[kind]
+        ]
+        if self.by_junction:
+            both = junctions_with_both([(take.site, take.hazard_free) for take in chosen])
+            if len(both) < 2:
+                wanted.append(f"2 junctions with approaches and hazard-free recordings, found {len(both)}")
+        ego = "moving" if self.moving else "standing"
+        return f"needs, of a {ego} ego, " + " and ".join(wanted) if wanted else None
+
+    def parts(
+        self, trials: Sequence[Trial], rng: np.random.Generator
+    ) -> Iterator[tuple[list[int], list[int]]]:
+        """Yield rows of calibration and test recordings; every recording is tested once."""
+        fold_of = self._by_junction(trials) if self.by_junction else _dealt(trials, rng)
+        for fold in np.unique(fold_of[fold_of >= 0]).tolist():
+            calibration = np.flatnonzero(fold_of != fold).tolist()
+            tested = np.flatnonzero(fold_of == fold).tolist()
+            shared = {trials[i].name for i in calibration} & {trials[i].name for i in tested}
+            if shared:
+                raise InvalidArgumentError(f"recordings: {sorted(shared)[0]} both calibrates and is tested")
+            yield calibration, tested
+
+    def _by_junction(self, trials: Sequence[Trial]) -> np.ndarray:
+        """Return the number of each junction; streams belong to none, calibrate and are never tested."""
+        names = junctions_with_both([(trial.site, trial.hazard_free) for trial in trials])
+        return np.array([names.index(j) if (j := junction_of(t.site)) in names else -1 for t in trials])
+
+
+STATIC = Protocol("static", "Standing ego, five folds")
+DYNAMIC = Protocol("dynamic", "Moving ego, five folds", moving=True)
+FIXED = Protocol("junctions_fixed", "One junction out, classifier fixed", by_junction=True)
+RETRAINED = Protocol(
+    "junctions_retrained",
+    "One junction out, classifier retrained without it",
+    by_junction=True,
+    trained_on="other junctions",
+)
+PROTOCOLS = (STATIC, DYNAMIC, FIXED, RETRAINED)
+
+
+def junctions_with_both(sites: Sequence[tuple[str, bool]]) -> list[str]:
+    """Return the junctions that have approaches and hazard-free recordings, by name."""
+    kinds: dict[str, set[bool]] = {}
+    for site, hazard_free in sites:
+        kinds.setdefault(junction_of(site), set()).add(hazard_free)
+    return sorted(name for name, found in kinds.items() if len(found) == 2)
+
+
+def _dealt(trials: Sequence[Trial], rng: np.random.Generator) -> np.ndarray:
+    """Deal recordings to folds, the pieces of a stream in runs, so that neighbours stay together."""
+    whole = [i for i, trial in enumerate(trials) if "stream" not in trial.hops.about]
+    fold_of = np.full(len(trials), -1)
+    if whole:
+        labels, sites = [trials[i].label for i in whole], [trials[i].site for i in whole]
+        streamed = len(whole) < len(trials)
+        free = sum(label == "none" for label in labels)
+        if free >= 2 or not streamed:
+            fold_of[whole] = deal_folds(labels, sites, rng, FOLDS)
+        else:
+            # All hazard-free time is in streams: the approaches are dealt alone.
+            fold_of[whole] = rng.permutation(np.arange(len(whole)) % FOLDS)
+    pieces: dict[str, list[int]] = {}
+    for i, trial in enumerate(trials):
+        if "stream" in trial.hops.about:
+            pieces.setdefault(str(trial.hops.about["stream"]), []).append(i)
+    for rows in pieces.values():
+        fold_of[rows] = np.arange(len(rows)) * FOLDS // len(rows)
+    return fold_of

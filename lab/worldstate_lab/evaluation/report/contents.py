@@ -1,0 +1,130 @@
+"""From the result of an evaluation to the document that tells it."""
+
+import platform
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import scipy
+import sklearn
+
+from worldstate.ground.version import __version__
+from worldstate_lab.evaluation.evaluation import Evaluation
+from worldstate_lab.evaluation.protocols import PROTOCOLS, STATIC
+from worldstate_lab.evaluation.report import study_sections as study
+from worldstate_lab.evaluation.report import warning_sections as warning
+from worldstate_lab.signatures.signature_study import SignatureStudy
+from worldstate_lab.trials.hearing import data_fingerprint
+
+from .degradation_section import awareness_figures, degradation_section, sweep_values
+from .document import Document, ReportTable, Section, Value
+from .measured_values import Values, measured_values
+
+
+def evaluation_document(
+    found: Evaluation,
+    signatures: SignatureStudy | None = None,
+    configuration: Sequence[tuple[str, str]] = (),
+) -> Document:
+    """Return the whole report; sections that nothing was measured for say so, and the options end it."""
+    values = measured_values(
+        found,
+        ({} if found.degradation is None else sweep_values(found.degradation))
+        | ({} if signatures is None else study.signature_values(signatures)),
+    )
+    panels = () if found.degradation is None else awareness_figures(found.degradation)
+    static = STATIC.name in found.runs
+    sections = [
+        _data_section(found, values),
+        *((warning.table_i(found, values), warning.budget_section(found, values)) if static else ()),
+        *((warning.cueing_section(found, values, panels), warning.approach_section(found)) if static else ()),
+        study.front_end_section(found, values),
+        study.approach_rate_section(values),
+        study.transfer_section(found, values),
+        degradation_section(
+            found.degradation, found.lacking.get("degradation sweep", "not asked for"), found.staged
+        ),
+        *((study.ablation_section(found, values),) if static else ()),
+        study.signature_section(signatures),
+        *((warning.tracking_section(found, values),) if static else ()),
+        *((warning.strata_section(found, values),) if static else ()),
+        warning.difference_section(found),
+        study.paper_section(found, values),
+    ]
+    return Document(
+        "Evaluation of hidden-hazard warnings from sound",
+        f"{found.takes.origin}: {len(found.trials)} recordings, {_hours(found):.3f} h of them hazard-free.",
+        tuple(sections),
+        (*_facts(found), *configuration),
+    )
+
+
+def _hours(found: Evaluation) -> float:
+    return sum(len(trial.hops) for trial in found.trials if trial.hazard_free) * 0.1 / 3600.0
+
+
+def _data_section(found: Evaluation, values: Values) -> Section:
+    rows = []
+    for protocol in PROTOCOLS:
+        run = found.runs.get(protocol.name)
+        if run is None:
+            rows.append(
+                (protocol.title, "0", "0", Value(np.nan), "", f"not run: {found.lacking[protocol.name]}")
+            )
+            continue
+        approaches = sum(not trial.hazard_free for trial in run.trials)
+        hours = values[protocol.name, warning.PROPOSED, "hazard_free_hours"]
+        told = "; ".join(run.cautions) or "run"
+        counts = str(len(run.trials)), str(approaches)
+        rows.append((protocol.title, *counts, Value(hours.value, digits=3), run.trained_on, told))
+    heads = (
+        "protocol",
+        "recordings",
+        "approaches",
+        "hazard-free (h)",
+        "published classifier trained on",
+        "state",
+    )
+    blocks = [ReportTable("protocols", "Protocols", heads, tuple(rows))]
+    if found.failed:
+        failed = tuple((one.name, one.problem) for one in found.failed)
+        blocks.append(
+            ReportTable("skipped", "Recordings that could not be heard", ("recording", "problem"), failed)
+        )
+    sound = (
+        "Every recording is simulated: no figure of this report is a measurement on real sound, and "
+        "agreement with the paper is agreement of the simulator with the paper's recordings."
+        if found.takes.simulated
+        else "The figures are measured on the sound that was given."
+    )
+    # A stratum of one is the same in every draw; nothing in the interval itself shows that.
+    strata = Counter((trial.label, trial.site) for trial in found.trials)
+    single = sum(count == 1 for count in strata.values())
+    intervals = (
+        f"Intervals draw recordings again within side and junction: {single} of {len(strata)} such strata "
+        f"hold a "
+        "single recording, which every draw repeats, so intervals are too narrow by what it would add."
+        if single
+        else "Intervals draw recordings again within side and junction; every such stratum holds several."
+    )
+    skipped = f"{len(found.failed)} recordings could not be heard and are left out of every figure."
+    return Section("What was evaluated", (sound, intervals, skipped), tuple(blocks))
+
+
+def _facts(found: Evaluation) -> tuple[tuple[str, str], ...]:
+    settings = found.settings
+    versions: Sequence[tuple[str, str]] = (
+        ("worldstate", __version__),
+        ("Python", platform.python_version()),
+        ("numpy", np.__version__),
+        ("scipy", scipy.__version__),
+        ("scikit-learn", sklearn.__version__),
+    )
+    return (
+        *versions,
+        ("data", found.takes.origin),
+        ("fingerprint of the data", data_fingerprint(found.trials) if found.trials else "none"),
+        ("seeds of the folds", ", ".join(map(str, settings.seeds))),
+        ("hazard-free hours asked for", str(settings.hazard_free_hours or "all")),
+        ("draws of recordings for intervals", str(settings.draws)),
+    )

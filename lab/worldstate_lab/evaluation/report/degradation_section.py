@@ -1,0 +1,211 @@
+"""The section on degraded cameras: miss rates, awareness by family and level, and rain as a common cause."""
+
+import math
+from dataclasses import replace
+
+from worldstate.adapters.camera.degradation import LEVELS
+from worldstate_lab.degradation.awareness import AwarenessRow, Estimate
+from worldstate_lab.degradation.beta_curves import Band
+from worldstate_lab.degradation.conditions import FAMILIES, OFF
+from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
+from worldstate_lab.degradation.stream_sweep import StreamSweep
+from worldstate_lab.evaluation.paper_values import COMMANDS, paper_value
+
+from .cueing_panels import awareness_figure
+from .document import Cell, ReportFigure, ReportTable, Section, Value
+from .measured_values import Place
+from .miss_rate_panels import miss_rate_angle_figure, miss_rate_level_figure
+
+_RATES, _AWARE = "miss rate of the camera", "after line-of-sight entry"
+
+_CONDITION = (
+    "condition",
+    "estimated d",
+    "vision alone (share)",
+    "awareness (share)",
+    "awareness where unseen (share)",
+    "detected before T0 (share)",
+    "lead (s)",
+    "false alarms (1/h)",
+    "false awareness (1/h)",
+)
+
+
+def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
+    """Return what the paper states of the sweep, of the first detector; a larger one is the last."""
+    first, last = study.sweeps[0], study.sweeps[-1]
+    beta, clean = first.beta, (0, 0)
+    values = {
+        "beta_boresight_clean": _at(beta.by_azimuth, (0, 0, 0)),
+        "beta_harshest": _at(beta.overall, (FAMILIES.index("noise"), -1)),
+        "beta_clean": _at(beta.overall, clean),
+        "beta_clean_large": replace(_at(last.beta.overall, clean), note=last.detector),
+    }
+    if 20.0 in beta.azimuth_deg[:-1]:
+        values["beta_20_30_deg"] = _at(beta.by_azimuth, (0, beta.azimuth_deg.index(20.0), 0))
+    least = {"awareness_least": first.least_awareness.awareness, "vision_least": first.least_vision.vision}
+    rates = {("degradation", _RATES, name): value for name, value in values.items()}
+    return rates | {("degradation", _AWARE, name): _value(one) for name, one in least.items()}
+
+
+def awareness_figures(study: DegradationStudy) -> tuple[ReportFigure, ...]:
+    """Return panel (d) for every detector, the paper's least awareness beside it."""
+    paper = paper_value("degradation", _AWARE, "awareness_least")
+    figures = []
+    for number, sweep in enumerate(study.sweeps, start=1):
+        # A condition without a camera is not of a family: the line would have one point.
+        names = dict.fromkeys(
+            r.condition.family for r in sweep.awareness.rows[1:] if r.condition.family != OFF
+        )
+        families = {name: [_point(row) for row in sweep.family(name)] for name in names}
+        figures.append(
+            _of_detector(awareness_figure(families, paper.value if paper else None), sweep, number)
+        )
+    return tuple(figures)
+
+
+def degradation_section(
+    study: DegradationStudy | None, lacking: str, staged: StreamSweep | None = None
+) -> Section:
+    """Return miss rates and awareness of every detector, or what is lacking and what would fill them."""
+    title, streams = "Vision degradation", () if staged is None else (_streams(staged),)
+    if study is None:
+        told = f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it."
+        return Section(title, (told,), streams)
+    names = " and ".join(sweep.detector for sweep in study.sweeps)
+    model = study.settings.model
+    heard = "the model that ships" if model is None else f"the model {model.name}"
+    text = [
+        f"{len(study.approaches)} approaches and {len(study.hazard_free)} hazard-free recordings, detectors: "
+        f"{names}; heard with {heard}. Ablation (c) is this sweep.",
+        *(f"{one}." for one in study.missing),
+        *(f"Left out: {name}, {why}." for name, why in study.skipped.items()),
+    ]
+    # One detector agrees with itself: the sentence would claim what nobody measured.
+    if len(study.sweeps) > 1:
+        text.append(
+            "Between the first and the last detector awareness differs by at most "
+            f"{study.largest_awareness_difference:.3f}, beta by {study.beta_shift:+.3f} in the mean."
+        )
+    parts = tuple(_detector_section(sweep, number) for number, sweep in enumerate(study.sweeps, start=1))
+    return Section(title, tuple(text), streams, parts)
+
+
+def _streams(sweep: StreamSweep) -> ReportTable:
+    rows = tuple(
+        (
+            row.name,
+            Value(row.onsets, digits=0),
+            replace(_value(row.per_hour), digits=1),
+            Value(row.upper_90, digits=1),
+            _value(row.ratio),
+        )
+        for row in sweep.rows
+    )
+    return ReportTable(
+        "staged_streams",
+        "Advisories where nobody comes, while the camera fails and it rains",
+        ("state", "onsets", "an hour", "at most (90 %)", "to the clean camera"),
+        rows,
+        f"On {sweep.hours:.2f} h of streams without hazards; the boxes of the camera are left out as often "
+        "as the table of miss rates says, and it states how degraded it is. Ratios draw minutes, the same "
+        "for both.",
+    )
+
+
+def _detector_section(sweep: DetectorSweep, number: int) -> Section:
+    beta = sweep.beta
+    steps = range(beta.overall.value.shape[1])
+    levels: dict[str, list[tuple[str, Value]]] = {
+        family: [(f"{LEVELS[level]:g}", _at(beta.overall, (f, level))) for level in steps]
+        for f, family in enumerate(FAMILIES)
+    }
+    states = {"clean": (0, 0)} | {
+        f"{name}, d = {LEVELS[steps[-1]]:g}": (f, -1) for f, name in enumerate(FAMILIES)
+    }
+    bins = range(len(beta.azimuth_deg) - 1)
+    angles = {
+        name: [_at(beta.by_azimuth, (f, b, level)) for b in bins] for name, (f, level) in states.items()
+    }
+    figures = (
+        _of_detector(miss_rate_level_figure(levels), sweep, number),
+        _of_detector(miss_rate_angle_figure(angles, beta.azimuth_deg), sweep, number),
+    )
+    return Section(
+        f"Detector {sweep.detector}", (), (*figures, _conditions(sweep, number), _rain(sweep, number))
+    )
+
+
+def _conditions(sweep: DetectorSweep, number: int) -> ReportTable:
+    rows = tuple(_condition(row) for row in sweep.awareness.rows)
+    return ReportTable(
+        f"degradation_{number}",
+        f"Awareness by condition, {sweep.detector}",
+        _CONDITION,
+        rows,
+        f"On {sweep.awareness.hops_in_view} hops in view and {sweep.awareness.hazard_free_hours:.3f} h of "
+        "hazard-free time. Thresholds are those of the clean camera. Paper: awareness at least 0.87 while "
+        "vision falls to 0.03.",
+    )
+
+
+def _condition(row: AwarenessRow) -> tuple[Cell, ...]:
+    return (
+        row.condition.name,
+        Value(row.degradation),
+        _value(row.vision),
+        _value(row.awareness),
+        _known(row.unseen_awareness),
+        Value(row.detected),
+        _known(row.lead_time_s),
+        replace(_value(row.false_alarms_per_hour), digits=0),
+        replace(_value(row.false_awareness_per_hour), digits=0),
+    )
+
+
+def _rain(sweep: DetectorSweep, number: int) -> ReportTable:
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (
+            str(one.level),
+            Value(one.noise_db, digits=0),
+            *map(_value, (one.lens, one.roof, one.rain, one.additive, one.optimism)),
+        )
+        for one in sweep.awareness.common_cause
+    )
+    heads = (
+        "level",
+        "noise (dB)",
+        "lens alone",
+        "roof alone",
+        "rain",
+        "if effects added up",
+        "optimism of (A1)",
+    )
+    return ReportTable(
+        f"rain_{number}",
+        f"Rain as a common cause: awareness (share), {sweep.detector}",
+        heads,
+        rows,
+        "Rain soils the lens and drums on the roof at once; noise over the recording's own level. "
+        "Optimism: what independent effects would leave, less what rain leaves.",
+    )
+
+
+def _of_detector(figure: ReportFigure, sweep: DetectorSweep, number: int) -> ReportFigure:
+    return replace(figure, name=f"{figure.name}_{number}", title=f"{figure.title}, {sweep.detector}")
+
+
+def _point(row: AwarenessRow) -> tuple[Value, Value]:
+    return Value(1.0 - row.vision.value), _value(row.awareness)
+
+
+def _at(band: Band, place: tuple[int, ...]) -> Value:
+    return Value(float(band.value[place]), float(band.low[place]), float(band.high[place]))
+
+
+def _value(one: Estimate) -> Value:
+    return Value(one.value, one.low, one.high)
+
+
+def _known(value: float | None) -> Value:
+    return Value(math.nan if value is None else value)

@@ -1,0 +1,363 @@
+"""What decisions are worth: the figures of every method and protocol, with intervals over recordings."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from worldstate.abduction.cueing.calibration_error import BINS
+from worldstate.ground.checks import check_shape
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper, random_detection
+from worldstate.operations.metrics.roc import rank_wins
+from worldstate.operations.metrics.weighted_figures import (
+    draw_weights,
+    highest_share,
+    known_mean,
+    ratio,
+    weighted_median,
+)
+from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
+from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
+from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.operations.recordings.hop_table import HopTable, joined
+from worldstate_lab.evaluation import reduction
+from worldstate_lab.metrics.recording_draws import middle, worst_group
+from worldstate_lab.trials.trial import Decisions, Trial
+
+Interval = tuple[float, float]
+
+_HOURS = HOP_S / SECONDS_PER_HOUR
+# Figure: numerator, denominator and unit of a ratio of sums over recordings; see `reduction`. A mean of the
+# rates of single recordings would let one of ten seconds weigh as much as a stream of an hour.
+_RATIOS = {
+    "detection": ("detected", "approaches", 1.0),
+    "lead_s": ("lead_s", "detected", 1.0),
+    "lead_missed_zero_s": ("lead_s", "approaches", 1.0),
+    "early_onsets_per_approach": ("early_onsets", "approaches", 1.0),
+    "side_correct": ("side_right", "sided", 1.0),
+    "false_alarms_per_hour": ("free_onsets", "free_hops", 1.0 / _HOURS),
+    "advisory_share": ("free_alarm_hops", "free_hops", 1.0),
+    "hazard_awareness": ("aware_hops", "clear_hops", 1.0),
+    # The challenge's means are of recordings, so here each recording with a vehicle in view counts once.
+    "id_switches_per_recording": ("id_switches", "tracked", 1.0),
+    "fragmentations_per_recording": ("fragmentations", "tracked", 1.0),
+    "swap_rate_hz": ("swap_rate_hz", "tracked", 1.0),
+    "fragmentation_rate_hz": ("fragmentation_rate_hz", "tracked", 1.0),
+    "track_latency_s": ("track_latency_s", "tracked", 1.0),
+    "azimuth_error_deg": ("azimuth_error_rad", "matched", np.degrees(1.0)),
+    "gospa_deg": ("gospa_rad", "gospa_hops", np.degrees(1.0)),
+    "visible_coverage": ("visible_inside", "visible_intervals", 1.0),
+}
+# What one recording adds; a count that it does not have is zero.
+COUNTS = (
+    *dict.fromkeys(name for ratio in _RATIOS.values() for name in ratio[:2]),
+    *("onsets_before", "window_s", "before_s"),
+    *(f"windows_{horizon}" for horizon in reduction.HORIZONS_S),
+    *("squared_error", "visible_hops", "visible_squared", "visible_true", "visible_true_squared"),
+)
+_RISK, _RAW = 0, 1
+# Measured after T0 with a vehicle in view; the other figures are of the time before it or without any.
+_CLEAR = (
+    *("hazard_awareness", "bearing_deg", "bearing_gated_deg", "gospa_deg", "azimuth_error_deg"),
+    *("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz"),
+    *("fragmentation_rate_hz", "track_latency_s"),
+)
+# Whether the greater or the smaller value is the worse one, where junctions are compared.
+_WORSE: dict[str, Literal["low", "high"]] = {
+    **dict.fromkeys(("detection", "lead_s", "lead_missed_zero_s", "side_correct", "hazard_awareness"), "low"),
+    **dict.fromkeys(("auroc_all", "auroc_2s", "auroc_1s", "brier_skill", "visible_coverage"), "low"),
+    **dict.fromkeys(("false_alarms_per_hour", "advisory_share", "early_onsets_per_approach"), "high"),
+    **dict.fromkeys(("bearing_deg", "bearing_gated_deg", "azimuth_error_deg", "gospa_deg"), "high"),
+    **dict.fromkeys(("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz"), "high"),
+    **dict.fromkeys(("fragmentation_rate_hz", "track_latency_s", "visible_error_s"), "high"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """Which recording one row stands for; what two evaluations compare to find the ones they share."""
+
+    name: str
+    label: str
+    site: str
+    degraded: bool = False  # Whether its images were
+    fingerprint: str = ""  # Of its content
+
+    @classmethod
+    def of(cls, trial: Trial) -> "Scored":
+        """Return the row of a trial."""
+        about = trial.hops.about
+        degraded, fingerprint = bool(about.get("degraded", False)), str(about.get("fingerprint", ""))
+        return cls(trial.name, trial.label, trial.site, degraded, fingerprint)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """What one method scored under one protocol, once for every seed that changes its answers.
+
+    S seeds, R recordings of which P are approaches and Q hazard-free.
+
+    Parameters
+    ----------
+    recordings : tuple of Scored
+        In the order of the rows.
+    counts : mapping of str to ndarray, shape (S, R)
+        Sums over the hops of each recording.
+    wins : ndarray, shape (S, horizons, P, Q)
+        How often windows of an approach score above those of a hazard-free recording.
+    bins : ndarray, shape (S, 2, R, bins, 3)
+        Windows, summed probability and summed variance of labels by probability: of the risk and the score.
+    bearings : tuple of HopTable, length S
+        Bearing errors in view beside the prominence of their peaks.
+
+    Examples
+    --------
+    >>> times = 1.0 + 0.1 * np.arange(20)
+    >>> near = HopTable(
+    ...     {"time_s": times, "reference_rad": np.full(20, np.nan), "prominence": np.ones(20)},
+    ...     "a", "left", 2.5, {"site": "SA1"},
+    ... )
+    >>> said = Decisions.of(times, alarm=times > 1.95, side=np.ones(20, int))
+    >>> score = Score.of([Trial(near), Trial(near.replace(name="b", label="none"))], [[said, said]])
+    >>> figures = score.figures()
+    >>> figures["detection"], round(figures["lead_s"], 2), round(figures["false_alarms_per_hour"])
+    (1.0, 0.5, 1800)
+    """
+
+    recordings: tuple[Scored, ...]
+    counts: Mapping[str, FloatArray]
+    wins: FloatArray
+    bins: FloatArray
+    bearings: tuple[HopTable, ...]
+
+    @classmethod
+    def of(cls, trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> "Score":
+        """Score what was said of the trials: one pass a seed, each with one answer a trial in order."""
+        if not (trials and passes):
+            raise InvalidArgumentError("trials: expected at least one recording and one pass over them")
+        for said in passes:
+            check_shape("decisions of a pass", (len(said),), (len(trials),))
+            for trial, one in zip(trials, said, strict=True):
+                reduction.check_decisions(trial, one)
+        # What no seed changes is scored once: a fixed chain hands out the very same answers.
+        if all(one is first for said in passes for one, first in zip(said, passes[0], strict=True)):
+            passes = passes[:1]
+        rows = [_counts(trials, said) for said in passes]
+        return cls(
+            recordings=tuple(map(Scored.of, trials)),
+            counts={name: np.array([[one[name] for one in row] for row in rows]) for name in COUNTS},
+            wins=np.array([_wins(trials, said) for said in passes]),
+            bins=np.array([_bins(trials, said) for said in passes]),
+            bearings=tuple(_bearings(trials, said) for said in passes),
+        )
+
+    @property
+    def draw_strata(self) -> list[tuple[str, str]]:
+        """Label and site of every recording: what `stratified_draws` keeps the numbers of."""
+        return [(one.label, one.site) for one in self.recordings]
+
+    def figures(self, rows: IndexArray | None = None) -> dict[str, float]:
+        """Return every figure on the chosen recordings, mean over seeds; NaN where there is none to count."""
+        chosen = np.arange(len(self.recordings)) if rows is None else rows
+        return {name: float(values[0]) for name, values in self.draws(chosen[None]).items()}
+
+    def draws(self, draws: IndexArray) -> dict[str, FloatArray]:
+        """Return every figure on each draw of recordings, mean over seeds, shape (D,); draws (D, n)."""
+        return self._values(draw_weights(draws, len(self.recordings)))
+
+    def intervals(self, draws: IndexArray) -> dict[str, Interval]:
+        """Return the middle 95 % of every figure over draws, and the exact interval of the false alarms."""
+        # The ECE of a draw lies above that of the recordings themselves: read its interval as a width.
+        exact = {"false_alarms_per_hour_poisson": self.poisson()}
+        return {name: middle(values) for name, values in self.draws(draws).items()} | exact
+
+    def poisson(self) -> Interval:
+        """Return the exact interval of the false alarms an hour, all recordings together."""
+        onsets, hours = self._false_onsets()
+        return poisson_interval(onsets, hours) if hours else (float("nan"), float("nan"))
+
+    def poisson_upper(self) -> float:
+        """Return what the false alarms an hour do not exceed with a confidence of .9."""
+        onsets, hours = self._false_onsets()
+        return poisson_upper(onsets, hours) if hours else float("nan")
+
+    def _false_onsets(self) -> tuple[int, float]:
+        """Return alarms and hours of hazard-free time."""
+        hours = float(self.counts["free_hops"].mean(axis=0).sum()) * _HOURS
+        # Seeds hear the same hours: their mean count is one count, not one of S times the hours.
+        return round(float(self.counts["free_onsets"].mean(axis=0).sum())), hours
+
+    def by_site(self) -> dict[str, dict[str, float]]:
+        """Return the figures of each junction, by name."""
+        sites = sorted({one.site for one in self.recordings})
+        inside = np.array([[one.site == site for one in self.recordings] for site in sites], np.float64)
+        found = self._values(inside)
+        return {
+            site: {name: float(values[i]) for name, values in found.items()} for i, site in enumerate(sites)
+        }
+
+    def worst_sites(self) -> dict[str, tuple[str, float]]:
+        """Return the worst junction and its value, of figures with a better and a worse end."""
+        sites = self.by_site()
+        return {
+            name: worst_group({site: figures[name] for site, figures in sites.items()}, worse)
+            for name, worse in _WORSE.items()
+        }
+
+    def strata(self) -> dict[str, dict[str, float]]:
+        """Return the figures before T0, after it in view, and of recordings with degraded images."""
+        figures = self.figures()
+        degraded = np.array([row for row, one in enumerate(self.recordings) if one.degraded], np.intp)
+        strata = {
+            "clear": {name: figures[name] for name in _CLEAR},
+            "occluded": {name: value for name, value in figures.items() if name not in _CLEAR},
+        }
+        return strata | ({"vision-degraded": self.figures(degraded)} if degraded.size else {})
+
+    @property
+    def _free(self) -> BoolArray:
+        return np.array([one.label == "none" for one in self.recordings])
+
+    def _values(self, weights: FloatArray) -> dict[str, FloatArray]:
+        """Return every figure where recording r counts weights[d, r] times, shape (D,)."""
+        names = list(self.counts)
+        sums = dict(zip(names, np.array([self.counts[name] for name in names]) @ weights.T, strict=True))
+        figures = {
+            name: unit * ratio(sums[above], sums[below]) for name, (above, below, unit) in _RATIOS.items()
+        }
+        hours = sums["free_hops"] * _HOURS
+        figures |= {
+            "false_onsets": sums["free_onsets"],
+            "hazard_free_hours": hours,
+            "quantum_per_hour": ratio(np.ones_like(hours), hours),
+            "random_detection": self._random_detection(weights, sums),
+        }
+        figures |= self._areas(weights) | self._calibration(weights, sums) | _visible_figures(sums)
+        samples = [_bearing_figures(table, weights) for table in self.bearings]
+        figures |= {name: np.array([one[name] for one in samples]) for name in samples[0]}
+        return {name: known_mean(values) for name, values in figures.items()}
+
+    def _areas(self, weights: FloatArray) -> dict[str, FloatArray]:
+        r"""Return the areas under the ROC curve: :math:`w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)`."""
+        # Between recordings wins are counted once; a draw then weighs them instead of ranking its windows.
+        high, low = weights[:, ~self._free], weights[:, self._free]
+        areas = {}
+        for i, horizon in enumerate(reduction.HORIZONS_S):
+            windows = self.counts[f"windows_{horizon}"]
+            pairs = (windows[:, ~self._free] @ high.T) * (windows[:, self._free] @ low.T)
+            areas[f"auroc_{horizon}"] = ratio(((high @ self.wins[:, i]) * low).sum(axis=-1), pairs)
+        return areas
+
+    def _calibration(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        shape = (*self.bins.shape[:2], len(weights), BINS, 3)
+        flat = self.bins.reshape(*self.bins.shape[:3], BINS * 3)
+        total = (weights @ flat).reshape(shape)
+        hazards = ((weights * ~self._free) @ flat).reshape(shape)[..., 0]
+        windows = total[..., 0].sum(axis=-1)
+        ece = ratio(np.abs(total[..., 1] - hazards).sum(axis=-1), windows)
+        share = ratio(hazards.sum(axis=-1), windows)[:, _RISK]
+        # Labels drawn from the risks miss their sum by a normal deviate of variance V, and by less than 2 V
+        # in expectation, which is what holds in a bin of few or certain windows.
+        variance = total[:, _RISK, ..., 2]
+        floor = np.minimum(np.sqrt(2.0 / np.pi * variance), 2.0 * variance).sum(axis=-1)
+        brier = ratio(sums["squared_error"], windows[:, _RISK])
+        return {
+            "ece": ece[:, _RISK],
+            "ece_raw": ece[:, _RAW],
+            "ece_floor": ratio(floor, windows[:, _RISK]),
+            "brier_skill": 1.0 - ratio(brier, share * (1.0 - share)),
+            "hazard_share": share,
+        }
+
+    def _random_detection(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> FloatArray:
+        """Return what as many onsets at random moments before T0 would detect, shape (S, D)."""
+        rates = np.full(sums["before_s"].shape, np.nan)
+        times = weights * ~self._free
+        for s, before_s in enumerate(sums["before_s"]):
+            scored = before_s > 0.0
+            onsets, windows_s = np.floor(sums["onsets_before"][s]), self.counts["window_s"][s]
+            rates[s, scored] = random_detection(windows_s, onsets[scored], before_s[scored], times[scored])
+        return rates
+
+
+def paired(ours: Score, other: Score, draws: IndexArray) -> dict[str, tuple[float, float, float]]:
+    """Return ours less the other's of every figure, with the middle 95 % on the same draws of recordings."""
+    if ours.recordings != other.recordings:
+        raise InvalidArgumentError("scores: expected two methods on the same recordings in the same order")
+    rows = np.arange(len(ours.recordings))
+    return paired_on(ours, other, rows, rows, draws)
+
+
+def paired_on(
+    ours: Score, other: Score, ours_rows: IndexArray, other_rows: IndexArray, draws: IndexArray
+) -> dict[str, tuple[float, float, float]]:
+    """Compare two scores on the recordings in these rows of each; draws (D, n) are of places in the rows."""
+    every = np.vstack([np.arange(len(ours_rows)), draws])
+    a, b = ours.draws(ours_rows[every]), other.draws(other_rows[every])
+    # Both stumble over the same hard recordings: on the same draws those cancel, apart they would not.
+    gains = {name: a[name] - b[name] for name in a}
+    return {name: (float(gain[0]), *middle(gain[1:])) for name, gain in gains.items()}
+
+
+def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str, float]]:
+    """Return the counts of every recording; a method is not judged by what it never states."""
+    sides, tracks = any(one.side.any() for one in said), any(len(one.tracks) for one in said)
+    bearings = any(np.isfinite(one.bearing_rad).any() for one in said)
+    rows = []
+    for trial, one in zip(trials, said, strict=True):
+        row = dict.fromkeys(COUNTS, 0.0) | reduction.alarm_counts(trial, one)
+        row |= reduction.awareness_counts(trial, one) | reduction.window_counts(trial, one)
+        row |= reduction.visible_counts(trial, one)
+        row |= reduction.track_counts(trial, one) if tracks else {}
+        row |= reduction.gospa_counts(trial, one, tracks) if tracks or bearings else {}
+        rows.append(row | {"sided": row["detected"] * sides})
+    return rows
+
+
+def _wins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
+    """Return how often windows of approaches outrank hazard-free ones, shape (horizons, P, Q)."""
+    pairs = list(zip(trials, said, strict=True))
+    calm = [reduction.scored_windows(trial, one.score) for trial, one in pairs if trial.hazard_free]
+    near = [(trial, one.score) for trial, one in pairs if not trial.hazard_free]
+    horizons_s = reduction.HORIZONS_S.values()
+    hazards = [[reduction.scored_windows(trial, score, h) for trial, score in near] for h in horizons_s]
+    return np.array([rank_wins(some, calm) for some in hazards])
+
+
+def _bins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
+    """Return probability bins of risk and score, shape (2, R, BINS, 3)."""
+    pairs = list(zip(trials, said, strict=True))
+    risks = [reduction.scored_windows(trial, one.risk) for trial, one in pairs]
+    raw = [reduction.scored_windows(trial, one.score) for trial, one in pairs]
+    # Log odds and ratios are scores as well, but they are read as a probability by nobody.
+    if any(((score < 0.0) | (score > 1.0)).any() for score in raw):
+        raw = [np.zeros(0)] * len(raw)
+    return np.array([[reduction.probability_bins(one) for one in some] for some in (risks, raw)])
+
+
+def _bearings(trials: Sequence[Trial], said: Sequence[Decisions]) -> HopTable:
+    pairs = enumerate(zip(trials, said, strict=True))
+    return joined(reduction.bearing_samples(trial, one, row) for row, (trial, one) in pairs)
+
+
+def _visible_figures(sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return the RMSE of the stated time to visible, and that of the constant that fits these truths best."""
+    hops = sums["visible_hops"]
+    spread = ratio(sums["visible_true_squared"], hops) - ratio(sums["visible_true"], hops) ** 2
+    return {
+        "visible_error_s": np.sqrt(ratio(sums["visible_squared"], hops)),
+        # The difference of two means may be -1e-16 where all truths are equal.
+        "visible_error_constant_s": np.sqrt(np.maximum(spread, 0.0)),
+    }
+
+
+def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatArray]:
+    """Return the median error of all bearings and of the most prominent ones, shape (D,) each."""
+    times = weights[:, samples.recording.astype(np.intp)]
+    # The threshold of prominence is that of each draw, as it would be set on those recordings.
+    gated = times * highest_share(samples.prominence, times, PUBLISHED_COVERAGE)
+    kinds = {"bearing_deg": times, "bearing_gated_deg": gated}
+    return {name: np.degrees(weighted_median(samples.error_rad, kept)) for name, kept in kinds.items()}

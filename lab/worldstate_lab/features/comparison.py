@@ -1,0 +1,129 @@
+"""One method beside those that it has to beat, figure by figure, with paired intervals."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from scipy.special import bdtrc
+
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.operations.training.feature_evaluation import Predictions
+from worldstate.operations.training.methods import ROWS, Passes, evaluate_pass, methods
+from worldstate.operations.training.splits import Protocol
+from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
+from worldstate_lab.metrics.recording_draws import DRAWS, FigureDraws
+
+from .bootstrap import draw_figures, recording_draws
+from .feature_report import count_windows, mean_figures, report_groups, window_figures
+
+# The same samples for every method and run: the differences between methods are paired.
+BOOTSTRAP_SEED = 0
+
+
+def run_passes(
+    names: Sequence[str],
+    table: FeatureTable,
+    protocol: Protocol,
+    *,
+    seeds: int,
+    alpha: float,
+    train: FeatureTable | None = None,
+    simulated: SimulatedWindows | None = None,
+    jobs: int = 1,
+    on_pass: Callable[[], None] = lambda: None,
+) -> dict[str, Passes]:
+    """Run every seed of every method; the outcome does not depend on the number of jobs."""
+    known = methods(simulated)
+    tasks = [(name, seed) for name in names for seed in range(seeds)]
+    run = delayed(evaluate_pass)
+    outcomes = Parallel(n_jobs=jobs, return_as="generator")(
+        run(known[name], table, protocol, seed=seed, alpha=alpha, train=train) for name, seed in tasks
+    )
+    passes: dict[str, Passes] = {name: [] for name in names}
+    for (name, _), outcome in zip(tasks, outcomes, strict=True):
+        passes[name].append(outcome)
+        on_pass()
+    return passes
+
+
+def comparison(
+    table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float, draws: int = DRAWS
+) -> dict[str, Any]:
+    """Return the figures of one row, those of all others, and what the one gains on each.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows that were predicted.
+    passes : mapping of str to list
+        From `run_passes`.
+    row : str
+        Name in `ROWS` of the one that the plain keys are of.
+    alpha : float
+        Budget, for the test of the achieved false-positive rate.
+    draws : int
+        Bootstrap samples behind the intervals.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there are no passes of that row's method.
+
+    Returns
+    -------
+    dict
+        Figures of the row, its intervals, the other rows, and the gains.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> labels, keys = np.repeat(["left", "none", "right", "front"], 20), np.arange(80).astype(str)
+    >>> features = np.where(labels == "none", 0.1, 0.2)[:, None] * rng.lognormal(0.0, 0.2, (80, 60))
+    >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
+    >>> passes = run_passes(["baseline"], table, "cv", seeds=1, alpha=0.1)
+    >>> comparison(table, passes, "baseline", alpha=0.1, draws=20)["auroc_pooled"] > 0.9
+    True
+    """
+    chosen = {name: row_predictions(passes, name) for name in ROWS if ROWS[name].method in passes}
+    if row not in chosen:
+        raise InvalidArgumentError(f"method: expected passes of {row}, got {', '.join(passes)}")
+    samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED), draws)
+    drawn = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
+    rows = {name: _row_figures(table, mine, drawn[name], alpha) for name, mine in chosen.items()}
+    others = [name for name in rows if name != row]
+    return {
+        **rows[row],
+        "statistic": "absent" if ROWS[row].miss_rate == ABSENT_MISS_RATE else "published",
+        **count_windows(table),
+        "per_group": report_groups(table, chosen[row]),
+        "rows": {name: rows[name] for name in others},
+        "gains": {name: _gains(rows[row], rows[name], drawn[row].gains(drawn[name])) for name in others},
+    }
+
+
+def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]:
+    """Return the predictions of one row, seed by seed."""
+    return [one[ROWS[row].miss_rate] for one in passes[ROWS[row].method]]
+
+
+def _row_figures(
+    table: FeatureTable, passes: Sequence[Predictions], draws: FigureDraws, alpha: float
+) -> dict[str, Any]:
+    figures = mean_figures([window_figures(table, one) for one in passes])
+    n = int(table.hazard_free.sum())
+    # Probability of as many false positives or more, were the true rate the budget.
+    p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
+    return {**figures, "fpr_p_value": p_value, "intervals": draws.intervals()}
+
+
+def _gains(
+    ours: Mapping[str, Any], theirs: Mapping[str, Any], intervals: Mapping[str, tuple[float, float]]
+) -> dict[str, dict[str, float]]:
+    return {
+        figure: {"gain": ours[figure] - theirs[figure], "low": low, "high": high}
+        for figure, (low, high) in intervals.items()
+    }

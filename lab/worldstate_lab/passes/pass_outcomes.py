@@ -1,0 +1,221 @@
+"""What became of every vehicle of a stream in the world-state: warned of, followed, lost, confused.
+
+An advisory belongs to an approach from five seconds before the first T0 on. Identity is kept where the entity
+that was hidden on the vehicle's side at T0 is the one seen at its place a second later.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
+from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.commissioning.stream_exam import (
+    AlarmOutcome,
+    StreamApproach,
+    alarm_outcomes,
+    approaches,
+    mean_of,
+    quiet_figures,
+    shortly_before,
+    time_figures,
+)
+from worldstate.commissioning.stream_labels import StreamTruth
+from worldstate.ground.values import wrap_angle
+from worldstate.operations.recordings.advisories import (
+    LONGEST_LEAD_S,
+    SLACK_S,
+    rising_edges,
+)
+from worldstate.operations.recordings.hop_stream import HOP_S
+from worldstate.state import Entity
+
+from .followed_stream import FollowedStream
+
+EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
+KEPT_S, KEPT_RAD = 3.0, np.radians(20.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassedStream:
+    """A stream, its truth, and what the filter believed of it."""
+
+    heard: HeardStream
+    truth: StreamTruth
+    followed: FollowedStream
+
+
+@dataclass(frozen=True, slots=True)
+class PassOutcome:
+    """One approach: what the advisories made of it, and the entities."""
+
+    alarm: AlarmOutcome
+    onsets: int  # Of advisories, from five seconds before T0 to T0
+    hidden_before: int  # Different entities believed hidden before T0
+    identity: bool | None  # None where nobody was believed there, or nobody was seen
+
+
+def outcomes(stream: PassedStream) -> list[PassOutcome]:
+    """Return the outcome of every approach that lies whole within the stream."""
+    followed = stream.followed
+    onsets_s = followed.time_s[rising_edges(followed.advisory.any(axis=1))]
+    found = []
+    for alarm in alarm_outcomes(stream.heard, followed.time_s, followed.advisory):
+        first, last = alarm.approach.entries_s[0], max(alarm.approach.entries_s)
+        hidden = {
+            entity.id
+            for hop in np.flatnonzero(shortly_before(followed.time_s, last))
+            for side in (0, 1)
+            for entity in followed.hidden(int(hop), side, EXISTS)
+        }
+        onsets = int(((onsets_s > first - LONGEST_LEAD_S) & (onsets_s < first)).sum())
+        found.append(PassOutcome(alarm, onsets, len(hidden), _identity(stream, alarm.approach)))
+    return found
+
+
+def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
+    """Tell whether the entity hidden on the first vehicle's side at T0 is the one seen in its place later."""
+    followed, entry_s = stream.followed, one.entries_s[0]
+    hop = int(np.searchsorted(followed.time_s, entry_s - SLACK_S)) - 1
+    hidden = followed.hidden(hop, one.sides[0])
+    later = int(np.searchsorted(followed.time_s, entry_s + SEEN_AFTER_S))
+    seen = _seen_at(stream, _vehicle(stream.heard, entry_s), later)
+    if not hidden or seen is None:
+        return None
+    return seen.id in {entity.id for entity in hidden}
+
+
+def _vehicle(heard: HeardStream, entry_s: float) -> int:
+    """Return the number of the vehicle that came into view at a time."""
+    return int(heard.vehicles.vehicle[np.nanargmin(np.abs(heard.vehicles.entry_s - entry_s))])
+
+
+def true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | None:
+    """Return the azimuth of a vehicle, None where it is not there."""
+    rows = heard.rows
+    at = np.flatnonzero((rows.vehicle == vehicle) & (np.abs(rows.time_s - time_s) < 0.5 * HOP_S + SLACK_S))
+    return None if not at.size else float(np.arctan2(rows.y_m[at[0]], rows.x_m[at[0]]))
+
+
+def _seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
+    azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+    if azimuth is None:
+        return None
+    near = [
+        (abs(wrap_angle(one.azimuth_rad - azimuth)), one.id, one)
+        for one in stream.followed.entities[hop]
+        if one.status == "visible" and one.existence_probability >= EXISTS
+    ]
+    distance, _, nearest = min(near, default=(np.inf, "", None))
+    return nearest if distance <= NEAR_RAD else None
+
+
+def pass_figures(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
+    """Return the figures of some streams together, ready for a table and for JSON."""
+    told = [one for stream in streams for one in outcomes(stream)]
+    loud = [one for one in told if not one.alarm.approach.quiet]
+    singles, both = ([one for one in loud if one.alarm.approach.flow == flow] for flow in ("single", "both"))
+    judged = [one.identity for one in loud if one.identity is not None]
+    found: dict[str, float | int | None] = {
+        "approaches": len(loud),
+        "detected": mean_of([one.alarm.detected for one in loud]),
+        "lead_missed_as_0_s": mean_of([one.alarm.lead_s for one in loud]),
+        "onsets_per_approach": mean_of([one.onsets for one in loud if one.alarm.detected]),
+        "both_sides_found": mean_of([one.alarm.every_side for one in both]),
+        "other_side_too": mean_of([one.alarm.other_side for one in singles]),
+        "wrong_side_only": mean_of([one.alarm.other_side and not one.alarm.own_side for one in singles]),
+        "phantom_third": mean_of([one.hidden_before > 2 for one in both]),
+        "identity_judged": len(judged),
+        "identity_kept": mean_of(judged),
+        "onset_after_pass": mean_of([one.alarm.onsets_after > 0 for one in singles]),
+    }
+    quiet = quiet_figures([one.followed.advisory for one in streams if one.heard.hazard_free])
+    return found | quiet | _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
+
+
+def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
+    """Return how often a vehicle first seen straight ahead takes the identity of a hidden one."""
+    taken = []
+    for stream in streams:
+        vehicles = stream.heard.vehicles
+        for number in vehicles.vehicle[~vehicles.hazard].tolist():
+            rows = stream.heard.rows
+            seen_s = rows.time_s[(rows.vehicle == number) & rows.in_view]
+            if not seen_s.size:
+                continue
+            first = int(np.searchsorted(stream.followed.time_s, seen_s[0] - SLACK_S))
+            later = int(np.searchsorted(stream.followed.time_s, seen_s[0] + SEEN_AFTER_S))
+            if first < 1 or later >= len(stream.followed.time_s):
+                continue
+            entity = _seen_at(stream, number, later)
+            before = {one.id for side in (0, 1) for one in stream.followed.hidden(first - 1, side)}
+            if entity is not None:
+                taken.append(entity.id in before)
+    return {"seen_ahead": len(taken), "took_hidden_identity": mean_of(taken)}
+
+
+def _kept(streams: Sequence[PassedStream]) -> dict[str, float | None]:
+    """Return how often an entity stands near a vehicle in the three seconds after T0, and how many do."""
+    near = []
+    for stream in streams:
+        for one in approaches(stream.heard):
+            if one.quiet or one.flow != "single":
+                continue
+            vehicle, lead = (
+                _vehicle(stream.heard, one.entries_s[0]),
+                stream.followed.time_s - one.entries_s[0],
+            )
+            for hop in np.flatnonzero((lead >= 0.0) & (lead < KEPT_S)).tolist():
+                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+                if azimuth is not None:
+                    there = [e for e in stream.followed.entities[hop] if e.existence_probability >= EXISTS]
+                    near.append(sum(abs(wrap_angle(e.azimuth_rad - azimuth)) <= KEPT_RAD for e in there))
+    counts = np.array(near)
+    return {
+        "kept_after_t0": mean_of(counts > 0),
+        "entities_after_t0": float(counts[counts > 0].mean()) if (counts > 0).any() else None,
+    }
+
+
+def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
+    within = np.concatenate([one.followed.within[:, :, HORIZONS_S.index(2.0)].ravel() for one in streams])
+    coming_s = np.concatenate([one.truth.coming_s.ravel() for one in streams])
+    risk = np.concatenate([one.followed.risk.ravel() for one in streams])
+    said = np.isfinite(within)
+    stated = np.concatenate([one.followed.time_to_visible_s.reshape(-1, 3) for one in streams])
+    return {
+        "skill_2s": brier_skill(within[said], coming_s[said] <= 2.0),
+        "ece_2s": expected_calibration_error(within[said], coming_s[said] <= 2.0),
+        # The risk is that of somebody hidden, who comes into view within the time that the sequence foresees.
+        "risk_skill": brier_skill(risk, coming_s <= COMING_S[-1]),
+        "risk_ece": expected_calibration_error(risk, coming_s <= COMING_S[-1]),
+        **time_figures(stated, coming_s),
+        "times_stated": mean_of(np.isfinite(stated[coming_s <= LONGEST_S][:, 1])),
+    }
+
+
+def _bearing(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
+    """Return how far hidden azimuths are off, and the same over their variance, in the 3 s before T0."""
+    errors_rad, stds_rad = [], []
+    for stream in streams:
+        for one in approaches(stream.heard):
+            if one.quiet:
+                continue
+            vehicle = _vehicle(stream.heard, one.entries_s[0])
+            lead = stream.followed.time_s - one.entries_s[0]
+            for hop in np.flatnonzero((lead > -3.0) & (lead < -SLACK_S)).tolist():
+                azimuth = true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
+                for entity in stream.followed.hidden(hop, one.sides[0], EXISTS)[:1]:
+                    if azimuth is not None:
+                        errors_rad.append(wrap_angle(entity.azimuth_rad - azimuth))
+                        stds_rad.append(entity.azimuth_std_rad)
+    errors, stds = np.array(errors_rad), np.array(stds_rad)
+    found = errors.size > 0
+    return {
+        "hidden_hops": errors.size,
+        "hidden_rms_deg": math.degrees(np.sqrt(np.mean(errors**2))) if found else None,
+        "hidden_nees": float(np.mean(errors**2 / stds**2)) if found else None,
+    }

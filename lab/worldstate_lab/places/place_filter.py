@@ -1,0 +1,187 @@
+r"""Exact filter over place and speed on a grid, with a state for nobody.
+
+.. math:: p_t(x', v') \propto L_t(x') \sum_{x, v} T_v(x' | x)\, A(v' | v)\, p_{t-1}(x, v)
+
+Places move by v dt, speeds by a random walk. Who leaves the grid is nobody; who comes may be anywhere on it.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from worldstate.ground.checks import in_range
+from worldstate.ground.typing import FloatArray
+
+from .estimate import KnownPlace, NearOrFar, PlaceEstimate
+from .spectrum_model import FARTHEST_M, STEP_M
+from .street_walls import StreetWalls
+
+# Toward the left and toward the right: streets in town, cars that creep into a junction included.
+SPEEDS_MPS = np.arange(1.0, 8.1, 0.5)
+VELOCITIES_MPS = np.concatenate([-SPEEDS_MPS[::-1], SPEEDS_MPS])
+# m/s in a second: drivers brake by .5 to 1 m/s^2 before a junction.
+SPEED_NOISE = 0.5
+TURNS_HZ = 1e-3  # Hardly anybody turns round in a street
+ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01  # The rates of `state.Rates`, both sides; who leaves without passing
+# An axle is heard, and the middle of the vehicle is meant: half a wheelbase of 2.7 m, and some.
+EXTENT_STD_M = 1.0
+STATED_STD_M = 5.0
+# In limits of sight: at twice that, a vehicle at 4 m/s comes into view within a second or two.
+NEAR = 2.0
+
+
+class PlaceLikelihood(Protocol):
+    """How likely a spectrum is from every place; `SpectrumModel` is one."""
+
+    @property
+    def walls(self) -> StreetWalls:
+        """Walls of the junction."""
+        ...
+
+    @property
+    def along_m(self) -> FloatArray:
+        """Places along the crossing street, left positive, those of `SpectrumModel`."""
+        ...
+
+    def log_likelihood(self, spectrum: FloatArray) -> tuple[FloatArray, float]:
+        """Return the log-likelihood from every place, and without a vehicle."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceBelief:
+    """Log probabilities of every velocity and place, and of nobody.
+
+    Examples
+    --------
+    >>> PlaceBelief.unknown(89).log_present.shape
+    (30, 89)
+    """
+
+    log_present: FloatArray  # shape (V, N)
+    log_nobody: float
+
+    @classmethod
+    def unknown(cls, places: int) -> "PlaceBelief":
+        """Return the belief before anything was heard: somebody as probable as nobody, anywhere."""
+        every = np.full((len(VELOCITIES_MPS), places), -np.log(2.0 * len(VELOCITIES_MPS) * places))
+        return cls(every, -np.log(2.0))
+
+    @property
+    def of_places(self) -> FloatArray:
+        """Probability of every place, given somebody, shape (N,)."""
+        present = np.exp(self.log_present - self.log_present.max()).sum(axis=0)
+        return np.asarray(present / present.sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceFilter:
+    """Carries the belief about one vehicle from one spatial spectrum to the next.
+
+    Parameters
+    ----------
+    model : PlaceLikelihood
+        Of the spectra: a `SpectrumModel`.
+
+    Examples
+    --------
+    >>> from worldstate.frontend import MicrophoneArray
+    >>> from worldstate_lab.places.spectrum_model import SpectrumModel
+    >>> from worldstate_lab.places.street_walls import StreetWalls
+    >>> array = MicrophoneArray([[x, y, 0.0] for x in (0.0, 0.12) for y in (-0.3, -0.1, 0.1, 0.3)])
+    >>> azimuths, walls = np.radians(np.linspace(90.0, -90.0, 37)), StreetWalls(4.45, 2.8, 2.8, 7.15)
+    >>> frequencies = np.arange(300.0, 2000.0, 300.0)
+    >>> beams = array.steering(frequencies, azimuths).conj().transpose(0, 2, 1)
+    >>> wave = np.abs(beams @ array.steering(frequencies, np.radians(20.0))) ** 2
+    >>> places = PlaceFilter(SpectrumModel.of(walls, array, azimuths, frequencies, draws=4))
+    >>> belief = places.unknown
+    >>> for _ in range(5):
+    ...     belief = places.update(places.predict(belief, 0.1), wave.sum(axis=(0, 2)))
+    >>> estimate = places.estimate(belief)
+    >>> round(estimate.mean_m), estimate.left_probability > 0.9
+    (3, True)
+    """
+
+    model: PlaceLikelihood
+
+    @property
+    def unknown(self) -> PlaceBelief:
+        """Belief before anything was heard."""
+        return PlaceBelief.unknown(len(self.model.along_m))
+
+    def predict(self, belief: PlaceBelief, dt_s: float) -> PlaceBelief:
+        """Return the belief after a time, 0 to 10 s, without a spectrum."""
+        in_range("dt_s", dt_s, 0.0, 10.0)
+        speeds, moves = _transitions(dt_s)
+        nobody = np.exp(belief.log_nobody)
+        stayed = np.exp(-DEPARTURES_HZ * dt_s) * (speeds.T @ np.exp(belief.log_present))
+        present = (stayed[:, None] @ moves)[:, 0]
+        come = nobody * -np.expm1(-ARRIVALS_HZ * dt_s)
+        left = max(1.0 - nobody - present.sum(), 0.0)
+        present = present + come / present.size
+        # Underflow leaves places that nothing could ever bring back.
+        return PlaceBelief(np.log(np.maximum(present, 1e-300)), float(np.log(nobody - come + left + 1e-300)))
+
+    def update(self, belief: PlaceBelief, spectrum: FloatArray) -> PlaceBelief:
+        """Return the belief after a spectrum; see `SpectrumModel.log_likelihood` for its errors."""
+        like, nobody = self.model.log_likelihood(spectrum)
+        present, empty = belief.log_present + like, belief.log_nobody + nobody
+        most = max(float(present.max()), empty)
+        total = most + np.log(np.exp(present - most).sum() + np.exp(empty - most))
+        return PlaceBelief(present - total, float(empty - total))
+
+    def estimate(self, belief: PlaceBelief) -> PlaceEstimate:
+        """Return what can be said of the middle of the vehicle."""
+        along, (right, left) = self.model.along_m, self.model.walls.sight_m
+        heard = belief.of_places
+        shares = np.convolve(heard, _extent(), mode="same")
+        shares = shares / shares.sum()
+        mean = float(shares @ along)
+        std = float(np.sqrt(shares @ (along - mean) ** 2))
+        ends = np.interp((0.05, 0.95), shares.cumsum(), along + 0.5 * STEP_M).tolist()
+        on_left = float(heard[along > 0.0].sum() + 0.5 * heard[along == 0.0].sum())
+        near = float(heard[(along > NEAR * right) & (along < NEAR * left)].sum())
+        side = "left" if on_left >= 0.5 else "right"
+        return PlaceEstimate(
+            KnownPlace(mean, std) if std < STATED_STD_M else NearOrFar(side, min(near, 1.0)),
+            mean,
+            std,
+            (ends[0], ends[1]),
+            min(on_left, 1.0),
+            min(float(heard[(along < right) | (along > left)].sum()), 1.0),
+            1.0 - min(float(np.exp(belief.log_nobody)), 1.0),
+        )
+
+
+@lru_cache(maxsize=4)
+def _transitions(dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Speeds, shape (V, V), and places by velocity, shape (V, N, N), from rows to columns."""
+    from scipy.linalg import expm
+
+    number, places = len(VELOCITIES_MPS), round(2.0 * FARTHEST_M / STEP_M) + 1
+    rate = 0.5 * (SPEED_NOISE / (SPEEDS_MPS[1] - SPEEDS_MPS[0])) ** 2
+    generator = rate * (np.eye(number, k=1) + np.eye(number, k=-1))
+    middle = number // 2
+    # Between the slowest to the left and the slowest to the right lies a stop: that is turning round.
+    generator[middle - 1, middle] = generator[middle, middle - 1] = 0.0
+    generator += TURNS_HZ * np.eye(number)[::-1]
+    generator -= np.diag(generator.sum(axis=1))
+    moves = np.array([_moved(velocity * dt_s / STEP_M, places) for velocity in VELOCITIES_MPS])
+    return expm(generator * dt_s), moves if dt_s else np.broadcast_to(np.eye(places), moves.shape)
+
+
+def _moved(steps: float, places: int) -> FloatArray:
+    """Matrix that moves by a number of steps in the mean, with a variance of 1/4 step^2, (places, places)."""
+    # Linear interpolation would spread slow vehicles and leave those that move by whole steps sharp.
+    whole = int(np.rint(steps))
+    rest, spread = steps - whole, 0.25
+    ahead, back = 0.5 * (spread + rest**2 + rest), 0.5 * (spread + rest**2 - rest)
+    eye = [np.eye(places, k=whole + k) for k in (-1, 0, 1)]
+    return np.asarray(back * eye[0] + (1.0 - ahead - back) * eye[1] + ahead * eye[2])
+
+
+def _extent() -> FloatArray:
+    reach = np.arange(-3.0 * EXTENT_STD_M, 3.0 * EXTENT_STD_M + 0.5 * STEP_M, STEP_M)
+    return np.asarray(np.exp(-0.5 * (reach / EXTENT_STD_M) ** 2))

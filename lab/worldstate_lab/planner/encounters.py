@@ -1,0 +1,141 @@
+"""Corners that a planner comes to: states and vehicles of recorded streams, the ego at other times."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from worldstate.commissioning.stream_exam import StreamApproach, approaches
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+
+from .believed_stream import GONE_M, BelievedStream
+from .ego_vehicle import EgoVehicle
+
+STEP_S, HOP_STEPS = 0.05, 2
+LASTS_S = 25.0
+STEPS = round(LASTS_S / STEP_S)
+MEETS_WITHIN_S = 3.0  # Between vehicle and an ego that never brakes, in the middle of the conflict zone
+MOST_VEHICLES = 6
+_NEAR_M, _BEFORE_S, _AFTER_S, _PASSED_S = 12.0, 1.0, 15.0, 8.0
+# Half the widest lorry: what a planner leaves free where it does not see who comes.
+HALF_LANE_M = 1.25
+_ROUNDS, _MINUTES = 200, 10_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Encounters:
+    """Replays, one a row; K vehicles, missing ones gone from the beginning; lanes left, right."""
+
+    recorded: IndexArray  # shape (n,): Number of the approach, or of a minute in which nobody comes
+    corner_ahead_m: FloatArray  # shape (n,)
+    corner_m: FloatArray  # shape (n, 2): Distance of the corners from the ego's axis
+    lane_m: FloatArray  # shape (n, 2): How far ahead vehicles from the left and from the right drive
+    within: FloatArray  # shape (n, STEPS / HOP_STEPS, 2, horizons)
+    to_come_m: FloatArray  # shape (n, STEPS, K): Way of the front to the ego's axis, negative behind it
+    in_view: BoolArray  # shape (n, STEPS, K): From where the state was recorded
+    side: IndexArray  # shape (n, K)
+    length_m: FloatArray  # shape (n, K)
+    width_m: FloatArray  # shape (n, K)
+
+    def __len__(self) -> int:
+        return len(self.recorded)
+
+    @property
+    def line_m(self) -> FloatArray:
+        """Where the lane that is nearer begins, shape (n,)."""
+        return np.asarray(self.lane_m[:, 0] - HALF_LANE_M)
+
+
+def joined_encounters(parts: Sequence[Encounters]) -> Encounters:
+    """Return the encounters of several streams."""
+    names = [one.name for one in fields(Encounters)]
+    return Encounters(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in names})
+
+
+def recorded_approaches(
+    streams: Sequence[BelievedStream], *, quiet: bool
+) -> list[tuple[BelievedStream, StreamApproach]]:
+    """Return all approaches of loud vehicles alone, or those with a quiet one among them."""
+    return [(stream, one) for stream in streams for one in approaches(stream.heard) if one.quiet is quiet]
+
+
+def approach_encounters(
+    recorded: Sequence[tuple[BelievedStream, StreamApproach]],
+    count: int,
+    ego: EgoVehicle,
+    rng: np.random.Generator,
+) -> Encounters:
+    """Draw replays, each recorded approach as often as the others, the ego uniformly within 3 s of it.
+
+    Drawn again are replays in which somebody drives in the ego's own street.
+    """
+    found: list[Encounters] = []
+    for _ in range(_ROUNDS if recorded else 0):
+        for number in rng.permutation(len(recorded))[: count - len(found)].tolist():
+            stream, one = recorded[number]
+            start_s = _meets_s(stream, one, ego) + rng.uniform(-MEETS_WITHIN_S, MEETS_WITHIN_S)
+            if _usable(stream, start_s):
+                found.append(_encounter(stream, start_s, number))
+    if len(found) < count:
+        raise InvalidArgumentError(f"streams: expected {count} replays of approaches, found {len(found)}")
+    return joined_encounters(found)
+
+
+def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.random.Generator) -> Encounters:
+    """Draw moments of streams without hazards at which nobody is in view or in the ego's own street."""
+    found: list[Encounters] = []
+    for _ in range(_ROUNDS * count):
+        number = len(found) % max(len(streams), 1)
+        if len(found) == count or not streams:
+            break
+        first_s, last_s = streams[number].time_s[[0, -1]]
+        start_s = rng.uniform(first_s + _BEFORE_S, last_s - LASTS_S)
+        if _usable(streams[number], start_s):
+            # Moments of one minute hear the same vehicles: they count as one in intervals.
+            minute = number * _MINUTES + int(start_s // 60.0)
+            found.append(_encounter(streams[number], start_s, minute))
+    if len(found) < count:
+        raise InvalidArgumentError(f"streams: expected {count} moments without anybody, found {len(found)}")
+    return joined_encounters(found)
+
+
+def _meets_s(stream: BelievedStream, one: StreamApproach, ego: EgoVehicle) -> float:
+    """Return when an ego that never brakes has to begin to meet the first vehicle of an approach."""
+    first = min(stream.ways, key=lambda way: abs(way.entry_s - one.entries_s[0]))
+    middle_s = float(np.interp(0.0, -first.to_come_m - 0.5 * first.length_m, first.time_s))
+    near_m, lane_m = stream.site.lanes_m[0], stream.site.lanes_m[first.side]
+    way_m = np.array([ego.begins_m + HALF_LANE_M + lane_m - near_m + 0.5 * ego.length_m])
+    return middle_s - float(ego.soonest_s(way_m, np.array([ego.begins_mps]))[0])
+
+
+def _usable(stream: BelievedStream, start_s: float) -> bool:
+    if not stream.time_s[0] + _BEFORE_S <= start_s <= stream.time_s[-1] - LASTS_S:
+        return False
+    rows = stream.heard.rows
+    # Rows of others are few: those in the window are looked for first.
+    during = np.flatnonzero((rows.time_s > start_s - _BEFORE_S) & (rows.time_s < start_s + _AFTER_S))
+    near = rows.in_view[during] | (np.hypot(rows.x_m[during], rows.y_m[during]) < _NEAR_M)
+    return not np.isin(rows.vehicle[during[near]], stream.others).any()
+
+
+def _encounter(stream: BelievedStream, start_s: float, number: int) -> Encounters:
+    site, clock_s = stream.site, np.asarray(start_s + np.arange(STEPS) * STEP_S, np.float64)
+    hop = np.searchsorted(stream.time_s, clock_s[::HOP_STEPS] + 1e-6, side="right") - 1
+    there = [way for way in stream.ways if start_s - _PASSED_S < way.entry_s < clock_s[-1]]
+    empty = MOST_VEHICLES - len(there)
+    to_come = [*(way.at(clock_s) for way in there), *[np.full(STEPS, GONE_M)] * empty]
+    in_view = [*(way.seen(clock_s) for way in there), *[np.zeros(STEPS, bool)] * empty]
+    one = {
+        "recorded": number,
+        "corner_ahead_m": site.corner_ahead_m,
+        "corner_m": [site.corner_left_m, site.corner_right_m],
+        "lane_m": site.lanes_m,
+        "within": stream.within[hop],
+        "to_come_m": np.stack(to_come, axis=1),
+        "in_view": np.stack(in_view, axis=1),
+        "side": [*(way.side for way in there), *[0] * empty],
+        "length_m": [*(way.length_m for way in there), *[0.0] * empty],
+        "width_m": [*(way.width_m for way in there), *[0.0] * empty],
+    }
+    return Encounters(**{name: np.asarray(value)[None] for name, value in one.items()})

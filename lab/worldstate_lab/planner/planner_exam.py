@@ -1,0 +1,146 @@
+"""What planners make of the same corners: collisions, needless braking, time lost."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.operations.metrics.alarm_rate import share_interval
+from worldstate.operations.metrics.weighted_figures import draw_weights
+from worldstate_lab.metrics.recording_draws import middle, stratified_draws
+
+from .believed_stream import BelievedStream
+from .closed_loop import Drives, drive_through
+from .ego_vehicle import EgoVehicle
+from .encounters import Encounters, approach_encounters, empty_encounters, recorded_approaches
+
+NOBODY, PHANTOM, FULL, CHANCE, LOUD = (
+    "no knowledge",
+    "phantom",
+    "phantom, full brakes",
+    "chance",
+    "chance, loud",
+)
+THRESHOLDS = tuple(round(0.001 * 2.0 ** (0.5 * step), 4) for step in range(13))
+# Of corners at which somebody comes.
+SHARES = (0.05, 0.2)
+HARD_MPS2 = 4.0
+_QUIET = 100_000  # Numbers of quiet approaches beside those of loud ones
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """Replays of approaches of loud vehicles, of those with a quiet one among them, and without anybody."""
+
+    loud: Encounters
+    quiet: Encounters
+    empty: Encounters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerDrives:
+    """One planner's drives through them."""
+
+    loud: Drives
+    quiet: Drives
+    empty: Drives
+
+
+def draw_corners(
+    streams: Sequence[BelievedStream], count: int, ego: EgoVehicle, rng: np.random.Generator
+) -> Corners:
+    """Draw approaches of loud vehicles, quiet ones by their share, and as many moments without anybody."""
+    loud, quiet = approaches_drawn(streams, count, ego, rng)
+    return Corners(loud, quiet, empty_encounters([one for one in streams if not one.ways], count, rng))
+
+
+def approaches_drawn(
+    streams: Sequence[BelievedStream], count: int, ego: EgoVehicle, rng: np.random.Generator
+) -> tuple[Encounters, Encounters]:
+    """Draw so many approaches of loud vehicles, and of quiet ones as many as their share asks for."""
+    loud, quiet = (recorded_approaches(streams, quiet=kind) for kind in (False, True))
+    quiet_count = max(round(count * len(quiet) / max(len(loud), 1)), 1)
+    return approach_encounters(loud, count, ego, rng), approach_encounters(quiet, quiet_count, ego, rng)
+
+
+def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
+    """Return the threshold one below the largest up to which nobody is hit; 0, the phantom, without one."""
+    # What nobody was hit with at some 130 approaches may hit somebody elsewhere: one step is kept in hand.
+    kept = 0.0
+    for lower, threshold in pairwise((0.0, *THRESHOLDS)):
+        if any(drive_through(one, threshold, ego).collided.any() for one in approached):
+            break
+        kept = lower
+    return kept
+
+
+def drives_of(corners: Corners, threshold: float, ego: EgoVehicle) -> CornerDrives:
+    """Return the drives of the planner that assumes vehicles from a chance on."""
+    return CornerDrives(
+        *(drive_through(one, threshold, ego) for one in (corners.loud, corners.quiet, corners.empty))
+    )
+
+
+def every_planner(corners: Corners, chance: float, loud: float, ego: EgoVehicle) -> dict[str, CornerDrives]:
+    """Return the drives of all planners; only the one with full brakes has another stopping law."""
+    return {
+        NOBODY: drives_of(corners, np.inf, ego),
+        PHANTOM: drives_of(corners, 0.0, ego),
+        FULL: drives_of(corners, 0.0, replace(ego, comfortable_mps2=ego.full_mps2)),
+        CHANCE: drives_of(corners, chance, ego),
+        LOUD: drives_of(corners, loud, ego),
+    }
+
+
+def planner_figures(
+    corners: Corners, planners: Mapping[str, CornerDrives], rng: np.random.Generator
+) -> dict[str, dict[str, float | int]]:
+    """Return the figures of every planner, ready for a table and for JSON; intervals are of 95 %."""
+    approached = np.r_[corners.loud.recorded, _QUIET + corners.quiet.recorded]
+    # Replays of one vehicle, and moments of one minute, are drawn together.
+    drawn = _with_mean(approached, rng), _with_mean(corners.empty.recorded, rng)
+    phantom = _needless_s(planners[PHANTOM], *drawn)
+    return {name: _figures(corners, one, _needless_s(one, *drawn), phantom) for name, one in planners.items()}
+
+
+def _with_mean(recorded: IndexArray, rng: np.random.Generator) -> FloatArray:
+    """Return the weights of replays in the mean, then in draws of what was recorded, each summing to one."""
+    which, members = np.unique(recorded, return_inverse=True)
+    drawn = draw_weights(stratified_draws([0] * which.size, rng), which.size)[:, members]
+    every = np.concatenate([np.ones((1, recorded.size)), drawn])
+    return np.asarray(every / every.sum(axis=1, keepdims=True))
+
+
+def _needless_s(drives: CornerDrives, approached: FloatArray, empty: FloatArray) -> FloatArray:
+    """Return needless braking a corner in the mean and in every draw, shape (1 + draws, shares)."""
+    met = np.r_[drives.loud.needless_s, drives.quiet.needless_s]
+    share = np.array(SHARES)
+    return np.outer(approached @ met, share) + np.outer(empty @ drives.empty.needless_s, 1.0 - share)
+
+
+def _figures(
+    corners: Corners, drives: CornerDrives, needless_s: FloatArray, phantom_s: FloatArray
+) -> dict[str, float | int]:
+    told: dict[str, float | int] = {}
+    for name, replays, driven in (
+        ("loud", corners.loud, drives.loud),
+        ("quiet", corners.quiet, drives.quiet),
+    ):
+        hit = driven.collided
+        low, high = share_interval(int(hit.sum()), hit.size)
+        told |= {f"{name}_collisions": int(hit.sum()), f"{name}_replays": hit.size}
+        told |= {f"{name}_collided_low": low, f"{name}_collided_high": high}
+        told |= {f"{name}_recorded": np.unique(replays.recorded).size}
+        told |= {f"{name}_recorded_collided": np.unique(replays.recorded[hit]).size}
+        told |= {f"{name}_needless_s": float(driven.needless_s.mean())}
+    told["empty_needless_s"] = float(drives.empty.needless_s.mean())
+    told["empty_hard_braking"] = float((drives.empty.hardest_mps2 > HARD_MPS2).mean())
+    told["empty_took_s"] = float(drives.empty.took_s.mean())
+    less = 1.0 - needless_s / phantom_s
+    for i, share in enumerate(SHARES):
+        told[f"needless_s_at_{share:g}"] = float(needless_s[0, i])
+        told[f"less_at_{share:g}"] = float(less[0, i])
+        told[f"less_at_{share:g}_low"], told[f"less_at_{share:g}_high"] = middle(less[1:, i])
+    return told

@@ -1,0 +1,114 @@
+"""What passes over recordings gave, kept by the content of what they were made of."""
+
+import hashlib
+import json
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.datasets.ovad_layout import AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
+from worldstate.adapters.files.atomic import write_text
+from worldstate.ground.errors import InputFileError
+from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
+from worldstate_lab.origin import origin_of
+
+# What a pass reads of a recording. Other files in its folder, such as notes of its owner, change nothing.
+RECORDING_NAMES = (AUDIO_NAME, *DETECTION_NAMES, VIDEO_NAME, TRUTH_NAME)
+
+
+@dataclass(frozen=True, slots=True)
+class FingerprintMemo:
+    """Content hashes of files by path, size and time of change, one small file a recording in `folder`."""
+
+    # One file for all recordings would lose entries where two processes write it at once.
+    folder: Path
+
+    def hashes(self, owner: Path, files: list[Path]) -> dict[str, str]:
+        """Return the hash of each file by name; those that did not change are not read again."""
+        path = self.folder / f"{origin_of(str(owner.absolute()))}.json"
+        known = _known(path)
+        stamps = {file: _stamp(file) for file in files}
+        found = {stamp: known.get(stamp) or content_hash(file) for file, stamp in stamps.items()}
+        if found != known:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_text(path, json.dumps(found))
+        return {file.name: found[stamp] for file, stamp in stamps.items()}
+
+
+def fingerprint(place: Path, memo: FingerprintMemo) -> str:
+    """Name the content of a recording, a folder in OVAD's layout or one file, in 32 characters.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     memo, recording = FingerprintMemo(Path(folder) / "memo"), Path(folder) / "1_00_0002"
+    ...     recording.mkdir()
+    ...     _ = (recording / "out_multi.wav").write_bytes(b"sound")
+    ...     before = fingerprint(recording, memo)
+    ...     _ = (recording / "out_multi.wav").write_bytes(b"other")
+    ...     len(before), fingerprint(recording, memo) == before
+    (32, False)
+    """
+    named = [place / name for name in RECORDING_NAMES] if place.is_dir() else [place]
+    files = [path for path in named if path.is_file()]
+    if not files:
+        raise InputFileError(place, f"expected a sound file or a recording folder with {AUDIO_NAME}")
+    return origin_of(memo.hashes(place, files))
+
+
+def _known(path: Path) -> dict[str, str]:
+    # A damaged memory costs one more reading of the files, nothing else.
+    try:
+        read = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return read if isinstance(read, dict) else {}
+
+
+def _stamp(path: Path) -> str:
+    # Taken before the file is read: one that changes meanwhile has another stamp, and is read again.
+    state = path.stat()
+    return f"{path.name} {state.st_size} {state.st_mtime_ns}"
+
+
+def content_hash(path: Path) -> str:
+    """Name the content of a file in 32 characters."""
+    # In blocks of 256 KiB: 11 GB of sound never sit in memory.
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class PassCache:
+    """Tables by name of each pass over a recording, in files below `folder`; may be sent to other processes.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     cache = PassCache(Path(folder))
+    ...     for _ in range(2):
+    ...         made = cache.tables("sound", ["a", 1], lambda: print("made") or {"hops": HopTable({})})
+    made
+    """
+
+    folder: Path
+
+    def tables(
+        self, pass_name: str, key: object, make: Callable[[], Mapping[str, HopTable]]
+    ) -> Mapping[str, HopTable]:
+        """Return what `make` gave for this `key`, anything ready for JSON that the tables depend on."""
+        path = self.folder / pass_name / f"{origin_of(key)}.npz"
+        if path.is_file():
+            try:
+                return load_named(path, "tables of a pass")
+            except InputFileError as error:
+                warnings.warn(f"{error}; made again", stacklevel=2)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_named(path, make())
+        # As read, also where just made: JSON makes lists of tuples in `about`, and an interrupted run that
+        # goes on shall give what an uninterrupted one does.
+        return load_named(path, "tables of a pass")

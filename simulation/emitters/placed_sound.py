@@ -1,0 +1,172 @@
+"""What a sound at a place, or on a vehicle, adds to the microphones."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, split_octaves
+from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.scene.sound_kinds import SoundKind, sound_kind
+from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.scene.vehicle import Trajectory
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.diffraction import screen_attenuation_db
+from worldstate.simulation.sound.emission import Emission, MovingSource
+from worldstate.simulation.sound.late_field import add_late_sound
+from worldstate.simulation.sound.propagation import add_sources
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.scatter import scattering
+from worldstate.simulation.sound.scattered_sound import add_scattered
+from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.surroundings import Surroundings
+
+from .emitter import emitted
+from .gusts import add_gusts
+from .rain import add_rain
+
+# Silence before and after: the octave bands of a sound that begins at once begin a little earlier.
+SILENT_BLOCKS = 8
+# Levels of the table are free-field levels, those of a source in `air.ground_gain` stand over hard ground.
+GROUND_GAIN = np.sqrt(2.0)
+# What stands in neither street is heard over the roofs: two storeys high, as near to the array as this.
+ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SoundTrack:
+    """Where a sound is and faces at its emission knots, shape (T,) each."""
+
+    time_s: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    facing_rad: FloatArray
+
+
+def add_sound(
+    static: StaticSources,
+    sound: SoundSettings,
+    site: Site,
+    preset: Preset,
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add one sound that is no vehicle's to all microphones."""
+    if sound.kind == "rain":
+        add_rain(static, sound, receiver, rng)
+        return
+    if sound.kind == "gusts":
+        add_gusts(static, sound, receiver, rng)
+        return
+    rate = receiver.sample_rate_hz
+    samples = round(sound.duration_s * rate)
+    blocks = -(-samples // KNOT_SAMPLES) + 2 * SILENT_BLOCKS
+    before = SILENT_BLOCKS * KNOT_SAMPLES
+    signal = np.zeros(blocks * KNOT_SAMPLES, np.float32)
+    level = np.float32(10.0 ** (sound.level_offset_db / 20.0))
+    signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng)
+    time = sound.start_s + (np.arange(blocks + 1) - SILENT_BLOCKS) * KNOT_SAMPLES / rate
+    track = SoundTrack(time, *sound.at(time), sound.facing(time))
+    _add_from(static, signal, track, sound.what, site, preset, receiver, rng)
+
+
+def add_signal(
+    static: StaticSources,
+    signal: str,
+    path: Trajectory,
+    site: Site,
+    preset: Preset,
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add what a vehicle warns with, from its front or its rear, all along its path."""
+    kind = sound_kind(signal)
+    samples = (len(path.time_s) - 1) * KNOT_SAMPLES
+    (front_x, front_y), (rear_x, rear_y) = path.behind(0.0), path.behind(path.kind.length_m)
+    heading = np.arctan2(kind.faces * (front_y - rear_y), kind.faces * (front_x - rear_x))
+    place = (front_x, front_y) if kind.faces > 0.0 else (rear_x, rear_y)
+    track = SoundTrack(path.time_s, *place, heading)
+    pressure = emitted(kind, samples, receiver.sample_rate_hz, rng)
+    _add_from(static, pressure, track, kind, site, preset, receiver, rng)
+
+
+def _add_from(
+    static: StaticSources,
+    signal: Float32Array,
+    track: SoundTrack,
+    kind: SoundKind,
+    site: Site,
+    preset: Preset,
+    receiver: Receiver,
+    rng: np.random.Generator,
+) -> None:
+    """Add a sound by every way; walls and the late field take its mean over all directions."""
+    rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
+    angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
+    towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
+    around = Surroundings(site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
+    if not in_the_streets(site, track).all():
+        over = _gained(towards, over_roofs(track, kind.height_m, receiver, preset.screen_cap_db), rate)
+        add_sources(static, [_source(over, track, kind, rate)], replace(around, site=in_the_open(site)))
+        return
+    add_sources(static, [_source(towards, track, kind, rate)], around)
+    mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN
+    add_scattered(static, _source(mean, track, kind, rate), around)
+    add_late_sound(static, mean, (track.x_m, track.y_m), track.time_s, site, preset, receiver, rng)
+
+
+def directivity(kind: SoundKind, angle_rad: FloatArray) -> FloatArray:
+    r"""Amplitude per octave at an angle from where a sound faces, shape (T, 8).
+
+    .. math:: g(\theta) = \frac{1 + \cos\theta}{2} + \frac{1 - \cos\theta}{2}\, 10^{D / 20}
+    """
+    back = 10.0 ** (np.array(kind.back_db) / 20.0)
+    ahead = 0.5 * (1.0 + np.cos(angle_rad))[:, None]
+    return np.asarray(ahead + (1.0 - ahead) * back)
+
+
+def mean_gain(kind: SoundKind) -> FloatArray:
+    """RMS of the directivity over all horizontal directions per octave, shape (8,)."""
+    every = directivity(kind, np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False))
+    return np.asarray(np.sqrt(np.square(every).mean(axis=0)))
+
+
+def in_the_streets(site: Site, track: SoundTrack) -> BoolArray:
+    """Tell when a sound stands in the ego's or in the crossing street, or in the open, shape (T,)."""
+    x, y = track.x_m, track.y_m
+    if site.is_open:
+        return np.ones(len(x), np.bool_)
+    own = (x <= site.corner_ahead_m) & (y <= site.side_wall_left_m) & (y >= -site.side_wall_right_m)
+    end = site.corner_ahead_m + site.street_width_m if site.opposite_wall_m is None else site.opposite_wall_m
+    return own | ((x >= site.corner_ahead_m) & (x <= end))
+
+
+def over_roofs(track: SoundTrack, height_m: float, receiver: Receiver, cap_db: float) -> FloatArray:
+    """Amplitude that the nearest roof leaves of a straight line per octave, shape (T, 8)."""
+    _, _, array_z = receiver.centre_m
+    away = np.hypot(track.x_m - receiver.ego.x_m(track.time_s), track.y_m)
+    beyond, rise = np.maximum(away - ROOF_AWAY_M, 0.0), ROOF_HEIGHT_M - array_z
+    bent = np.hypot(ROOF_AWAY_M, rise) + np.hypot(beyond, ROOF_HEIGHT_M - height_m)
+    detour = bent - np.hypot(away, height_m - array_z)
+    clear = array_z + (height_m - array_z) * ROOF_AWAY_M / np.maximum(away, ROOF_AWAY_M) > ROOF_HEIGHT_M
+    loss_db = screen_attenuation_db(np.where(clear, -detour, detour)[:, None], OCTAVES_HZ, cap_db)
+    return np.asarray(10.0 ** (-loss_db / 20.0))
+
+
+def in_the_open(site: Site) -> Site:
+    """Return a site of the same name without streets."""
+    return replace(site, opposite_wall_m=None, in_the_open=True)
+
+
+def _gained(signal: Float32Array, gain: FloatArray, rate_hz: float) -> Float32Array:
+    """Weight the octaves of a signal by gains (T, 8) at its knots."""
+    knots = np.arange(len(gain)) * KNOT_SAMPLES
+    out, samples = np.zeros(len(signal), np.float32), np.arange(len(signal))
+    for band, values in zip(split_octaves(signal, rate_hz), gain.T, strict=True):
+        out += band * np.interp(samples, knots, values).astype(np.float32)
+    return out
+
+
+def _source(signal: Float32Array, track: SoundTrack, kind: SoundKind, rate_hz: float) -> MovingSource:
+    return MovingSource(Emission.of(signal, track.time_s[0], rate_hz), track.x_m, track.y_m, kind.height_m)

@@ -1,0 +1,85 @@
+"""Rain: drops round each microphone by itself, and the rain of the whole street from everywhere."""
+
+from functools import cache
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+
+from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
+from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.static_field import (
+    StaticSources,
+    azimuths_all_round,
+    plane_wave_delays,
+    unit_vectors,
+)
+
+from .emitter import a_weight, a_weighted
+from .signals import add_ringing, gate, octave_noise
+
+# Drops that hit the sheet metal within a hand's breadth of a microphone (assumed: moderate rain, 4 mm/h), the
+# damped modes each of them excites, and how much louder the largest are: masses spread like an exponential.
+DROPS_HZ = 40.0
+MODES = ((700.0, 1.0, 0.006), (1600.0, 0.8, 0.004), (3300.0, 0.6, 0.0025), (5800.0, 0.3, 0.0015))
+# Rain on paving hisses from 1 kHz up (assumed); it comes from all around and from somewhat above.
+FAR_DB = (-20.0, -16.0, -12.0, -8.0, -4.0, 0.0, 2.0, 2.0)
+FAR_WAVES, FAR_LIFT_RAD = 24, 0.3
+FAR_SHARE = 0.3  # of the energy at a microphone
+# Levels are those of the whole sound: a low sample rate hears less of it.
+WHOLE_HZ = np.arange(1.0, 20_000.0, 5.0)
+RAMP_S = 0.5  # a shower sets in
+
+
+def add_rain(
+    static: StaticSources, sound: SoundSettings, receiver: Receiver, rng: np.random.Generator
+) -> None:
+    """Add rain to all microphones, at its level at each of them."""
+    rate, samples = receiver.sample_rate_hz, static.out.shape[1]
+    level = REFERENCE_PA * 10.0 ** ((sound.what.level_db + sound.level_offset_db) / 20.0)
+    begin = sound.start_s - receiver.knots_s[0]
+    swell = gate(samples, rate, [(begin, begin + sound.duration_s)], RAMP_S).astype(np.float32)
+    to_drops, to_street = rng.spawn(2)
+    for channel, draws in zip(static.out, to_drops.spawn(len(static.out)), strict=True):
+        channel += swell * _drumming(samples, rate, draws) * np.float32(level * np.sqrt(1.0 - FAR_SHARE))
+    azimuth = azimuths_all_round(FAR_WAVES, to_street)
+    waves = np.stack([octave_noise(FAR_DB, samples, rate, to_street) for _ in azimuth]).astype(np.float32)
+    waves *= swell * np.float32(level * np.sqrt(FAR_SHARE / FAR_WAVES) / _hiss_pressure())
+    offsets = receiver.positions_m - receiver.centre_m
+    lift = np.abs(to_street.normal(0.0, FAR_LIFT_RAD, FAR_WAVES))
+    static.add(waves, plane_wave_delays(unit_vectors(azimuth, lift), offsets))
+
+
+def _drop(rate_hz: float) -> FloatArray:
+    """Sound of one drop of unit strength, of what a sample rate can hold."""
+    out = np.zeros(int(0.04 * rate_hz))
+    add_ringing(out, 0.0, rate_hz, MODES)
+    return out
+
+
+def _drumming(samples: int, rate_hz: float, rng: np.random.Generator) -> Float32Array:
+    """Draw drops at random times and of random strengths, of unit A-weighted pressure in the mean."""
+    hits, drop = np.zeros(samples), _drop(rate_hz)
+    count = int(rng.poisson(DROPS_HZ * samples / rate_hz))
+    np.add.at(hits, rng.integers(samples, size=count), rng.exponential(1.0, count))
+    n = next_fast_len(samples + len(drop), real=True)
+    heard = irfft(rfft(hits, n) * rfft(drop, n), n)[:samples]
+    # Campbell's theorem: the power of a shot noise is its rate times the energy of one shot, times the mean
+    # square of the strengths, which is 2 of an exponential of mean 1.
+    return np.asarray(heard / np.sqrt(2.0 * DROPS_HZ * _drop_energy()), np.float32)
+
+
+@cache
+def _drop_energy() -> float:
+    """A-weighted energy of a drop of unit strength, Pa^2 s."""
+    rate = 2.0 * WHOLE_HZ[-1]
+    whole = a_weighted(np.pad(_drop(rate), 2048), rate)
+    return float(np.square(whole).sum() / rate)
+
+
+@cache
+def _hiss_pressure() -> float:
+    """A-weighted pressure of a wave of the levels `FAR_DB`, Pa."""
+    density = level_curve(np.array(FAR_DB), WHOLE_HZ) * a_weight(WHOLE_HZ) ** 2
+    return float(np.sqrt(np.trapezoid(density, WHOLE_HZ)))

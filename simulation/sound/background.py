@@ -1,0 +1,194 @@
+"""What an empty street sounds like: anisotropic ambience, distant traffic, wind and noise.
+
+All of it is noise from many directions whose powers change slowly. An open sky gives a part from everywhere;
+the rest comes in by the street's openings: along both arms of the crossing street, round the corners and by
+the walls as a vehicle there would be heard, straight ahead, and from behind.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfftfreq
+
+from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.simulation.scene.ambience import (
+    OPENINGS,
+    Ambience,
+    recording_ambience,
+    site_ambience,
+)
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
+from worldstate.simulation.scene.presets import Preset
+
+from .paths import trace_paths
+from .receiver import Receiver
+from .static_field import azimuths_all_round, plane_wave_delays, unit_vectors
+from .wave_field import BlockGrid, WaveField
+
+ELEVATION_RAD = 0.25  # traffic between buildings is heard from near the horizon
+FAR_M, FAR_HEIGHT_M = 60.0, 1.4  # where traffic in an arm is, and how much lower than the array
+FAR_OCTAVE = 3  # 500 Hz, the middle of what the feature listens to
+# Of an opening, or of an image seen in rough walls: some 20 degrees. With twice as much, the walls of single
+# sites made their empty windows differ more from one another than real ones do.
+OPENING_CONCENTRATION = 7.0
+# A distant vehicle swells and fades with these standard deviations; two of them off it is 17 dB down.
+FAR_WIDTH_S, FAR_AUDIBLE_S = (1.5, 4.0), 8.0
+FAR_SPAN_S, MAX_FAR = 10.0, 512  # the rate is that in so many seconds
+FAR_DRIFT_RAD = 0.15  # as far its direction moves while it swells
+FLUCTUATION_STEP_S = 0.5  # turbulence and moving sources change a distant sound in about so long
+# Free turbulence falls with f^-2.2. What the microphones of a standing car hear by themselves is steeper, for
+# screens average the small eddies and a roof rings low: with -2.2 the bins at 94 and 188 Hz, where the array
+# hears every direction alike, are so coherent that no vehicle stands out as far as the real ones do.
+WIND_SLOPE, ROOF_SLOPE = -2.2, -3.7
+WIND_FLOOR_HZ, ROOF_FLOOR_HZ = 20.0, 60.0  # below, it stays as it is there
+NOISE_BAND_HZ = 24_000.0  # the band that electronic noise is stated for
+
+
+def add_background(
+    out: Float32Array,
+    receiver: Receiver,
+    site: Site,
+    preset: Preset,
+    rng: np.random.Generator,
+    here: Ambience | None = None,
+) -> None:
+    """Add everything that a street without a vehicle sounds like; what a recording makes of it, unless given.
+
+    Shapes: out (M, n).
+    """
+    grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
+    if here is None:
+        here = recording_ambience(site_ambience(site, preset), preset, rng)
+    azimuth = azimuths_all_round(preset.ambient_waves, rng)
+    elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
+    directions, offsets = unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m
+    wind = wind_density(preset.wind_100hz_db + here.wind_db, grid.frequencies_hz, ROOF_SLOPE, ROOF_FLOOR_HZ)
+    electronic = REFERENCE_PA**2 * 10.0 ** (preset.self_noise_db / 10.0) / NOISE_BAND_HZ
+    field = WaveField(
+        grid,
+        plane_wave_delays(directions, offsets) + receiver.skew_s,
+        level_curve(here.octaves_db, grid.frequencies_hz),
+        _Town(site, preset, here, azimuth).power(grid, rng),
+        wind + electronic,
+    )
+    field.add_to(out, rng)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Town:
+    """What surrounds a site, seen from the array in some directions (Q,)."""
+
+    site: Site
+    preset: Preset
+    here: Ambience
+    azimuth_rad: FloatArray
+
+    def power(self, grid: BlockGrid, rng: np.random.Generator) -> FloatArray:
+        """Power of every wave in every block, as factors on the ambient level, shape (B, Q)."""
+        sky = self.preset.sky_share
+        steady = sky / len(self.azimuth_rad) + (1.0 - sky) * (self.shares @ self.lobes())
+        return (steady + self.passing(grid, rng)) * self.fluctuation(grid, rng)
+
+    @property
+    def shares(self) -> FloatArray:
+        """Power that comes in by each of `OPENINGS`, shape (4,)."""
+        return np.asarray(10.0 ** (self.here.openings_db / 10.0))
+
+    def passing(self, grid: BlockGrid, rng: np.random.Generator) -> FloatArray:
+        """Power that distant vehicles add, shape (B, Q): each swells and fades in one opening."""
+        preset, time = self.preset, grid.middles_s
+        added = np.zeros((len(time), len(self.azimuth_rad)))
+        for loudest_s in far_passages_s(preset, grid.samples / grid.sample_rate_hz, rng):
+            opening = rng.choice(len(OPENINGS), p=self.shares / self.shares.sum())
+            swell = np.exp(-(((time - loudest_s) / rng.uniform(*FAR_WIDTH_S)) ** 2))
+            loud = 10.0 ** ((preset.far_level_db + preset.far_spread_db * rng.standard_normal()) / 10.0)
+            drift = FAR_DRIFT_RAD * rng.standard_normal()
+            first, last = (self.lobes(way * drift)[opening] for way in (-1.0, 1.0))
+            gone = np.interp(time - loudest_s, [-FAR_WIDTH_S[1], FAR_WIDTH_S[1]], [0.0, 1.0])[:, None]
+            added += loud * swell[:, None] * ((1.0 - gone) * first + gone * last)
+        return added
+
+    def fluctuation(self, grid: BlockGrid, rng: np.random.Generator) -> FloatArray:
+        """Wander of every wave by itself, mean power one, shape (B, Q)."""
+        spread_db = self.preset.wave_fluctuation_db
+        at = grid.middles_s / FLUCTUATION_STEP_S
+        knots = spread_db * rng.standard_normal((int(at[-1]) + 2, len(self.azimuth_rad)))
+        before, part = at.astype(int), np.mod(at, 1.0)[:, None]
+        power = 10.0 ** (((1.0 - part) * knots[before] + part * knots[before + 1]) / 10.0)
+        return np.asarray(power / np.exp(0.5 * (spread_db * np.log(10.0) / 10.0) ** 2))
+
+    def lobes(self, turned_rad: float = 0.0) -> FloatArray:
+        """Share of every direction in the sound of each of `OPENINGS`, shape (4, Q), rows of sum one."""
+        turns = self.here.turned_rad + turned_rad
+        lobes = np.stack(
+            [
+                np.exp(OPENING_CONCENTRATION * (np.cos(self.azimuth_rad[:, None] - at - turn) - 1.0)) @ weight
+                for (at, weight), turn in zip(opening_images(self.site), turns, strict=True)
+            ]
+        )
+        return np.asarray(lobes / lobes.sum(axis=1, keepdims=True))
+
+
+def opening_images(site: Site) -> list[tuple[FloatArray, FloatArray]]:
+    """Azimuths from which the sound of each of `OPENINGS` arrives, and their powers.
+
+    Examples
+    --------
+    >>> from worldstate.simulation.scene.junction import site
+    >>> left, right, ahead, behind = opening_images(site("SA1"))
+    >>> bool(left[0][left[1].argmax()] < 0.0)  # the far side wall sees deepest into an arm
+    True
+    """
+    straight = [(np.array([direction]), np.ones(1)) for direction in (0.0, np.pi)]
+    if site.is_open:  # in the open nothing mirrors, and the road lies across
+        return [(np.array([side]), np.ones(1)) for side in (0.5 * np.pi, -0.5 * np.pi)] + straight
+    return [_arm_images(site, side) for side in (1.0, -1.0)] + straight
+
+
+@lru_cache(maxsize=64)
+def _arm_images(site: Site, side: float) -> tuple[FloatArray, FloatArray]:
+    """Directions of the images of traffic far along an arm (side +1 left), and their powers."""
+    paths = trace_paths(site, site.lanes_m[0], np.array([side * FAR_M]), FAR_HEIGHT_M, np.inf)
+    ends = [one.receiver.sign * (one.edge_y_m[0] - one.receiver.offset_m) for one in paths]
+    power = [float(one.gain[0, FAR_OCTAVE] / one.bent_m[0]) ** 2 for one in paths]
+    return np.arctan2(ends, site.corner_ahead_m), np.array(power)
+
+
+def shaped_noise(density: FloatArray, samples: int, rng: np.random.Generator, channels: int) -> Float32Array:
+    """Gaussian noise with a given power spectral density.
+
+    Shapes: density (n // 2 + 1,).
+    """
+    n = next_fast_len(samples, real=True)
+    shape = np.sqrt(density * n / 4.0).astype(np.float32)
+    noise = np.empty((channels, samples), np.float32)
+    for channel in noise:
+        # The transform of white noise is white noise.
+        white = rng.standard_normal(2 * len(shape), dtype=np.float32).view(np.complex64)
+        channel[:] = irfft(white * shape, n)[:samples]
+    return noise
+
+
+def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:
+    """Bins at which `shaped_noise` wants its density."""
+    return np.asarray(rfftfreq(next_fast_len(samples, real=True), 1.0 / sample_rate_hz))
+
+
+def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
+    """Draw when distant vehicles are loudest, a Poisson process that knows nothing of a recording's ends."""
+    expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_SPAN_S
+    number = min(int(rng.poisson(expected)), MAX_FAR)
+    return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, number)
+
+
+def wind_density(
+    octave_100hz_db: float,
+    frequencies_hz: FloatArray,
+    slope: float = WIND_SLOPE,
+    floor_hz: float = WIND_FLOOR_HZ,
+) -> FloatArray:
+    """Power spectral density of wind at a microphone, Pa^2/Hz, from its level in the octave of 100 Hz."""
+    at_100hz = REFERENCE_PA**2 * 10.0 ** (octave_100hz_db / 10.0) / (100.0 / np.sqrt(2.0))
+    return np.asarray(at_100hz * (np.maximum(frequencies_hz, floor_hz) / 100.0) ** slope)

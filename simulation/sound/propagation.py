@@ -1,0 +1,203 @@
+"""Moving sources carried along every path to every microphone, which may move as well."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
+
+from .air import air_gain, ground_gain
+from .diffraction import SPEED_OF_SOUND_MPS
+from .emission import MovingSource
+from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls, trace_paths
+from .receiver import Receiver, add_along, add_to_all, add_turning
+from .screened import ScreenedLeg, open_images, screened_legs
+from .static_field import StaticSources
+from .surroundings import Surroundings, in_own_street
+
+TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
+ANY_ORDER = range(99)
+FAINTEST = 3e-3  # a path below this share of the whole amplitude is left out (features: 4e-4 rms)
+
+
+def add_sources(
+    static: StaticSources,
+    sources: Sequence[MovingSource],
+    around: Surroundings,
+    reflections: range = ANY_ORDER,
+) -> None:
+    """Add moving sources to all microphones, by every path with so many reflections."""
+    if around.site.is_open:
+        for source in sources if 0 in reflections else ():
+            _add_open(static.out, source, around)
+        return
+    images = receiver_images(around.site)
+    bent = np.zeros((len(images), 2, around.receiver.samples), np.float32)
+    for source in sources:
+        for path in _audible(_paths(source, around)):
+            if path.source.order + path.receiver.order not in reflections:
+                continue
+            for edge in (LEFT, RIGHT):
+                _add_bent(bent[images.index(path.receiver), edge], source, path, edge, around)
+            _add_lit(static.out, source, path, around.receiver)
+    _add_corners(static, bent, images, around)
+
+
+def _paths(source: MovingSource, around: Surroundings) -> list[Path]:
+    receiver = around.receiver
+    above = receiver.above(source.height_m)
+    flat = source.y_m**2 + above**2
+    _, heard_x = receiver.arrivals(source.emission.knots_s, partial(_slant, source.x_m, flat))
+    mirrored = np.sqrt(1.0 - around.scattered(True)), np.sqrt(1.0 - around.scattered(False))
+    place = source.x_m, source.y_m, above
+    paths = trace_paths(around.site, *place, around.cap_db, receiver_x_m=heard_x, specular=mirrored)
+    beside = in_own_street(around.site, source.x_m, source.y_m)
+    if beside.any():
+        paths = [_beside(path, source, beside, mirrored[1], heard_x, around) for path in paths]
+    return [replace(path, gain=path.gain * _media(path.bent_m, source, around)) for path in paths]
+
+
+def _beside(
+    path: Path,
+    source: MovingSource,
+    share: FloatArray,
+    specular: FloatArray,
+    heard_x_m: float | FloatArray,
+    around: Surroundings,
+) -> Path:
+    """Return the path of a source that stands, as far as `share` says, in the ego's own street.
+
+    Shapes: share, heard_x_m (T,), specular (8,).
+    """
+    image, order = path.receiver, path.source.order
+    if order % 2:
+        return path  # by the wall opposite: through the mouth, as from the crossing street
+    if order:
+        # The near facade comes first, and there a source in the own street stands behind it.
+        return replace(path, gain=path.gain * (1.0 - share)[:, None])
+    across = source.y_m - float(image.mirror(np.zeros(1))[0])
+    straight = np.sqrt(
+        (source.x_m - heard_x_m) ** 2 + across**2 + around.receiver.above(source.height_m) ** 2
+    )
+    walls = side_walls(around.site, image, heard_x_m, (source.x_m, source.y_m))
+    whole = image.gain * walls[:, None] * specular**image.order
+    return replace(
+        path,
+        lit=np.maximum(path.lit, share),
+        bent_m=path.bent_m + share * (straight - path.bent_m),
+        gain=path.gain + share[:, None] * (whole - path.gain),
+    )
+
+
+def _media(length_m: FloatArray, source: MovingSource, around: Surroundings) -> float | FloatArray:
+    """Amplitude that air and road leave per octave, shape (T, 8)."""
+    if not around.outdoors:
+        return 1.0
+    return air_gain(length_m) * ground_gain(length_m, source.height_m, float(around.receiver.centre_m[2]))
+
+
+def _audible(paths: list[Path]) -> list[Path]:
+    """Paths that at some moment carry more than `FAINTEST` of the whole amplitude."""
+    strength = np.array([path.gain.max(axis=1) / path.bent_m for path in paths])
+    share = strength / np.maximum(strength.sum(axis=0), 1e-30)
+    return [path for path, peak in zip(paths, share.max(axis=1), strict=True) if peak > FAINTEST]
+
+
+def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, around: Surroundings) -> None:
+    """Add what reaches the array's centre round one corner."""
+    made = source.emission.table(path.gain * ((1.0 - path.lit) * (path.edge == edge))[:, None])
+    if made is None:
+        return
+    table, span = made
+    receiver, mouth = around.receiver, around.site.corner_ahead_m
+    before, above = path.before_m[span], receiver.above(source.height_m)
+    across = path.edge_y_m[span] - float(path.receiver.mirror(np.zeros(1))[0])
+    knots = source.emission.knots_s[span]
+    travel, _ = receiver.arrivals(knots, partial(_round, before, mouth, across, above))
+    add_along(out, table, knots, travel, receiver.knots_s)
+
+
+def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Receiver) -> None:
+    """Add what reaches every microphone along the straight line."""
+    made = source.emission.table(path.gain * path.lit[:, None])
+    if made is None:
+        return
+    table, span = made
+    knots = source.emission.knots_s[span]
+    ahead = (path.source.x_m + np.zeros_like(source.y_m))[span]
+
+    def travel(position: FloatArray) -> FloatArray:
+        across = source.y_m[span] - path.receiver.mirror(position[1:2])
+        flat = across**2 + (position[2] - source.height_m) ** 2
+        return receiver.arrivals(knots, partial(_slant, ahead - position[0], flat))[0]
+
+    add_to_all(out, table, knots, travel, receiver)
+
+
+def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt((along - x_m) ** 2 + flat_squared))
+
+
+def _add_open(out: Float32Array, source: MovingSource, around: Surroundings) -> None:
+    """Add what reaches every microphone in the open: straight, by a wall, or round a body."""
+    receiver, knots, ahead = around.receiver, source.emission.knots_s, source.ahead_m
+    flat = source.y_m**2 + receiver.above(source.height_m) ** 2
+    _, heard_x = receiver.arrivals(knots, partial(_slant, ahead, flat))
+    for image in open_images(around.site, ahead, source.y_m, heard_x):
+        straight = np.sqrt((image.x_m - heard_x) ** 2 + image.y_m**2 + receiver.above(source.height_m) ** 2)
+        gain = image.gain * _media(straight, source, around)
+        for leg in screened_legs(image.occluders, image.x_m, image.y_m, heard_x, around.cap_db):
+            _add_leg(out, source, replace(leg, gain=leg.gain * gain), receiver)
+
+
+def _add_leg(out: Float32Array, source: MovingSource, leg: ScreenedLeg, receiver: Receiver) -> None:
+    """Add what reaches every microphone by one point, or straight."""
+    made = source.emission.table(leg.gain)
+    if made is None:
+        return
+    table, span = made
+    knots = source.emission.knots_s[span]
+    before, via_x, via_y = leg.before_m[span], leg.via_x_m[span], leg.via_y_m[span]
+
+    def travel(position: FloatArray) -> FloatArray:
+        rise, across = position[2] - source.height_m, via_y - position[1]
+        return receiver.arrivals(knots, partial(_round, before, via_x - position[0], across, rise))[0]
+
+    add_to_all(out, table, knots, travel, receiver)
+
+
+def _round(
+    before: FloatArray, along: float | FloatArray, across: FloatArray, rise: float, x_m: FloatArray
+) -> FloatArray:
+    return np.asarray(np.hypot(before + np.hypot(along - x_m, across), rise))
+
+
+def _add_corners(
+    static: StaticSources, bent: Float32Array, images: list[ReceiverImage], around: Surroundings
+) -> None:
+    """Let every corner, as every side image sees it, sound to all microphones."""
+    site, receiver = around.site, around.receiver
+    places = [(image, y) for image in images for y in (site.corner_left_m, -site.corner_right_m)]
+    signals = bent.reshape(-1, bent.shape[2])
+    used = np.flatnonzero(np.abs(signals).max(axis=1) > 0.0)
+    if len(used) and receiver.ego.stands:
+        delays = np.stack([_corner_delays(*place, site.corner_ahead_m, receiver) for place in places])
+        static.add(signals[used], delays[used])
+    elif len(used):
+        for i in used:
+            image, y = places[i]
+            place = np.array([site.corner_ahead_m, image.sign * (y - image.offset_m), receiver.centre_m[2]])
+            add_turning(static.out, signals[i], place, np.ones(len(receiver.knots_s)), receiver)
+
+
+def _corner_delays(image: ReceiverImage, corner_y: float, mouth: float, receiver: Receiver) -> FloatArray:
+    """Delay of every microphone against the array's centre for sound from a corner, shape (M,)."""
+    x, y, z = receiver.positions_m.T
+    last_leg = np.hypot(mouth - x, image.mirror(y) - corner_y)
+    to_centre = np.hypot(mouth, float(image.mirror(np.zeros(1))[0]) - corner_y)
+    tilted = np.hypot(TYPICAL_LEG_M + last_leg, z - SOURCE_HEIGHT_M)
+    centre = np.hypot(TYPICAL_LEG_M + to_centre, receiver.above(SOURCE_HEIGHT_M))
+    return np.asarray((tilted - centre) / SPEED_OF_SOUND_MPS + receiver.skew_s)

@@ -1,0 +1,161 @@
+"""Microphones that stand or move, and what reaches them from places that stand still."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.fft import next_fast_len
+
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.simulation.scene.ego_motion import ARRAY_HEIGHT_M, EgoMotion
+from worldstate.simulation.scene.octave_bands import resample_whole
+
+from .delay import KNOT_SAMPLES, PHASES, Phases, Table, add_delayed, emission_times
+from .diffraction import SPEED_OF_SOUND_MPS
+
+NEAREST_M = 0.5  # nothing comes nearer to a microphone, and louder
+ARRIVAL_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """Microphones, how they move, and the times at which they listen."""
+
+    positions_m: FloatArray  # shape (M, 3): In `base_link`, z above the road
+    skew_s: FloatArray  # shape (M,): Phase mismatch of every channel as a delay
+    knots_s: FloatArray  # shape (K + 1,): Receive times of the knots; K * KNOT_SAMPLES samples are heard
+    ego: EgoMotion = field(default_factory=EgoMotion)  # How `base_link` moves along x
+
+    @property
+    def samples(self) -> int:
+        """Number of samples between the first and the last knot."""
+        return (len(self.knots_s) - 1) * KNOT_SAMPLES
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Rate at which is heard."""
+        return float(KNOT_SAMPLES / (self.knots_s[1] - self.knots_s[0]))
+
+    @property
+    def centre_m(self) -> FloatArray:
+        """Array's centre in `base_link`, shape (3,)."""
+        return np.asarray(self.positions_m.mean(axis=0))
+
+    @property
+    def reach_knots(self) -> int:
+        """Knots within which all microphones hear what the centre hears now."""
+        offsets = np.linalg.norm(self.positions_m - self.centre_m, axis=1) / SPEED_OF_SOUND_MPS
+        return int(np.ceil((offsets + np.abs(self.skew_s)).max() * self.sample_rate_hz / KNOT_SAMPLES)) + 1
+
+    def above(self, height_m: float) -> float:
+        """Height of the array's centre above a source."""
+        return float(self.centre_m[2]) - height_m
+
+    def arrivals(
+        self, emit_s: FloatArray, length_m: Callable[[FloatArray], FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        r"""Solve a = t + r(x(a)) / c for what is emitted at t and heard at a by an ego at x.
+
+        Shapes: emit_s (T,), length_m (T,).
+        """
+        x = self.ego.x_m(emit_s)
+        length = length_m(x)
+        # The ego is far slower than sound: every round is wrong by v / c < 6 % of what the last one was.
+        for _ in range(0 if self.ego.stands else ARRIVAL_ROUNDS):
+            x = self.ego.x_m(emit_s + length / SPEED_OF_SOUND_MPS)
+            length = length_m(x)
+        return length, x
+
+
+def standing_m(array: MicrophoneArray) -> FloatArray:
+    """Positions in `base_link`, z above the road, of an array with its centre at `ARRAY_HEIGHT_M`, (M, 3).
+
+    Examples
+    --------
+    >>> standing_m(MicrophoneArray([[1.0, 0.1, 3.0], [1.0, -0.1, 3.2]])).round(2).tolist()
+    [[0.0, 0.1, 1.6], [0.0, -0.1, 1.8]]
+    """
+    positions = array.centred_m + np.array([0.0, 0.0, ARRAY_HEIGHT_M])
+    lowest = float(positions[:, 2].min())
+    if lowest <= 0.0:
+        got = f"one {ARRAY_HEIGHT_M - lowest:.2f} m below its centre"
+        raise InvalidArgumentError(f"array: expected microphones above the road, got {got}")
+    return np.asarray(positions)
+
+
+def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> FloatArray:
+    """Distance from a place to a point fixed at `offset_m` on an ego at `x_m` (T,)."""
+    across = np.hypot(place_m[1] - offset_m[1], place_m[2] - offset_m[2])
+    return np.asarray(np.hypot(place_m[0] - offset_m[0] - x_m, across))
+
+
+def add_along(
+    out: Float32Array, table: Table, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
+) -> None:
+    """Add what was emitted at the knots `emit_s` and has gone `travel_m`, weaker the longer the way."""
+    emit = emission_times(receive_s, emit_s, travel_m, SPEED_OF_SOUND_MPS)
+    length = np.interp(np.nan_to_num(emit), emit_s, travel_m)
+    add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
+
+
+def add_to_all(
+    out: Float32Array,
+    table: Table,
+    emit_s: FloatArray,
+    travel_m: Callable[[FloatArray], FloatArray],
+    receiver: Receiver,
+) -> None:
+    """Add a sound to all microphones, whose way to a position is `travel_m` at the emission knots."""
+    # Rendered once, for the centre: every microphone hears that a little earlier or later, and looking up
+    # every sample for each of them took twice as long.
+    knots, step, reach = receiver.knots_s, KNOT_SAMPLES / receiver.sample_rate_hz, receiver.reach_knots
+    way = travel_m(receiver.centre_m)
+    heard_s = emit_s + way / SPEED_OF_SOUND_MPS
+    ends = (heard_s[[0, -1]] - knots[0]) / step + np.array([-reach, reach])
+    first, last = (int(end) for end in np.clip(np.rint(ends), -reach, len(knots) - 1 + reach))
+    if last <= first:
+        return
+    centre_s = knots[0] + np.arange(first, last + 1) * step
+    values = np.zeros((last - first) * PHASES * KNOT_SAMPLES, np.float32)
+    add_along(values, table, emit_s, way, centre_s)
+    phases, rows = Phases(values), slice(max(first, 0), min(last, len(knots) - 1))
+    at_s = knots[rows.start : rows.stop + 1]
+    for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
+        own = travel_m(position)
+        arrives = emit_s + own / SPEED_OF_SOUND_MPS + skew
+        wanted = np.interp(at_s, arrives, heard_s, left=np.nan, right=np.nan) - centre_s[0]
+        nearer = np.maximum(way, NEAREST_M) / np.maximum(own, NEAREST_M)
+        gain = np.interp(at_s[:-1], arrives, nearer)
+        heard = microphone[rows.start * KNOT_SAMPLES : rows.stop * KNOT_SAMPLES]
+        phases.add_to(heard, wanted * (receiver.sample_rate_hz * PHASES), gain)
+
+
+def add_turning(
+    out: Float32Array, signal: Float32Array, place_m: FloatArray, gain: FloatArray, receiver: Receiver
+) -> None:
+    """Spread over the microphones of a moving ego what its centre hears from a place that stands still."""
+    knots, reach = receiver.knots_s, receiver.reach_knots
+    blocks = signal.reshape(-1, KNOT_SAMPLES)
+    loud = np.flatnonzero(np.abs(blocks).max(axis=1) * np.maximum(gain[:-1], gain[1:]) > 0.0)
+    if not len(loud):
+        return
+    first, last = int(loud[0]), int(loud[-1]) + 1
+    ramp = np.arange(KNOT_SAMPLES) / KNOT_SAMPLES
+    factor = gain[first:last, None] + np.diff(gain[first : last + 1])[:, None] * ramp
+    # A length that the transform likes: silence at the end costs less.
+    part = np.zeros((next_fast_len(last - first + 2 * reach, real=True), KNOT_SAMPLES), np.float32)
+    part[reach : reach + last - first] = blocks[first:last] * factor
+    phases = Phases(resample_whole(part.ravel(), PHASES))
+    rows = slice(max(first - reach, 0), min(last + reach, len(blocks)))
+    x, at_s = receiver.ego.x_m(knots), knots[rows.start : rows.stop + 1]
+    left = knots - distance_m(place_m, x, receiver.centre_m) / SPEED_OF_SOUND_MPS
+    here, even = x[rows.start : rows.stop + 1], np.ones(rows.stop - rows.start)
+    step = knots[1] - knots[0]
+    for microphone, position, skew in zip(out, receiver.positions_m, receiver.skew_s, strict=True):
+        wanted = at_s - skew - distance_m(place_m, here, position) / SPEED_OF_SOUND_MPS
+        # What the centre hears before the beginning and after the end is not known.
+        heard = np.interp(wanted, left, knots, left=np.nan, right=np.nan)
+        at = ((heard - knots[0]) / step - (first - reach)) * (KNOT_SAMPLES * PHASES)
+        phases.add_to(microphone[rows.start * KNOT_SAMPLES : rows.stop * KNOT_SAMPLES], at, even)

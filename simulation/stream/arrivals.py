@@ -1,0 +1,160 @@
+"""Who comes when: every flow is a Poisson process, every arrival one vehicle or several."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from worldstate.ground.typing import FloatArray
+from worldstate.simulation.scene.drawn_sounds import with_sounds
+from worldstate.simulation.scene.ego_motion import EgoMotion
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
+from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.scene.settings import EGO_STOPS_AFTER_S, SimulationSettings
+from worldstate.simulation.scene.sound_settings import SoundSettings
+
+from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
+from .settings import StreamSettings
+from .traffic import HAZARDS, Traffic
+
+HEADWAY_S = (1.5, 4.0)
+TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
+LONGEST_QUEUE = 8
+AROUND_DRIVE_S = 20.0  # who arrives so long before or after a drive is still heard in it
+STANDING = EgoMotion()
+SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # the fades of an event lie beside the sound
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleEvent:
+    """One vehicle of a stream."""
+
+    flow: str  # The flow that it arrived in, or "follows"
+    manoeuvre: Manoeuvre
+    start_s: float  # Time of the stream at which the clock of its motion is 0
+    signal: str = ""  # What it warns with
+
+    @property
+    def end_s(self) -> float:
+        """Time of the stream at which it is out of earshot."""
+        return self.start_s + self.manoeuvre.motion.duration_s
+
+
+@dataclass(frozen=True, slots=True)
+class SoundEvent:
+    """A sound of a stream that is no vehicle's."""
+
+    sound: SoundSettings
+    start_s: float  # Time of the stream at which its clock is 0
+
+    @property
+    def end_s(self) -> float:
+        """Time of the stream at which it is over, with what comes late."""
+        return self.start_s + self.sound.end_s + SOUND_MARGIN_S
+
+
+Event = VehicleEvent | SoundEvent
+
+
+def draw_events(
+    site: Site,
+    traffic: Traffic,
+    preset: Preset,
+    duration_s: float,
+    rng: np.random.Generator,
+    ego: EgoMotion = STANDING,
+) -> list[VehicleEvent]:
+    """Draw all vehicles of a stream, in the order in which they come into earshot."""
+    # A generator a flow: another rate of one of them leaves the others as they are.
+    flows = dict(zip(MANOEUVRES, rng.spawn(len(MANOEUVRES)), strict=True))
+    turns = _turns(traffic, duration_s, rng, ego) if traffic.evenly else {}
+    around_s = 0.0 if ego.stands else AROUND_DRIVE_S
+    events: list[VehicleEvent] = []
+    for flow, own in flows.items():
+        times_s = turns.get(flow)
+        if times_s is None:
+            drawn_s = duration_s + 2.0 * around_s
+            number = own.poisson(traffic.per_hour.get(flow, 0.0) * drawn_s / 3600.0)
+            times_s = np.sort(own.uniform(0.0, drawn_s, number)) - around_s
+        for arrival_s, one in zip(times_s, own.spawn(len(times_s)), strict=True):
+            events += _arrival(flow, float(arrival_s), site, traffic, preset, one)
+    inside = [event for event in events if event.start_s < duration_s and event.end_s > 0.0]
+    return sorted(inside, key=lambda event: event.start_s)
+
+
+def _turns(
+    traffic: Traffic, duration_s: float, rng: np.random.Generator, ego: EgoMotion
+) -> dict[str, FloatArray]:
+    """Deal equal stretches of time to the hazards, and draw the middle half of each to arrive in.
+
+    A drive has one of them, shortly before the ego stops, as recordings have.
+    """
+    if not ego.stands:
+        rates = np.array([traffic.per_hour.get(flow, 0.0) for flow in HAZARDS])
+        chosen = rng.choice(HAZARDS, p=rates / rates.sum())
+        arrives_s = np.array([ego.stop_s - rng.uniform(*EGO_STOPS_AFTER_S)])
+        return {flow: arrives_s[: int(flow == chosen)] for flow in HAZARDS}
+    counts = {flow: round(traffic.per_hour.get(flow, 0.0) * duration_s / 3600.0) for flow in HAZARDS}
+    order = rng.permutation(np.repeat(list(counts), list(counts.values())))
+    middle = np.arange(len(order)) + rng.uniform(0.25, 0.75, len(order))
+    return {flow: middle[order == flow] * duration_s / max(len(order), 1) for flow in counts}
+
+
+def _arrival(
+    flow: str, arrival_s: float, site: Site, traffic: Traffic, preset: Preset, rng: np.random.Generator
+) -> Iterator[VehicleEvent]:
+    arms = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
+    if flow == "queue":
+        arms[flow] = ((LEFT,), (RIGHT,))[rng.integers(2)]
+    for arm in arms.get(flow, (None,)):
+        kind = _kind(traffic, rng)
+        # Nobody hears a bicycle two streets away.
+        heard = vehicle_kind("light") if flow == "far" and kind.name == "bicycle" else kind
+        driver = draw_driver(site, heard, preset, rng, arm)
+        signal = _signal(traffic, heard, rng)
+        if signal:
+            driver = replace(driver, reach_m=EARSHOT_M[1])  # louder than its tyres
+        leader = MANOEUVRES[flow](driver, rng)
+        late_s = TOGETHER_S * rng.standard_normal() if flow == "both" and arm == RIGHT else 0.0
+        yield replace(_event(flow, arrival_s + late_s, leader), signal=signal)
+        if arm is None:
+            continue
+        last = leader
+        for number in range(LONGEST_QUEUE):
+            another = number == 0 if flow == "queue" else rng.random() < traffic.follower_share
+            if not another:
+                break
+            # Who follows on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
+            kind = leader.motion.kind if rng.random() < 0.5 else vehicle_kind("light")
+            last = behind(last, rng.uniform(*HEADWAY_S), kind)
+            yield _event("follows", arrival_s + late_s, last)
+
+
+def draw_sounds(settings: StreamSettings, microphones: int, rng: np.random.Generator) -> list[SoundEvent]:
+    """Draw all sounds of a stream that are no vehicle's, each kind a Poisson process of its own."""
+    events: list[SoundEvent] = []
+    kinds = settings.traffic.sounds
+    for (kind, rate), own in zip(sorted(kinds.items()), rng.spawn(len(kinds)), strict=True):
+        for arrival_s in own.uniform(0.0, settings.duration_s, own.poisson(rate * settings.minutes / 60.0)):
+            empty = SimulationSettings(settings.site, "none", duration_s=own.uniform(*SOUND_S))
+            sound = with_sounds(empty, [kind], microphones, own).sounds[0]
+            events.append(SoundEvent(replace(sound, start_s=SOUND_MARGIN_S), float(arrival_s)))
+    return sorted(events, key=lambda event: event.start_s)
+
+
+def _event(flow: str, arrival_s: float, manoeuvre: Manoeuvre) -> VehicleEvent:
+    return VehicleEvent(flow, manoeuvre, arrival_s + manoeuvre.gap_s - manoeuvre.arrives_s)
+
+
+def _signal(traffic: Traffic, kind: VehicleKind, rng: np.random.Generator) -> str:
+    """Draw what a vehicle warns with; only what is ridden has a bicycle's bell."""
+    for signal, share in traffic.signals.items():
+        if (signal == "bicycle-bell") == (kind.ridden_mps is not None) and rng.random() < share:
+            return signal
+    return ""
+
+
+def _kind(traffic: Traffic, rng: np.random.Generator) -> VehicleKind:
+    names, shares = zip(*traffic.kinds.items(), strict=True)
+    return vehicle_kind(str(rng.choice(names, p=np.array(shares) / sum(shares))))

@@ -1,0 +1,218 @@
+"""What the vehicles of every flow do at a junction: their routes, where they slow down, stand and end."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from worldstate.ground.typing import FloatArray
+from worldstate.simulation.scene.driving import entry_y_m
+from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.kinds import VehicleKind
+from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.scene.route import TURN_RADIUS_M, Route, along
+from worldstate.simulation.scene.settings import (
+    BRAKING_MPS2,
+    BRAKING_SHARE,
+    SPEEDS_MPS,
+    speeds_mps,
+)
+from worldstate.simulation.scene.vehicle import (
+    POWER_TO_1M_DB,
+    propulsion_level_db,
+    rolling_level_db,
+)
+from worldstate.simulation.sound.late_field import LATE_DISTANCE_M, late_level_db
+
+from .motion import Motion, SpeedLimit, confined, drive_along
+
+TURN_MPS, ARC_STEPS = 4.0, 16
+OWN_LANE_M = 1.8  # beside the ego, whose half width is .9 m, with what a side wall leaves
+KERB_M = 0.95  # half a vehicle and a hand's breadth
+BESIDE_M, SHORTEST_M = 30.0, 10.0  # how far into another street a vehicle is followed
+# Out of earshot: in the octaves of 125 Hz to 2 kHz so far below the ambience, round the corner (which takes
+# 12 dB at least in deep shadow) and by the late field, which has no direction. Wind covers what is lower.
+INAUDIBLE_DB, LATE_INAUDIBLE_DB, SHADOW_DB, HEARD_OCTAVES = 15.0, 6.0, 12.0, slice(1, 6)
+EARSHOT_M = (15.0, 80.0)
+LEFT, RIGHT = "left", "right"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Manoeuvre:
+    """One vehicle's motion and how it is heard."""
+
+    arm: str  # The hidden arm that it comes out of, goes into or stays in
+    motion: Motion
+    arrives_s: float  # The moment of its clock that its flow's arrival time stands for
+    heard: Route | None = None  # Where its sound comes from, if not from where it is
+    gap_s: float = 0.0  # Behind the arrival that it belongs to
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Driver:
+    """Who drives where: what every manoeuvre is drawn for."""
+
+    site: Site
+    kind: VehicleKind
+    arm: str
+    speed_mps: float
+    braking_mps2: float  # Before the junction; 0 for none
+    reach_m: float  # Beyond it nothing of the vehicle is heard
+
+    @property
+    def side(self) -> float:
+        """Sign of y in its arm."""
+        return 1.0 if self.arm == LEFT else -1.0
+
+    def lane_m(self, into: bool = False) -> float:
+        """How far ahead it drives when it comes out of its arm, or goes into it."""
+        near, far = self.site.lanes_m
+        return near if (self.arm == LEFT) is not into else far
+
+    def reach_from(self, before_m: float) -> float:
+        """How far before a point in the arm, which lies so far before line of sight, it is first heard."""
+        return max(self.reach_m - before_m, SHORTEST_M)
+
+    def entry_y_m(self) -> float:
+        """Where on its lane it comes into the camera's line of sight."""
+        return entry_y_m(self.site, self.lane_m(), self.arm)
+
+
+def draw_driver(
+    site: Site, kind: VehicleKind, preset: Preset, rng: np.random.Generator, arm: str | None = None
+) -> Driver:
+    """Draw an arm, a speed and whether the driver brakes before a blind junction."""
+    speed = float(rng.uniform(*speeds_mps(site, kind)))
+    braking = float(rng.uniform(*BRAKING_MPS2)) if rng.random() < BRAKING_SHARE else 0.0
+    chosen = LEFT if rng.random() < 0.5 else RIGHT
+    return Driver(site, kind, arm or chosen, speed, braking, earshot_m(site, kind, speed, preset))
+
+
+def earshot_m(site: Site, kind: VehicleKind, speed_mps: float, preset: Preset) -> float:
+    """Distance beyond which a vehicle in a hidden arm is lost in the ambience in all octaves that count."""
+    speed = np.array([speed_mps])
+    power = [10.0 ** (law(speed, kind)[:, 0] / 10.0) for law in (rolling_level_db, propulsion_level_db)]
+    level = 10.0 * np.log10(np.sum(power, axis=0)) + POWER_TO_1M_DB + preset.vehicle_level_db
+    above = level - preset.ambient_octaves_db
+    bent = 10.0 ** ((above - SHADOW_DB + INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)
+    late = 10.0 ** ((above + late_level_db(site, preset) + LATE_INAUDIBLE_DB)[HEARD_OCTAVES].max() / 20.0)
+    return float(np.clip(max(bent, LATE_DISTANCE_M * (late - 1.0)), *EARSHOT_M))
+
+
+def emerges(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Come out of the arm, cross the view and go on into the other arm."""
+    slowest = max(driver.speed_mps - 2.0 * driver.braking_mps2, 0.25 * driver.speed_mps)
+    limits = [SpeedLimit(0.0, slowest, braking_mps2=driver.braking_mps2)] if driver.braking_mps2 else []
+    return _through(driver, limits)
+
+
+def waits(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Stand before the corner for some time, then come out."""
+    return _through(driver, [SpeedLimit(-rng.uniform(1.0, 6.0), 0.0, rng.uniform(4.0, 25.0))])
+
+
+def turns_away(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Turn into a side street before the corner."""
+    lane, before = driver.lane_m(), rng.uniform(8.0, 35.0)
+    turn_y = driver.entry_y_m() + driver.side * before
+    corner = _arc((lane, turn_y), (0.0, -driver.side), (-1.0, 0.0))
+    points = np.concatenate([[[lane, turn_y + driver.side]], corner, corner[-1:] - [[BESIDE_M, 0.0]]])
+    limits = [SpeedLimit(0.0, TURN_MPS), SpeedLimit(0.5 * np.pi * TURN_RADIUS_M, TURN_MPS)]
+    return _beside(driver, along(points, 1.0), (-driver.reach_from(before), BESIDE_M), limits)
+
+
+def parks(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Stop at the kerb of the arm and switch the engine off."""
+    lane, before = driver.lane_m(), rng.uniform(8.0, 30.0)
+    stop_y = driver.entry_y_m() + driver.side * before
+    route = along([[lane, stop_y + driver.side], [lane, stop_y]], 1.0)
+    limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 5.0))]
+    motion = _drive(driver, route, (-driver.reach_from(before), 0.0), limits)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(-0.1))
+
+
+def passes_far(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Cross the arm on another street, far from the corner."""
+    y, heading = driver.side * rng.uniform(40.0, 80.0), 1.0 if rng.random() < 0.5 else -1.0
+    middle = driver.site.corner_ahead_m + 0.5 * driver.site.street_width_m
+    route = along([[middle - heading, y], [middle + heading, y]], 1.0)
+    elsewhere = replace(driver, speed_mps=float(rng.uniform(*SPEEDS_MPS)))
+    return _beside(elsewhere, route, (-BESIDE_M, BESIDE_M), [])
+
+
+def from_behind(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Overtake the standing ego in its own street and turn into the arm."""
+    own = min(OWN_LANE_M, driver.site.side_wall_left_m - KERB_M)
+    turn = (driver.lane_m(into=True) - TURN_RADIUS_M, own)
+    return _turn_into(driver, turn, (1.0, 0.0))
+
+
+def from_ahead(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
+    """Come towards the ego and turn into the arm; with a wall opposite, pull out from the kerb in view."""
+    lane = driver.lane_m(into=True)
+    if driver.site.opposite_wall_m is None:
+        return _turn_into(driver, (lane + TURN_RADIUS_M, 1.2), (-1.0, 0.0))
+    route = along([[lane, -driver.side], [lane, 0.0]])
+    limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 4.0))]
+    motion = _drive(driver, route, (0.0, driver.reach_m), limits, into=True)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+
+
+MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
+    "left": emerges,
+    "right": emerges,
+    "both": emerges,
+    "waits": waits,
+    "turns_away": turns_away,
+    "parks": parks,
+    "far": passes_far,
+    "from_behind": from_behind,
+    "from_ahead": from_ahead,
+    "queue": emerges,
+}
+
+
+def _through(driver: Driver, limits: list[SpeedLimit]) -> Manoeuvre:
+    """Drive along the crossing street; the arrival is the line of sight."""
+    lane, entry = driver.lane_m(), driver.entry_y_m()
+    route = along([[lane, entry], [lane, entry - driver.side]])
+    motion = _drive(driver, route, (-driver.reach_m, 2.0 * abs(entry) + driver.reach_m), limits)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+
+
+def _turn_into(driver: Driver, turn_m: tuple[float, float], towards: tuple[float, float]) -> Manoeuvre:
+    """Come straight to a point in view or beside the ego, turn there into the arm and leave by it."""
+    corner = _arc(turn_m, towards, (0.0, driver.side))
+    before = np.array(turn_m) - towards
+    after = corner[-1:] + np.array([0.0, driver.side])
+    points = np.concatenate([[before], corner, after])
+    length = 0.5 * np.pi * TURN_RADIUS_M
+    limits = [SpeedLimit(0.0, TURN_MPS), SpeedLimit(length, TURN_MPS)]
+    motion = _drive(driver, along(points, 1.0), (-driver.reach_m, length + driver.reach_m), limits, into=True)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+
+
+def _beside(driver: Driver, route: Route, span_m: tuple[float, float], limits: list[SpeedLimit]) -> Manoeuvre:
+    """Drive where only the mouth of another street lets the sound out."""
+    near, far = driver.site.lanes_m
+    motion = _drive(driver, route, span_m, limits)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0), confined(route, near, far))
+
+
+def _drive(
+    driver: Driver, route: Route, span_m: tuple[float, float], limits: list[SpeedLimit], into: bool = False
+) -> Motion:
+    heading = int(driver.side) if into else -int(driver.side)
+    return drive_along(route, span_m, driver.speed_mps, limits, driver.kind, heading)
+
+
+def _arc(start_m: tuple[float, float], towards: tuple[float, float], then: tuple[float, float]) -> FloatArray:
+    """Quarter circle from a point, shape (ARC_STEPS, 2)."""
+    angle = np.linspace(0.0, 0.5 * np.pi, ARC_STEPS)[:, None]
+    turned = np.sin(angle) * np.array(towards) + (1.0 - np.cos(angle)) * np.array(then)
+    return np.asarray(np.array(start_m) + TURN_RADIUS_M * turned)
+
+
+def behind(leader: Manoeuvre, headway_s: float, kind: VehicleKind) -> Manoeuvre:
+    """Return a follower, who drives as the one in front does."""
+    return replace(leader, motion=replace(leader.motion, kind=kind), gap_s=leader.gap_s + headway_s)

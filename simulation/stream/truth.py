@@ -1,0 +1,168 @@
+"""What only the simulation knows of a stream: every vehicle, every tenth of a second."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.ground.errors import InputFileError
+from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.simulation.camera.simulated_detector import line_of_sight
+from worldstate.simulation.dataset.truth import SCHEMA, SCHEMA_VERSION
+
+from .arrivals import SoundEvent, VehicleEvent
+from .rendering import row_times
+from .settings import StreamSettings
+from .sight import visible_s
+from .traffic import HAZARDS
+
+COLUMNS = (
+    "time_s", "vehicle", "x_m", "y_m", "speed_mps", "in_view", "time_to_visible_s", "loudness_db",
+)  # fmt: skip
+FOLLOWS = "follows"
+EVENTS_NAME, ROWS_NAME = "events.json", "vehicles.csv"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleTruth:
+    """One vehicle of a stream: who it is, and its rows."""
+
+    number: int
+    event: VehicleEvent
+    t0_s: float | None  # First line of sight; None where it never comes into view
+    time_s: FloatArray  # shape (R,): Tenths of a second of the stream
+    x_m: FloatArray  # shape (R,): Front bumper, ahead of the array
+    y_m: FloatArray  # shape (R,): Front bumper, left
+    axle_rad: FloatArray  # shape (R,): Azimuth of the front axle
+    axle_m: FloatArray  # shape (R,): Its distance
+    speed_mps: FloatArray  # shape (R,)
+    in_view: BoolArray  # shape (R,)
+
+    @property
+    def hazard(self) -> bool:
+        """Whether it comes out of a hidden arm."""
+        return self.event.flow in (*HAZARDS, FOLLOWS)
+
+    def time_to_visible_s(self) -> list[float | None]:
+        """Time until the first line of sight at every row, negative afterwards; None where it never comes."""
+        if self.t0_s is None:
+            return [None] * len(self.time_s)
+        return [round(self.t0_s - time_s, 3) for time_s in self.time_s.tolist()]
+
+
+def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) -> VehicleTruth:
+    """Return where a vehicle is at its rows, and when it is in view."""
+    rows = row_times(event, settings)
+    path = event.manoeuvre.motion.trajectory(rows - event.start_s)
+    x, y = path.behind(0.0)
+    axle_x, axle_y = path.behind(path.kind.axles_m[0])
+    ego_x = settings.ego.x_m(rows)
+    return VehicleTruth(
+        number=number,
+        event=event,
+        t0_s=visible_s(event, settings.site, settings.ego),
+        time_s=rows.round(1),
+        x_m=x - ego_x,
+        y_m=y,
+        axle_rad=np.arctan2(axle_y, axle_x - ego_x),
+        axle_m=np.hypot(axle_x - ego_x, axle_y),
+        speed_mps=path.speed_mps,
+        in_view=line_of_sight(path, settings.site, PinholeCamera(), ego_x),
+    )
+
+
+def describe_events(
+    vehicles: Sequence[VehicleTruth], sounds: Sequence[SoundEvent], loudness_db: Mapping[int, FloatArray]
+) -> dict[str, list[dict[str, Any]]]:
+    """Return `events.json`: one entry a vehicle, and one a sound that is none."""
+    told = [
+        {
+            "vehicle": one.number,
+            "flow": one.event.flow,
+            "kind": one.event.manoeuvre.motion.kind.name,
+            "signal": one.event.signal or None,
+            "arm": one.event.manoeuvre.arm,
+            "hazard": one.hazard,
+            "t0_s": one.t0_s,
+            "first_s": round(one.event.start_s, 3),
+            "last_s": round(one.event.end_s, 3),
+        }
+        for one in vehicles
+    ]
+    others = [
+        {
+            "kind": one.sound.kind,
+            "place_m": list(one.sound.place_m) if one.sound.has_place else None,
+            "first_s": round(one.start_s + one.sound.start_s, 3),
+            "last_s": round(one.start_s + one.sound.end_s, 3),
+            "loudness_db": round(float(loudness_db[number].max()), 1) if loudness_db[number].size else None,
+        }
+        for number, one in enumerate(sounds, start=len(vehicles))
+    ]
+    return {"vehicles": told, "sounds": others}
+
+
+def stream_hazards(folder: Path) -> int:
+    """Count the vehicles that come out of a hidden arm in a stream on disk; 0 where it is not simulated."""
+    path = folder / EVENTS_NAME
+    if not path.is_file():
+        return 0
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        return sum(bool(one["hazard"]) for one in told["vehicles"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputFileError(path, f"expected the events of a simulated stream: {error!r}") from error
+
+
+def describe_stream(settings: StreamSettings, vehicles: Sequence[VehicleTruth]) -> dict[str, Any]:
+    """Return a stream in the form of a recording's truth: its vehicles' rows, each over its own time."""
+    # What reads a recording's truth draws and scores tracks; `entry_s` is the first T0 of all.
+    tracks = [_frames(one) for one in vehicles if len(one.time_s)]
+    frames = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
+    return {
+        "schema": SCHEMA,
+        "version": SCHEMA_VERSION,
+        "settings": asdict(settings),
+        "frame_rate_hz": FRAME_RATE_HZ,
+        "entry_s": min((one.t0_s for one in vehicles if one.t0_s is not None), default=None),
+        "frames": tracks[0] if tracks else [],
+        "others": tracks[1:],
+        "ego": {"x_m": [0.0] * frames, "speed_mps": [0.0] * frames},
+    }
+
+
+def _frames(one: VehicleTruth) -> list[dict[str, Any]]:
+    columns = {
+        "time_s": one.time_s,
+        "speed_mps": one.speed_mps,
+        "azimuth_rad": one.axle_rad,
+        "range_m": one.axle_m,
+    }
+    return [
+        {name: round(float(values[i]), 3) for name, values in columns.items()}
+        | {"time_to_visible_s": left}
+        | {"position_m": [round(float(one.x_m[i]), 3), round(float(one.y_m[i]), 3)]}
+        | {"line_of_sight": bool(one.in_view[i])}
+        for i, left in enumerate(one.time_to_visible_s())
+    ]
+
+
+def rows_csv(vehicles: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> str:
+    """Return `vehicles.csv`: one row a vehicle and tenth of a second; no time to visible is an empty cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for one in vehicles:
+        places = np.column_stack([one.x_m, one.y_m, one.speed_mps]).round(2).tolist()
+        loudness, seen = loudness_db[one.number].round(1).tolist(), one.in_view.astype(int).tolist()
+        left = ["" if value is None else value for value in one.time_to_visible_s()]
+        for row in zip(one.time_s.tolist(), places, seen, left, loudness, strict=True):
+            writer.writerow([row[0], one.number, *row[1], *row[2:]])
+    return text.getvalue()

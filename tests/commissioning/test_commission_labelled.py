@@ -1,0 +1,30 @@
+"""Labelled windows that a commissioned model learns are of its array, and the model says so."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.commissioning.commission import windows_of_array
+from worldstate.commissioning.plan import CommissionSettings
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import OutOfDomainError
+
+ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.1, -0.3, 0.0]], "three")
+HERE = domain_of(ARRAY, [6000.0], ["SA101"])
+
+
+def test_a_table_that_names_no_array_is_of_this_one_and_one_of_another_is_refused() -> None:
+    names = np.array(["SA1", "SB1", "SB2"])
+    table = FeatureTable(
+        np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3
+    )
+    kept = windows_of_array(table, CommissionSettings(leave_out=("SB1",)), HERE)
+    assert kept.environments.tolist() == ["SA1", "SB2"]
+    # Without it a commissioned model would state no budget and no times.
+    assert kept.domain is HERE
+    elsewhere = domain_of(MicrophoneArray(ARRAY.positions_m * [1.0, 1.1, 1.0]), [6000.0], ["SA1"])
+    with pytest.raises(OutOfDomainError, match="not the array"):
+        windows_of_array(replace(table, domain=elsewhere), CommissionSettings(), HERE)

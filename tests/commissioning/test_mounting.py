@@ -1,0 +1,69 @@
+"""What a wrong mounting does: places believed that are not true, bearings beside what is in view."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from worldstate.commissioning.bearing_exam import in_view_bearings
+from worldstate.commissioning.heard_stream import HeardStream, hear_stream
+from worldstate.commissioning.mounting import mountings
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.operations.recordings.hop_table import HopTable
+from worldstate.simulation import site
+from worldstate.simulation.stream.settings import StreamSettings
+
+ARRAY = MicrophoneArray([[0.1, 0.2, 0.0], [0.0, 0.05, 0.1], [0.0, -0.1, 0.0], [-0.1, -0.25, 0.2]])
+
+
+@given(st.floats(-np.pi, np.pi))
+def test_a_plane_wave_is_heard_two_degrees_aside_by_who_believes_a_turned_array(azimuth_rad: float) -> None:
+    _, turned, _ = mountings(ARRAY, np.random.default_rng(1)).values()
+    np.testing.assert_allclose(
+        turned.delays_s(azimuth_rad + np.radians(2.0)), ARRAY.delays_s(azimuth_rad), atol=1e-12
+    )
+
+
+def test_positions_are_off_by_five_millimetres_in_every_direction() -> None:
+    many = MicrophoneArray(np.random.default_rng(1).uniform(-1.0, 1.0, (600, 3)))
+    *_, off = mountings(many, np.random.default_rng(2)).values()
+    np.testing.assert_allclose((off.positions_m - many.positions_m).std(axis=0), 5e-3, rtol=0.12)
+
+
+def test_one_rendering_is_heard_by_every_array_as_it_would_be_alone() -> None:
+    settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
+    right, turned, _ = hear_stream(settings, ARRAY, list(mountings(ARRAY, np.random.default_rng(1)).values()))
+    (alone,) = hear_stream(settings, ARRAY)
+    for name, column in alone.hops.columns.items():
+        np.testing.assert_array_equal(right.hops.columns[name], column, err_msg=name)
+    assert not np.array_equal(turned.hops.feature, right.hops.feature)
+
+
+def passing(bearing_deg: float) -> HeardStream:
+    """Return a stream with one vehicle at 45 degrees, 7 m, for a second, and a fainter one at -90 degrees."""
+    time_s = np.round(np.arange(1.0, 3.0, 0.1), 1)
+    places = ((1, 5.0, 5.0, 70.0), (2, 0.0, -9.0, 60.0))
+    rows = [(number, t, x, y, t < 2.0, level) for number, x, y, level in places for t in time_s]
+    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
+    hops = HopTable({"time_s": time_s, "bearing_rad": np.full(len(time_s), np.radians(bearing_deg))})
+    return HeardStream(hops, HopTable({}), HopTable.of_rows(names, rows))
+
+
+def test_bearings_are_held_against_the_loudest_vehicle_in_view() -> None:
+    assert in_view_bearings([passing(48.0)])["bearing_error_deg"] == pytest.approx(3.0)
+    two_to_one = [passing(48.0), passing(38.0), passing(38.0)]
+    assert in_view_bearings(two_to_one)["bearing_error_deg"] == pytest.approx(7.0)
+    unseen = passing(48.0)
+    nobody = dataclasses.replace(unseen, rows=unseen.rows.replace(in_view=np.zeros(len(unseen.rows), bool)))
+    assert in_view_bearings([nobody]) == dict.fromkeys(in_view_bearings([unseen]))
+
+
+def test_an_offset_of_the_clocks_is_worth_what_a_vehicle_turns_meanwhile() -> None:
+    turning = passing(0.0)
+    azimuth = np.radians(30.0) * turning.rows.time_s
+    rows = turning.rows.replace(x_m=7.0 * np.cos(azimuth), y_m=7.0 * np.sin(azimuth))
+    found = in_view_bearings([dataclasses.replace(turning, rows=rows)])
+    assert found["offset_50ms_deg"] == pytest.approx(1.5)
+    assert found["offset_50ms_95_deg"] == pytest.approx(1.5)

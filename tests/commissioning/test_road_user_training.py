@@ -1,0 +1,60 @@
+"""Training on rows whose clusters are known, and on one junction of the simulator."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worldstate_lab.streets.road_user_exam import road_user_exam
+
+from worldstate.commissioning.road_user_training import (
+    CLASS_OF,
+    CLASSES,
+    RoadUserRows,
+    class_shares,
+    fit_road_users,
+    road_user_rows,
+)
+from worldstate.frontend.array.ovad_array import ovad_array
+from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
+
+N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 12, ("one", "two", "three")
+
+
+def made_up_rows(seed: int, apart: float = 4.0) -> RoadUserRows:
+    """Draw clusters: each kind on an axis of its own, the inaudible at the origin."""
+    rng = np.random.default_rng(seed)
+    kinds = np.array([kind for kind in CLASS_OF for _ in range(EACH)] * len(SITES))
+    audible = rng.random(len(kinds)) < 0.8
+    centres = apart * np.stack([np.eye(N_INPUTS)[list(CLASS_OF).index(kind)] for kind in kinds.tolist()])
+    measures = rng.standard_normal((len(kinds), N_INPUTS)) + centres * audible[:, None]
+    sites = np.repeat(SITES, len(kinds) // len(SITES))
+    return RoadUserRows(measures, kinds, audible, rng.random(len(kinds)) < 0.9, sites)
+
+
+def test_classes_that_differ_are_told_and_such_that_do_not_are_the_towns_shares() -> None:
+    rows, fresh = made_up_rows(1), made_up_rows(2)
+    found = road_user_exam(rows)
+    assert found.log_loss < 0.7 * found.prior_log_loss
+    assert found.recall_of_equals[:-1].min() > 0.5
+    np.testing.assert_allclose(found.confusion.sum(axis=1), 1.0, atol=1e-9)
+    # Classes are said as often as they come in a town, though kinds are drawn equally often.
+    said = fit_road_users(rows).probabilities(fresh.measures)
+    expected = np.average(said, axis=0, weights=fresh.weights)
+    np.testing.assert_allclose(expected, class_shares(fresh), atol=0.1)
+    # Nothing is to be learned of labels dealt by chance.
+    dealt = replace(rows, kinds=np.random.default_rng(3).permutation(rows.kinds))
+    nothing = road_user_exam(replace(dealt, measures=made_up_rows(4, apart=0.0).measures))
+    assert nothing.log_loss > 0.8 * nothing.prior_log_loss
+
+
+@pytest.mark.slow
+def test_vehicles_of_the_simulator_are_heard_before_they_are_seen_and_bicycles_hardly() -> None:
+    rows = road_user_rows(ovad_array(), ["SB1"], 6000.0, np.random.default_rng(1))
+    names = np.array(CLASSES)[rows.classes]
+    audible = {
+        kind: float((names[(rows.kinds == kind) & rows.counts] != "unknown").mean()) for kind in CLASS_OF
+    }
+    assert audible["heavy"] > 0.95
+    assert audible["light"] > 0.8
+    assert audible["bicycle"] < 0.5
+    assert rows.weights.sum() == pytest.approx(1.0)

@@ -1,0 +1,1 @@
+"""Commands about an array and its microphones."""

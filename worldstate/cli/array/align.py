@@ -1,0 +1,84 @@
+"""`worldstate array align`: offset and yaw of a camera against the array, from vehicles in view.
+
+Compare the bearings of the sound with the boxes of vehicles that turn through the view of a standing camera,
+and say what has to be added to the stamps of its images and to its yaw. Vehicles from both sides tell the two
+apart.
+
+Each interval is a bootstrap over the vehicles, and does not hold what all vehicles share: where a vehicle is
+heard, taken as a third of its length behind the front (a tenth more or less is 0.1 s of offset), and 10 m for
+the way of the sound (3 ms a metre).
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, add_search_options, search_of
+from worldstate.cli.common.camera_options import add_camera_options, boxes_of, given_detections
+from worldstate.cli.common.car_options import add_car_options, given_sensors
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+
+if TYPE_CHECKING:
+    from worldstate.adapters.listen import Source
+
+EXAMPLE = """\
+examples:
+  worldstate array align drives/* --car car.json --camera-name front --out aligned.json
+  worldstate array align ovad_dataset --json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    inputs = "data sets, recording folders, or a sound file with --detections"
+    add("input", type=Path, nargs="+", metavar="RECORDING", help=inputs)
+    add_array_options(parser)
+    add_car_options(parser)
+    add_search_options(parser)
+    add_camera_options(parser)
+    add("--out", type=Path, metavar="FILE", help="the file of --car, with both added, beside it")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from dataclasses import asdict
+
+    from worldstate.adapters.vehicle.car_file import write_aligned
+    from worldstate.cli.common.progress import track
+    from worldstate.ground.errors import InvalidArgumentError
+    from worldstate.operations.alignment.camera_alignment import LARGEST_OFFSET_S, align
+    from worldstate.operations.alignment.heard_passes import heard_passes
+    from worldstate.operations.calibration.calibration_input import find_inputs
+
+    check_outputs(arguments, "out")
+    if arguments.out is not None and arguments.car is None:
+        raise InvalidArgumentError("--out: expected --car with it, whose camera is aligned")
+    inputs = [found for path in arguments.input for found in find_inputs(path)]
+    if arguments.detections is not None and len(inputs) > 1:
+        raise InvalidArgumentError("--detections: expected one recording with it, folders bring their own")
+    passes = [
+        one
+        for path in track(inputs, "listening", len(inputs))
+        for one in heard_passes(_source(arguments, path), LARGEST_OFFSET_S)
+    ]
+    found = align(passes)
+    if arguments.out is not None:
+        write_aligned(arguments.car, arguments.out, arguments.camera_name, found.offset_s, found.yaw_deg)
+    return CommandResult({"recordings": len(inputs)} | asdict(found))
+
+
+def _source(arguments: argparse.Namespace, path: Path) -> "Source":
+    from dataclasses import replace
+
+    from worldstate.adapters.listen import open_source
+
+    # Only its sound, boxes and camera are used: no model has to fit the array.
+    array, camera = given_sensors(arguments)
+    return open_source(
+        path,
+        array=array,
+        camera=camera,
+        detections=given_detections(arguments, camera),
+        settings=replace(search_of(arguments), boxes=boxes_of(arguments), uncalibrated=True, mask_dead=True),
+    )

@@ -1,0 +1,67 @@
+"""`worldstate array bearings`: the direction of the loudest source at every hop, without a model.
+
+Write the bearing of the loudest source every tenth of a second, for any array, without a model.
+
+--out is CSV with the columns time_s (middle of the sound that the bearing was read from), azimuth_deg (left
+positive), std_deg (standard deviation as the front-end states it) and prominence (peak over median of the
+spatial spectrum; 1 in silence). --sources adds the number of plane waves in each second by an information
+criterion: reflections count, so it is no number of vehicles.
+"""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.common.array_options import (
+    add_array_options,
+    add_search_options,
+    search_of,
+    sound_and_array,
+    stance,
+)
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.sound_options import add_sound_options
+
+EXAMPLE = """\
+examples:
+  worldstate array bearings some.wav --array mics.csv --out bearings.csv --figure bearings.png
+  worldstate array bearings mic1.wav mic2.wav --array pair.json --azimuth-span 360 --out bearings.csv"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_sound_options(parser)
+    add_array_options(parser)
+    add_search_options(parser)
+    parser.add_argument("--sources", action="store_true", help="count the sources of every second")
+    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
+    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.audio.open_sound import open_sound, path_of
+    from worldstate.adapters.files.atomic import write_text
+    from worldstate.cli.common.progress import sound_bar
+    from worldstate.frontend.stream import FrontEnd
+    from worldstate.operations.recordings.bearing_track import track_bearings, write_bearings_figure
+
+    check_outputs(arguments, "out", figures=("figure",))
+    sound, array = sound_and_array(arguments)
+    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
+        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        front_end = FrontEnd(array, audio.sample_rate_hz, settings)
+        with sound_bar(audio) as bar:
+            track = track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
+        silent = list(audio.silent_channels)
+    write_text(arguments.out, track.csv())
+    if arguments.figure is not None:
+        write_bearings_figure(track, arguments.figure, path_of(sound).name)
+    summary = {
+        "out": str(arguments.out),
+        "array": stance(array),
+        "band_hz": list(settings.srp_band_hz),
+        "hops": len(track.time_s),
+        "silent_channels": silent,
+    }
+    return CommandResult(summary)

@@ -1,0 +1,86 @@
+"""`worldstate array check`: which microphones of a recording misbehave, and what to do about it.
+
+Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
+or clipped ones, offsets, levels, gusts, cards that are late or have a clock of their own, missing or repeated
+samples, the sample rate. Channels are counted from 1.
+
+Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
+and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
+ten for small ones; levels and gusts take six seconds, drifts twenty.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import (
+    add_array_options,
+    add_search_options,
+    search_of,
+    sound_and_array,
+)
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.sound_options import add_sound_options
+
+if TYPE_CHECKING:
+    from worldstate.adapters.audio.sound_file import Audio
+    from worldstate.frontend.stream import FrontEnd
+    from worldstate.operations.recordings.channel_report import RecordingHealth
+
+EXAMPLE = """\
+examples:
+  worldstate array check some.wav --array mics.xml
+  worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_sound_options(parser)
+    add_array_options(parser)
+    add_search_options(parser)
+    add = parser.add_argument
+    add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
+    add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
+    add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from dataclasses import replace
+
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.frontend.health.sample_clock import rate_from_duration
+    from worldstate.frontend.stream import FrontEnd
+    from worldstate.operations.arrays.array_figure import write_array_figure
+
+    from .check_report import as_json, as_text
+
+    check_outputs(arguments, figures=("figure",))
+    sound, array = sound_and_array(arguments)
+    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
+        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        health = examine(audio, FrontEnd(array, audio.sample_rate_hz, settings))
+        if arguments.duration is not None:
+            rate = rate_from_duration(
+                audio.frames, arguments.duration, arguments.duration_error, float(audio.sample_rate_hz)
+            )
+            health = replace(health, sample_rate=rate)
+        report, lines = as_json(health, audio, array), list(as_text(health, audio, array))
+    if arguments.figure is not None:
+        write_array_figure(array, health, arguments.figure)
+    return CommandResult(report, table={}, lines=lines, code=0 if health.is_healthy else 1)
+
+
+def examine(audio: "Audio", front_end: "FrontEnd") -> "RecordingHealth":
+    """Listen to an open recording to its end."""
+    from worldstate.cli.common.progress import sound_bar
+    from worldstate.operations.recordings.channel_report import HealthLog
+
+    log = HealthLog()
+    with sound_bar(audio) as bar:
+        for block in audio.blocks(audio.sample_rate_hz):
+            for frame in front_end.process(block):
+                log.add(frame)
+            bar.advance()
+    return log.summary()

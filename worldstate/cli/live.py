@@ -1,0 +1,254 @@
+"""`worldstate live`: microphones that run in, one snapshot a hop out.
+
+Listen to the microphones of this machine, or to a recording played as if they heard it, and keep the
+world-state.
+
+States are kept where asked for. The sound is not, unless --keep-sound says so: microphones in public hear
+people. What the machine was too slow for is counted as an overrun, said when it happens, and heard as
+silence. Ctrl-C ends the run, and what it wrote is complete.
+
+--detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
+  {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
+with "age_s" from the capture of the image to the sending; an image without boxes is sent, too.
+
+--odometry HOST:PORT takes how the car moves in the same way, as often as it is known:
+  {"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}
+with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. The model of a moving ego is taken
+where --model or --context says so.
+
+--save-state keeps belief and site at the end, --resume goes on from them: from the time at which they end, or
+by --start from a later one.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, add_search_options, stance
+from worldstate.cli.common.camera_options import LENS_HELP, add_lens_options, boxes_of
+from worldstate.cli.common.car_options import add_car_options, given_sensors
+from worldstate.cli.common.detector_options import add_detector_options, detector_filter, detector_maker
+from worldstate.cli.common.listen_options import (
+    add_listen_options,
+    add_memory_options,
+    given_context,
+    given_sides,
+    listen_settings,
+)
+from worldstate.cli.common.log_options import LOG_FILES, add_log_options, log_hops
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.stopping import stopped_by_signals
+
+if TYPE_CHECKING:
+    from worldstate.adapters.listen import Source
+    from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
+
+    Losses = Callable[[], dict[str, object]]
+
+EXAMPLE = """\
+examples:
+  worldstate live --array mics.csv --device 2 --model mine.json --out states.jsonl
+  worldstate live --array mics.csv --model mine.json --camera-device 0 --camera camera.json
+  worldstate live --array mics.csv --model mine.json --detections 127.0.0.1:9100
+  worldstate live --play ovad_dataset/SA1/left/1_00_0002
+  worldstate live --play some.wav --array mics.csv --uncalibrated --speed 4"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_array_options(parser)
+    parser.description = f"{parser.description}\n\n{LENS_HELP}"
+    add_car_options(parser)
+    _add_sound_options(parser)
+    add_search_options(parser)
+    add_listen_options(parser)
+    add_memory_options(parser, "the end of STATE")
+    told = "listen there to how the car moves"
+    parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
+    _add_camera_options(parser)
+    add = parser.add_argument_group("output").add_argument
+    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
+    view = "show bearing, risk and entities (default: where standard error is a terminal)"
+    add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
+    add_log_options(parser)
+
+
+def _add_sound_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("sound").add_argument
+    add("--device", metavar="NAME", help="number or name of the input device (default: the system's)")
+    add("--rate", type=int, default=48_000, metavar="HZ", help="samples a second (default: %(default)s)")
+    add("--play", type=Path, metavar="RECORDING", help="a sound file or recording folder instead")
+    add("--speed", type=float, default=1.0, metavar="X", help="play so many times as fast (default: 1)")
+    ends = "end after so many seconds of sound; a shorter recording is played again"
+    add("--duration", type=float, metavar="S", help=ends)
+
+
+def _add_camera_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("camera")
+    which = group.add_mutually_exclusive_group()
+    which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
+    which.add_argument("--detections", metavar="HOST:PORT", help="listen there to a detector of your own")
+    add_lens_options(group)
+    add_detector_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.live.live_sound import LiveSound
+    from worldstate.adapters.live.sound_keeping import kept_sound
+
+    check_outputs(arguments, "out", "keep_sound", "save_state", *LOG_FILES)
+    with ExitStack() as opened:
+        recorded = None if arguments.play is None else _source(arguments, arguments.play)
+        feed = _microphones(arguments) if recorded is None else _played(arguments, recorded)
+        keep = opened.enter_context(kept_sound(arguments.keep_sound, feed.sample_rate_hz, feed.channels))
+        sound = LiveSound(feed, keep)
+        source = _source(arguments, sound) if recorded is None else replace(recorded, sound=sound)
+        sound.start_ns = source.start_ns
+        source, camera_losses = _with_camera(arguments, source, sound, opened)
+        source, odometry_losses = _with_odometry(arguments, source, sound, opened)
+        figures = _listen(arguments, source, sound) | camera_losses() | odometry_losses()
+        return CommandResult(figures | {"array": stance(source.array)})
+
+
+def _source(arguments: argparse.Namespace, sound: "LiveSound | Path") -> "Source":
+    from worldstate.adapters.files.checkpoint_file import read_checkpoint
+    from worldstate.adapters.listen import open_source
+    from worldstate.ground.values import seconds
+
+    array, camera = given_sensors(arguments)
+    before = None if arguments.resume is None else read_checkpoint(arguments.resume)
+    ended_s = 0.0 if before is None else seconds(before.world.stamp_ns)
+    moving = arguments.camera_device is not None
+    boxes = detector_filter(arguments) if moving else boxes_of(arguments)
+    return open_source(
+        sound,
+        array=array,
+        camera=camera,
+        miss_rates=arguments.miss_rates,
+        model=arguments.model,
+        context=given_context(arguments),
+        sides=given_sides(arguments),
+        resume=before,
+        start_s=ended_s if arguments.start is None else arguments.start,
+        # A channel that is silent is told by the front-end, which leaves it out.
+        settings=replace(listen_settings(arguments), mask_dead=True, boxes=boxes),
+    )
+
+
+def _microphones(arguments: argparse.Namespace) -> "SoundFeed":
+    from worldstate.adapters.live.microphones import PortAudioInput
+    from worldstate.ground.checks import in_range
+    from worldstate.ground.errors import InvalidArgumentError
+
+    array, _ = given_sensors(arguments)
+    if array is None:
+        problem = "expected the positions of the microphones, or --car, or --play RECORDING"
+        raise InvalidArgumentError(f"--array: {problem}")
+    device = arguments.device
+    number = int(device) if device is not None and device.isdecimal() else device
+    rate_hz = int(in_range("--rate", arguments.rate, 1000, 1_000_000))
+    return PortAudioInput(array.n_microphones, rate_hz, number)
+
+
+def _played(arguments: argparse.Namespace, recorded: "Source") -> "SoundFeed":
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.adapters.live.playback import Playback
+
+    audio = open_sound(recorded.sound, recorded.array.n_microphones, strict=False)
+    return Playback(audio, arguments.speed, arguments.duration)
+
+
+def _with_camera(
+    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
+    """Return the source with the camera that was asked for, and what tells what was lost of its looks."""
+    if arguments.detections is not None:
+        return _with_detections(arguments.detections, source, sound, opened)
+    if arguments.camera_device is not None:
+        return _with_device(arguments, source, sound, opened)
+    return source, dict
+
+
+def _with_detections(
+    address: str, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
+    from worldstate.adapters.live.detection_socket import DetectionSocket
+    from worldstate.adapters.live.live_camera import LiveCamera
+
+    looks = opened.enter_context(DetectionSocket(address, sound.stamp_ns))
+    return replace(source, co_evidence=LiveCamera(source, looks)), lambda: {
+        "detections_dropped": looks.dropped,
+        "detections_refused": looks.refused,
+        "last_refusal": looks.problem or None,
+    }
+
+
+def _with_device(
+    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
+    from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
+    from worldstate.adapters.live.live_camera import LiveCamera
+
+    images, detector = image_channel(), detector_maker(arguments)()
+    size = source.camera.width_px, source.camera.height_px
+    looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
+    opened.enter_context(CameraFeed(arguments.camera_device, images))
+    camera = LiveCamera(source, looks, looks.degradation)
+    return replace(source, co_evidence=camera), lambda: {"images_dropped": images.dropped}
+
+
+def _with_odometry(
+    arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
+) -> "tuple[Source, Losses]":
+    """Return the source with the odometry that was asked for, and what tells what was lost of it."""
+    from worldstate.adapters.live.odometry_socket import OdometrySocket
+
+    if arguments.odometry is None:
+        return source, dict
+    told = opened.enter_context(OdometrySocket(arguments.odometry, sound.stamp_ns))
+    return replace(source, told=told.until), lambda: {
+        "odometry_dropped": told.dropped,
+        "odometry_refused": told.refused,
+        "last_odometry_refusal": told.problem or None,
+    }
+
+
+def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound") -> dict[str, object]:
+    """Listen until the sound ends; return what came of it and what it cost."""
+    from worldstate.adapters.files.checkpoint_file import save_checkpoint
+    from worldstate.adapters.files.states_file import states_writer
+    from worldstate.adapters.live.live_listening import live_steps
+    from worldstate.cli.common.live_view import live_view, loss_notices
+    from worldstate.ground.values import seconds
+    from worldstate.operations.recordings.live_report import LiveReport
+
+    shown = sys.stderr.isatty() if arguments.view is None else arguments.view
+    report, notice = LiveReport(source), loss_notices()
+    start_s, last = seconds(source.start_ns), None
+    with (
+        states_writer(arguments.out) as write,
+        log_hops(arguments, source, paced=False) as log,
+        live_view(shown) as show,
+        stopped_by_signals(sound.close),
+    ):
+        for live in live_steps(source):
+            write(live.step.state.to_json())
+            log(live.step)
+            for watcher in (report.add, show, notice):
+                watcher(live)
+            last = live.step
+            if (
+                arguments.duration is not None
+                and seconds(last.state.stamp_ns) - start_s >= arguments.duration
+            ):
+                break
+    if arguments.save_state is not None and last is not None:
+        save_checkpoint(arguments.save_state, last.checkpoint)
+    return report.to_dict(sound)

@@ -1,0 +1,89 @@
+"""`worldstate log plot`: figures of a run from its snapshots.
+
+Draw what the filter believed: over time (--out), from above at one time (--birds-eye with --time), and from
+above as an animation (--animate). With --recording the power of its sound lies below the azimuths, so that
+belief and sound are seen together.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import (
+    add_array_options,
+    add_search_options,
+    search_of,
+    sound_and_array,
+)
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+
+if TYPE_CHECKING:
+    from worldstate.operations.viewing.state_figure import SoundPower
+
+EXAMPLE = """\
+examples:
+  worldstate log plot states.jsonl --out states.png
+  worldstate log plot out.mcap --out states.png --recording some.wav --array mics.csv
+  worldstate log plot states.jsonl --birds-eye above.png --time 5.2
+  worldstate log plot states.jsonl --animate above.gif"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("log", type=Path, metavar="LOG", help="what `worldstate run --out` or --mcap wrote")
+    add("--out", type=Path, metavar="PNG", help="draw the run over time")
+    add("--recording", type=Path, action="append", dest="input", metavar="WAV", help="below --out its sound")
+    add("--birds-eye", type=Path, metavar="PNG", help="draw the snapshot nearest to --time from above")
+    add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the largest risk)")
+    add("--animate", type=Path, metavar="GIF", help="draw every snapshot from above")
+    # Standard input is refused where raw samples are asked for: without a rate there are none.
+    parser.set_defaults(rate=None, channels=None)
+    add_array_options(parser)
+    add_search_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.state_log import read_log
+    from worldstate.cli.common.progress import progress_bar
+    from worldstate.ground.errors import InvalidArgumentError
+    from worldstate.ground.values import nanoseconds, seconds
+    from worldstate.operations.viewing.birds_eye import check_gif, write_animation, write_birds_eye
+    from worldstate.operations.viewing.state_figure import write_state_figure
+
+    asked = arguments.out, arguments.birds_eye, arguments.animate
+    if not any(asked):
+        raise InvalidArgumentError("plot: expected one of --out, --birds-eye and --animate")
+    check_outputs(arguments, "animate", figures=("out", "birds_eye"))
+    if arguments.animate is not None:
+        check_gif(arguments.animate)
+    states, title = [state for _, state in read_log(arguments.log)], arguments.log.name
+    shown = max(states, key=lambda state: state.risk)
+    if arguments.time is not None:
+        shown = min(states, key=lambda state: abs(state.stamp_ns - nanoseconds(arguments.time)))
+    if arguments.out is not None:
+        sound = _sound(arguments) if arguments.input else None
+        write_state_figure(states, arguments.out, title=title, sound=sound)
+    if arguments.birds_eye is not None:
+        write_birds_eye(shown, arguments.birds_eye, title=title)
+    if arguments.animate is not None:
+        with progress_bar("drawing", len(states)) as bar:
+            write_animation(states, arguments.animate, title=title, on_frame=bar.advance)
+    written = [str(path) for path in asked if path is not None]
+    return CommandResult({"states": len(states), "birds_eye_s": seconds(shown.stamp_ns), "written": written})
+
+
+def _sound(arguments: argparse.Namespace) -> "SoundPower":
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.cli.common.progress import progress_bar
+    from worldstate.frontend.stream import FrontEnd
+    from worldstate.operations.viewing.state_figure import sound_power
+
+    sound, array = sound_and_array(arguments)
+    with open_sound(sound, expect_channels=array.n_microphones, strict=False) as audio:
+        settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
+        front_end = FrontEnd(array, audio.sample_rate_hz, settings)
+        with progress_bar("listening", audio.duration_s) as bar:
+            return sound_power(audio, front_end, on_second=bar.advance)

@@ -1,0 +1,60 @@
+"""`worldstate log replay`: the snapshots of a log again, as they were written.
+
+Read the snapshots of an MCAP file, of a bag of ROS 2 or of JSON lines, and write or serve them anew. --out of
+an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --out of that run.
+"""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.common.log_options import LOG_FILES, add_log_options, open_logs
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+
+EXAMPLE = """\
+examples:
+  worldstate log replay out.mcap --out states.jsonl
+  worldstate log replay states.jsonl --mcap out.mcap
+  worldstate log replay states.jsonl --live
+  worldstate log replay states.jsonl --osi out.osi --autoware objects.jsonl
+  worldstate log replay states.jsonl --odas 127.0.0.1:9000"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("log", type=Path, metavar="LOG", help="what `worldstate run --mcap`, --ros-bag or --out wrote")
+    add("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
+    add_log_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.files.states_file import states_writer
+    from worldstate.adapters.state_log import read_log
+    from worldstate.cli.common.progress import progress_bar
+    from worldstate.ground.values import seconds
+    from worldstate.operations.recordings.warning import WarningMeter
+
+    check_outputs(arguments, "out", *LOG_FILES)
+    meter, stamps_ns, peak_risk = WarningMeter(t0_s=None), [], 0.0
+    with (
+        states_writer(arguments.out) as write,
+        open_logs(arguments) as logs,
+        progress_bar(f"reading {arguments.log.name}", None) as bar,
+    ):
+        for line, state in read_log(arguments.log):
+            write(line)
+            logs.state(state)
+            meter.update(state)
+            stamps_ns.append(state.stamp_ns)
+            peak_risk = max(peak_risk, state.risk)
+            bar.advance()
+    summary = {
+        "states": len(stamps_ns),
+        "first_s": seconds(stamps_ns[0]),
+        "last_s": seconds(stamps_ns[-1]),
+        "peak_risk": peak_risk,
+        "advisory_onsets_s": list(meter.summary().advisory_onsets_s),
+    }
+    return CommandResult(summary)

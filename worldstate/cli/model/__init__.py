@@ -1,0 +1,1 @@
+"""Commands that make, fit, examine and show a model."""

@@ -1,0 +1,122 @@
+"""`worldstate model detector`: the miss rate of a camera's detector on staged-degraded frames.
+
+Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
+blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
+detector has to find the reference boxes again (IoU >= 0.3). False detections are counted apart, as clutter.
+
+INPUT is a video, or a data set or recording folder in the OVAD layout with ueye_stereo_vid.mp4 beside the
+sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON or a folder of
+YOLO text. Without any, what the detector itself reports on clean frames is the reference, and its miss rate
+on those is zero by definition.
+
+The file also holds the scale by which d is read from this camera's own images.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.detector_options import add_detector_options, detector_maker, detector_name
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.adapters.camera.miss_rates import MissRates
+    from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
+
+EXAMPLE = """\
+examples:
+  worldstate model detector sim --detector motion --out beta.json --figure beta.png
+  worldstate model detector street.mp4 --reference boxes.json --detector onnx --onnx-model m.onnx \\
+      --labels person bicycle car --out beta.json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
+    add("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
+    add_detector_options(parser)
+    add("--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)")
+    add("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
+    add("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
+    add("--out", type=Path, required=True, metavar="JSON", help="exactly this file")
+    add("--figure", type=Path, metavar="PNG", help="draw beta over d")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    import numpy as np
+
+    from worldstate.adapters.camera.miss_rates import save_miss_rates
+    from worldstate.operations.detectors.labelled_videos import find_videos
+    from worldstate.operations.detectors.miss_rate_figure import write_absence_figure
+    from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, measure_absence
+
+    check_outputs(arguments, "out", figures=("figure",))
+    make, settings = detector_maker(arguments), AbsenceSettings()
+    scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
+    with progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
+        rates = measure_absence(
+            scenes,
+            make,
+            np.random.default_rng(arguments.seed),
+            settings,
+            provenance=_provenance(arguments, len(scenes)),
+            on_frame=bar.advance,
+        )
+    save_miss_rates(arguments.out, rates)
+    if arguments.figure is not None:
+        write_absence_figure(rates, arguments.figure)
+    return CommandResult(_summary(arguments, rates))
+
+
+def _scene(
+    arguments: argparse.Namespace, make: "MakeDetector", path: Path, reference: Path | None
+) -> "LabelledVideo":
+    from dataclasses import replace
+    from math import radians
+
+    from worldstate.adapters.camera.detection_formats import read_any_detections
+    from worldstate.adapters.camera.pinhole import PinholeCamera
+    from worldstate.adapters.camera.video import open_video
+    from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by
+
+    video = open_video(path)
+    camera = PinholeCamera(width_px=video.width_px, height_px=video.height_px)
+    if arguments.half_angle is not None:
+        camera = replace(camera, half_angle_rad=radians(arguments.half_angle))
+    boxes = arguments.reference or reference
+    if boxes is None:
+        return LabelledVideo(video, reference_by(make(), video), camera)
+    size = (video.width_px, video.height_px)
+    return LabelledVideo(video, read_any_detections(boxes, video.frame_rate_hz, size), camera)
+
+
+def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
+    from worldstate.ground.version import __version__
+
+    return {
+        "data": arguments.input.name,
+        "videos": str(videos),
+        "detector": detector_name(arguments),
+        "seed": str(arguments.seed),
+        "worldstate": __version__,
+    }
+
+
+def _summary(arguments: argparse.Namespace, rates: "MissRates") -> dict[str, object]:
+    table = rates.table
+    summary: dict[str, object] = {
+        "out": str(arguments.out),
+        **rates.provenance,
+        "looks": sum(sum(row[:1]) for row in next(iter(rates.families.values())).looks),
+        "beta_clean_boresight": table(0.0, 0.0),
+        "beta_harshest_boresight": table(0.0, 1.0),
+        "clutter_clean": rates.clutter_rate(0.0),
+    }
+    for name, family in rates.tables.items():
+        summary[f"beta_{name}_boresight"] = list(family.beta[0])
+        summary[f"beta_{name}_edge"] = list(family.beta[-1])
+    return summary

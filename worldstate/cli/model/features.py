@@ -1,0 +1,86 @@
+"""`worldstate model features`: labelled recordings in, a table of feature windows out.
+
+Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
+array of one's own. The list of labels is CSV with the columns ID, Class (front, left, none, right),
+Environment (S.. standing ego, D.. moving ego, then the junction) and Recording ID; optional are File,
+relative to DATASET, End, the end of the window in seconds from the start of the file (default: its last
+second), and T0. Where no File is given, DATASET/Environment/Class/ID/out_multi.wav and DATASET/ID.wav are
+looked for.
+
+Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
+none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, given_array, stance
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import track
+
+if TYPE_CHECKING:
+    from worldstate.adapters.datasets.feature_extraction import LabelledWindow
+
+EXAMPLE = """\
+examples:
+  worldstate sim make --out sim --static 40 && worldstate model features sim --out features.csv
+  worldstate model features recordings --labels labels.csv --array mics.xml --out features.csv
+  worldstate model fit features.csv --method worldstate --out model.json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
+    parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
+    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
+    ego_noise = "take the own vehicle's noise out, learned from each file's beginning (default: off)"
+    parser.add_argument("--ego-noise", action="store_true", help=ego_noise)
+    add_array_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    import numpy as np
+
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table
+    from worldstate.adapters.datasets.feature_table import write_features
+    from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, FEATURE_VERSION
+
+    check_outputs(arguments, "out")
+    array = choose_array(arguments.dataset, given_array(arguments))
+    windows, left_out = _windows(arguments)
+    cleaned = arguments.ego_noise
+    extracted = extract_features(windows, array, ego_noise=cleaned)
+    features = list(track(extracted, "extracting", len(windows)))
+    version = CLEANED_FEATURE_VERSION if cleaned else FEATURE_VERSION
+    table = feature_table(windows, features, array, version)
+    write_features(arguments.out, table)
+    summary = {
+        "out": str(arguments.out),
+        "array": stance(array),
+        "feature": version,
+        "n_windows": len(table),
+        "n_left_out": left_out,
+        "n_recordings": len(np.unique(table.recording_keys)),
+        "n_hazard": int(table.hazards.sum()),
+        "n_hazard_free": int(table.hazard_free.sum()),
+    }
+    return CommandResult(summary)
+
+
+def _windows(arguments: argparse.Namespace) -> "tuple[list[LabelledWindow], int]":
+    from worldstate.adapters.datasets.feature_extraction import read_labels
+    from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+    from worldstate.adapters.datasets.sample_windows import sample_windows
+    from worldstate.ground.errors import InputFileError
+
+    if arguments.labels is not None:
+        return read_labels(arguments.labels, arguments.dataset), 0
+    windows, left_out = sample_windows(arguments.dataset)
+    if not windows:
+        problem = f"expected a recording with a second of sound before T0, found none; {left_out} are cut off"
+        raise InputFileError(arguments.dataset / LOG_NAME, problem)
+    return windows, left_out

@@ -1,0 +1,120 @@
+"""`worldstate model fit`: a table of feature windows in, a model file out.
+
+Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
+scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data, and
+what the windows were made with: array, sample rate, band, ego's motion. A table that does not say, as the
+released one, counts as OVAD's unless --array and --sample-rate say otherwise.
+
+  --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
+  --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
+                       thresholds half-way between recordings left out and junctions left out;
+                       with --simulated it learns simulated windows too, with --streams the classes both and
+                       direct as well: for a standing ego
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.feature_options import add_table_options, read_beside
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar, track
+
+if TYPE_CHECKING:
+    from worldstate.adapters.datasets.feature_table import FeatureTable
+
+EXAMPLE = """\
+examples:
+  worldstate model fit features.csv --group static --exclude testset.csv --out model.json
+  worldstate model fit features.csv --labels recordings/labels.csv --out model.json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add_table_options(parser)
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    labels = (
+        "windows of recordings of one's own, learned as those of the table: what `label --windows` writes"
+    )
+    add("--labels", type=Path, nargs="+", default=[], metavar="CSV", help=labels)
+    ids = "CSV files with a column ID: leave out the recordings of these windows"
+    add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
+    add("--array", type=Path, metavar="FILE", help="microphones that the windows were heard by")
+    add("--sample-rate", type=float, metavar="HZ", help="of that sound (default: 47998)")
+    add("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
+    add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    add("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.datasets.feature_table import read_features, read_ids
+    from worldstate.adapters.files.model_file import save_model
+    from worldstate.operations.training.training import TrainingSettings, train_model
+
+    check_outputs(arguments, "out")
+    table = _with_domain(arguments, read_features(arguments.table)).group(arguments.group)
+    labelled = [_heard_windows(path, table) for path in arguments.labels]
+    for one in labelled:
+        table = table.joined(one.group(arguments.group))
+    kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
+    settings = TrainingSettings(
+        seed=arguments.seed, sustain_hops=arguments.sustain_hops, method=arguments.method
+    )
+    with progress_bar("training", settings.steps) as bar:
+        model = train_model(
+            kept,
+            settings,
+            dataset=arguments.source or arguments.table.name,
+            group=arguments.group,
+            excluded_lists=[path.name for path in arguments.exclude],
+            simulated=read_beside(arguments, kept),
+            on_step=bar.advance,
+        )
+    save_model(arguments.out, model)
+    summary = {
+        "out": str(arguments.out),
+        "n_windows": len(kept),
+        "n_recordings": len(model.provenance.training_recordings),
+        "n_excluded_windows": len(table) - len(kept),
+        **(model.provenance.figures or {}),
+    }
+    if labelled:
+        summary["n_labelled"] = sum(map(len, labelled))
+    return CommandResult(summary)
+
+
+def _heard_windows(labels: Path, table: "FeatureTable") -> "FeatureTable":
+    """Return the features of labelled windows, by the microphones that the table's were heard by."""
+    from worldstate.adapters.datasets.feature_extraction import extract_features, feature_table, read_labels
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.frontend.array.ovad_array import ovad_array
+
+    array = ovad_array() if table.domain is None else MicrophoneArray(table.domain.positions_m)
+    windows = read_labels(labels, labels.parent)
+    features = list(track(extract_features(windows, array), "listening", len(windows)))
+    return feature_table(windows, features, array)
+
+
+def _with_domain(arguments: argparse.Namespace, table: "FeatureTable") -> "FeatureTable":
+    """Return the table with what its windows were made with: as it says, as the options say, or as OVAD's."""
+    import sys
+    from dataclasses import replace
+
+    from worldstate.adapters.files.acoustic_domain import check_array, domain_of, ovad_domain
+    from worldstate.adapters.files.array_file import read_array
+    from worldstate.frontend.direction.feature import FEATURE_RATE_HZ
+
+    environments = table.environments.tolist()
+    if arguments.array is None:
+        if table.domain is None:
+            print(f"worldstate: {arguments.table} names no array: taken as OVAD's", file=sys.stderr)
+        return replace(table, domain=table.domain or ovad_domain(environments))
+    array = read_array(arguments.array)
+    if table.domain is not None:
+        check_array(table.domain, array)
+        return table
+    rate_hz = arguments.sample_rate or FEATURE_RATE_HZ
+    return replace(table, domain=domain_of(array, [rate_hz], environments))

@@ -1,0 +1,163 @@
+"""`worldstate model make`: an array in, a model for it and what to expect of it out.
+
+Simulate streets for an array, listen to them, learn what a window and what three seconds of windows say, set
+the alarm to what hazard-free streets allow, and examine all of it on five other junctions: approaches
+detected, lead, alarms an hour, both sides, times to visible. Usable before any microphone is bought.
+
+Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes on
+there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+
+if TYPE_CHECKING:
+    from worldstate.adapters.datasets.feature_table import FeatureTable
+    from worldstate.adapters.files.model_file import Model
+    from worldstate.commissioning.exam_report import Figures
+    from worldstate.commissioning.plan import CommissionSettings
+    from worldstate.frontend.array.microphone_array import MicrophoneArray
+
+# Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
+ONSETS = {"standing": 30.0, "moving": 60.0}
+EXAMPLE = """\
+examples:
+  worldstate model make --array mics.csv --out my_model.json --streams streams --jobs 2
+  worldstate model make --array mics.csv --out my_model.json --streams streams --quiet night.wav
+  worldstate model make --array mics.csv --out my_model.json --streams streams --mounting-errors
+  worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
+  worldstate model make --array mics.csv --out try.json --quick"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add_array_options(parser, "OVAD's")
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    add("--report", type=Path, metavar="JSON", help="write what the exam found")
+    add("--figure", type=Path, metavar="PNG", help="draw what the exam found")
+    streams = "keep streams that were listened to, and take those that are there (default: beside MODEL)"
+    add("--streams", type=Path, metavar="DIR", help=streams)
+    windows = "labelled windows of this array at real junctions, learned too: feat0..feat59, Class, ..."
+    add("--labelled", type=Path, metavar="CSV", help=windows)
+    ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
+    add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
+    add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
+    quiet = "recordings in which nobody came: the alarm is set on them"
+    add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
+    add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
+    allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
+    add("--onsets", type=float, metavar="N", help=allowed)
+    add("--junctions", type=int, default=16, metavar="N", help="to learn from (default: 16)")
+    minutes = "of approaches at each; all other streams and the exam last in proportion (default: 7.2)"
+    add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
+    add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
+    add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
+    wrong = "hear one junction of the exam with a turned array and with wrong positions, too"
+    add("--mounting-errors", action="store_true", help=wrong)
+    add(
+        "--quick", action="store_true", help="from minutes of sound: to try the command, not to use the model"
+    )
+    add("--seed", type=int, default=1, help="another seed, other streams (default: 1)")
+    add("--jobs", type=int, default=1, help="processes (default: 1)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from worldstate.adapters.files.model_file import save_model
+    from worldstate.cli.common.output import write_report
+    from worldstate.commissioning.commission import LEARNING_STEPS, commission, exam_of
+    from worldstate.commissioning.exam_figure import write_exam_figure
+    from worldstate.commissioning.exam_report import (
+        REFERENCE,
+        beside_reference,
+        exam_figures,
+        mounting_lines,
+    )
+    from worldstate.commissioning.plan import exam_streams, learned_streams
+    from worldstate.frontend.array.ovad_array import ovad_array
+
+    check_outputs(arguments, "out", "report", figures=("figure",))
+    settings = _settings(arguments)
+    folder = arguments.streams or arguments.out.with_suffix(".streams")
+    array = given_array(arguments) or ovad_array()
+    # Streams take nearly all of the time; what is learned from them counts as a few more.
+    steps = len(learned_streams(settings)) + LEARNING_STEPS
+    with progress_bar("commissioning", steps) as bar:
+        model = commission(
+            array,
+            settings,
+            folder,
+            table=_labelled(arguments),
+            source=arguments.source or getattr(arguments.labelled, "name", ""),
+            excluded_lists=[path.name for path in arguments.exclude],
+            quiet=arguments.quiet,
+            jobs=arguments.jobs,
+            on_step=bar.advance,
+        )
+    save_model(arguments.out, model)
+    report: dict[str, object] = {"out": str(arguments.out), "fit_for_use": model.provenance.fit_for_use}
+    if arguments.exam:
+        with progress_bar("exam", len(exam_streams(settings))) as bar:
+            examined = exam_of(array, model, settings, folder, jobs=arguments.jobs, on_step=bar.advance)
+        report |= exam_figures(examined)
+        if arguments.figure is not None:
+            write_exam_figure(examined, arguments.figure)
+    # The figures of the 56 microphones are those of a standing ego.
+    told, lines = report if settings.moving_ego else beside_reference(report), list[str]()
+    if arguments.mounting_errors:
+        mounted = _mounted(array, model, settings, folder)
+        report["mounting"] = mounted
+        lines += ["", *mounting_lines(mounted)]
+    if not settings.moving_ego:
+        report["reference"] = dict(REFERENCE)
+    if arguments.report is not None:
+        write_report(arguments.report, report)
+    lines += ["", "unfit for use: learned from minutes of sound"] if settings.quick else []
+    return CommandResult(report, told, lines)
+
+
+def _labelled(arguments: argparse.Namespace) -> "FeatureTable | None":
+    """Return the labelled windows that are learned, too; None without any."""
+    from worldstate.adapters.datasets.feature_table import read_features, read_ids
+
+    if arguments.labelled is None:
+        return None
+    table = read_features(arguments.labelled).group("dynamic" if arguments.ego == "moving" else "static")
+    return table.without([name for path in arguments.exclude for name in read_ids(path)])
+
+
+def _mounted(
+    array: "MicrophoneArray", model: "Model", settings: "CommissionSettings", folder: Path
+) -> "dict[str, Figures]":
+    from worldstate.commissioning.commission import exam_of_mountings
+    from worldstate.commissioning.exam_report import exam_figures
+    from worldstate.commissioning.plan import mounting_streams
+
+    with progress_bar("mounting", len(mounting_streams(settings))) as bar:
+        heard = exam_of_mountings(array, model, settings, folder, on_step=bar.advance)
+    return {name: exam_figures(streams) for name, streams in heard.items()}
+
+
+def _settings(arguments: argparse.Namespace) -> "CommissionSettings":
+    from worldstate.commissioning.plan import CommissionSettings, quick_settings
+
+    minutes: float = arguments.minutes
+    settings = CommissionSettings(
+        junctions=arguments.junctions,
+        approach_minutes=minutes,
+        hazard_free_minutes=minutes / 1.2,
+        exam_minutes=minutes / 0.3,
+        onsets_per_hour=ONSETS[arguments.ego] if arguments.onsets is None else arguments.onsets,
+        seed=arguments.seed,
+        leave_out=tuple(arguments.leave_out),
+        moving_ego=arguments.ego == "moving",
+    )
+    return quick_settings(settings) if arguments.quick else settings

@@ -1,0 +1,99 @@
+"""`worldstate model threshold`: thresholds of a model from a user's own hazard-free hours.
+
+Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
+
+INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, or hop streams
+that --save-streams wrote with the same signature. Recordings labelled none and sound files count as
+hazard-free. Approaches with a T0, where there are some, give the risk map (Platt for few, isotonic for many);
+without them the model's own is kept. A budget that the hours do not suffice for is warned about, with the
+hours that it would take.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+
+if TYPE_CHECKING:
+    from worldstate.operations.calibration.cueing_calibration import CueingCalibration
+
+EXAMPLE = """\
+examples:
+  worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
+  worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
+    add_array_options(parser)
+    add("--model", type=Path, help="model file to start from (default: the one that ships)")
+    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
+    budgets = "budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
+    add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
+    guarantee = "with a finite-sample guarantee, or the smallest threshold that fits"
+    add_choice(parser, "--method", guarantee, "conformal", "plain")
+    add("--confidence", type=float, metavar="C", help="of the guarantee, such as 0.95")
+    add("--block", type=float, default=10.0, metavar="S", help="pieces of so many seconds (default: 10)")
+    add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
+    add("--keep", type=float, metavar="N", help="let the threshold move to keep N false alarms an hour")
+    add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    from dataclasses import replace
+
+    from worldstate.adapters.files.model_file import read_model, save_model
+    from worldstate.cli.common.listening import read_streams
+    from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
+    from worldstate.operations.recordings.hop_table import save_tables
+
+    check_outputs(arguments, "out", "save_streams")
+    settings = CueingSettings(
+        alphas=tuple(arguments.alpha),
+        sustain_hops=arguments.sustain_hops,
+        method=arguments.method,
+        confidence=arguments.confidence,
+        block_s=arguments.block,
+        keep_per_hour=arguments.keep,
+    )
+    model = read_model(arguments.model)
+    streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
+    if arguments.save_streams is not None:
+        save_tables(arguments.save_streams, streams)
+    done = calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
+    figures = dict(model.provenance.figures or {}) | {"calibration_hours": done.hours}
+    provenance = replace(model.provenance, figures=figures)
+    save_model(arguments.out, replace(model, policies=done.policies, provenance=provenance))
+    for warning in done.warnings:
+        print(f"worldstate: warning: {warning}", file=sys.stderr)
+    return _result(arguments, done)
+
+
+def _result(arguments: argparse.Namespace, done: "CueingCalibration") -> CommandResult:
+    summary: dict[str, object] = {
+        "out": str(arguments.out),
+        "hazard_free_hours": done.hours,
+        "windows": done.windows,
+        "recordings": done.recordings,
+        "pieces": done.blocks,
+        "correlation_time_s": done.correlation_time_s,
+        "risk_map": done.risk,
+    }
+    detail = {"budgets": [report.to_dict() for report in done.budgets], "warnings": list(done.warnings)}
+    lines = {
+        f"alpha {report.alpha:g}, beta {report.miss_rate:g}": (
+            f"gamma {report.gamma:.4f}  {report.counted.per_hour:.3g} false alarms/h "
+            f"[{report.counted.low_per_hour:.3g}, {report.counted.high_per_hour:.3g}], "
+            f"one is {report.counted.quantum_per_hour:.3g}/h"
+        )
+        for report in done.budgets
+    }
+    return CommandResult(summary | detail, table=summary | lines)

@@ -1,0 +1,58 @@
+"""`worldstate sim to-bag`: a recording as a bag of ROS 2, as a vehicle would have recorded it.
+
+Write sound, array, detections and the speed of the ego, where it is known, as messages. It shows what a bag
+has to look like for `worldstate run BAG`, and which topics; the definitions are in the documentation.
+"""
+
+import argparse
+from pathlib import Path
+
+from worldstate.cli.common.array_options import add_array_options, given_array
+from worldstate.cli.common.bag_options import add_storage_option
+from worldstate.cli.common.output import CommandResult
+
+EXAMPLE = """\
+examples:
+  worldstate sim to-bag ovad_dataset/SA1/left/1_00_0002 street_bag
+  worldstate sim to-bag out/demo/recording/SB1/right/3_02_0000 street_bag --ros-storage sqlite3"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("recording", type=Path, metavar="RECORDING", help="folder of a recording in the OVAD layout")
+    add("out", type=Path, metavar="BAG", help="folder to write, which must not exist")
+    start = "time of the first sample, seconds since 1970 in a real bag (default: %(default)g)"
+    add("--start", type=float, default=0.0, metavar="S", help=start)
+    add_storage_option(parser)
+    add_array_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it wrote."""
+    from worldstate.adapters.datasets.array_choice import choose_array
+    from worldstate.adapters.datasets.ovad import Recording
+    from worldstate.adapters.ros.bag_writer import check_bag_target
+    from worldstate.adapters.ros.recording_bag import odometry_of, write_bag
+    from worldstate.cli.common.progress import track
+    from worldstate.ground.checks import in_range
+    from worldstate.ground.values import nanoseconds
+
+    check_bag_target(arguments.out)
+    start_ns = nanoseconds(in_range("--start", arguments.start, 0.0, 4e9))
+    recording = Recording.open(arguments.recording)
+    array, seen = choose_array(recording.path, given_array(arguments)), recording.read_detections()
+    ego = odometry_of(recording)
+    written = write_bag(
+        arguments.out, recording.audio_path, array, seen, ego,
+        start_ns=start_ns, storage=arguments.ros_storage,
+    )  # fmt: skip
+    sound_s = list(track(written, f"writing {arguments.out.name}"))[-1]
+    summary = {
+        "bag": str(arguments.out),
+        "sound_s": round(sound_s, 3),
+        "microphones": array.n_microphones,
+        "images": None if seen is None else len(seen),
+        "odometry": ego is not None,
+    }
+    return CommandResult(summary)

@@ -1,0 +1,1 @@
+"""Commands that learn a street from the vehicles that pass."""

@@ -1,0 +1,99 @@
+"""`worldstate street label`: a recording with a camera in, trajectories and labelled windows out.
+
+Join the camera's boxes of a recording into passes, and smooth each of them together with the seconds before
+it: trajectories with covariance, the hidden phase included, and T0, the first line of sight, with its
+standard deviation. For a standing ego.
+
+--out is JSON in the layout of ASAM OpenLABEL. --windows is a list of labelled seconds, which
+`extract-features --labels` and `train --labels` read: recordings of one's own become training data without
+anybody marking them. It lies in the recording's folder or above it.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from worldstate.cli.common.array_options import add_array_options
+from worldstate.cli.common.camera_options import add_camera_options, camera_source
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.outputs import check_outputs
+from worldstate.cli.common.progress import progress_bar
+from worldstate.cli.common.sound_options import add_sound_options, sound_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from worldstate.adapters.listen import Source
+    from worldstate.operations.labelling.box_tracks import BoxTrack
+    from worldstate.operations.labelling.pass_labels import PassLabel
+
+EXAMPLE = """\
+examples:
+  worldstate street label street.wav --detections boxes.json --camera camera.json --out labels.json
+  worldstate street label ovad_dataset/SA1/left/1_00_0002 --out labels.json --windows ovad_dataset/labels.csv
+  worldstate model fit features.csv --labels ovad_dataset/labels.csv --out model.json"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_sound_options(parser)
+    add_array_options(parser)
+    add_camera_options(parser)
+    add = parser.add_argument_group("output").add_argument
+    add("--out", type=Path, required=True, metavar="JSON", help="trajectories and T0, OpenLABEL")
+    add("--windows", type=Path, metavar="CSV", help="labelled seconds for train --labels")
+    add("--figure", type=Path, metavar="PNG", help="draw the passes as seen from above")
+    site = "name of the place, S.. (default: S and the name of the recording's folder)"
+    add("--environment", metavar="NAME", help=site)
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the command; return what it found."""
+    import numpy as np
+
+    from worldstate.operations.labelling.box_tracks import box_tracks
+    from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
+    from worldstate.operations.labelling.pass_figure import write_pass_figure
+    from worldstate.operations.labelling.pass_labels import label_passes
+    from worldstate.operations.recordings.true_track import read_true_tracks
+
+    check_outputs(arguments, "out", "windows", figures=("figure",))
+    source, detections = camera_source(arguments, sound_of(arguments))
+    file = None if arguments.windows is None else file_below(source.audio_path, arguments.windows)
+    tracks = box_tracks(detections, source.camera, source.settings.boxes)
+    with progress_bar("smoothing", len(tracks)) as bar:
+        passes = label_passes(tracks, source.camera.position_m[0], on_pass=bar.advance)
+    write_open_label(arguments.out, source.audio_path.name, passes)
+    if arguments.figure is not None:
+        truth = read_true_tracks(source.audio_path.parent)
+        write_pass_figure(passes, arguments.figure, source.audio_path.name, truth)
+    summary: dict[str, object] = {"out": str(arguments.out), "n_tracks": len(tracks), "n_passes": len(passes)}
+    if passes:
+        summary["t0_std_s"] = float(np.median([one.t0.std_s for one in passes]))
+    if file is not None:
+        rows = _windows(arguments, source, tracks, passes, file)
+        write_window_labels(arguments.windows, rows)
+        summary |= {"windows": str(arguments.windows), "n_windows": len(rows)}
+    lines = [f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}" for one in passes]
+    return CommandResult(summary, lines=lines)
+
+
+def _windows(
+    arguments: argparse.Namespace,
+    source: "Source",
+    tracks: "Sequence[BoxTrack]",
+    passes: "Sequence[PassLabel]",
+    file: str,
+) -> "list[tuple[object, ...]]":
+    import numpy as np
+
+    from worldstate.adapters.audio.open_sound import open_sound
+    from worldstate.operations.labelling.label_files import window_rows
+
+    with open_sound(source.sound) as audio:
+        time_s = np.arange(10, int(10.0 * audio.duration_s) + 1) / 10.0
+    seen = np.zeros(len(time_s), np.bool_)
+    for one in tracks:
+        seen |= (time_s >= one.time_s[0] - 0.05) & (time_s <= one.time_s[-1] + 0.05)
+    environment = arguments.environment or f"S{source.audio_path.parent.name}"
+    return window_rows(passes, seen, time_s, environment, file)

@@ -1,1 +1,0 @@
-"""Commands for users with recordings of their own."""

@@ -1,1 +1,0 @@
-"""Commands about the vehicle that carries the sensors."""
