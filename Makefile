@@ -7,23 +7,33 @@ SHELL := /bin/sh
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test slow lint schema docs matrix dist clean
+.PHONY: demo check test slow lint schema docs matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.core: $(VENV)/bin/python pyproject.toml
-	$(BIN)/pip install -q --disable-pip-version-check -e .
+	$(BIN)/pip install -q --disable-pip-version-check -e '.[all]'
 	touch $@
 
-$(VENV)/.test: $(VENV)/bin/python pyproject.toml
-	$(BIN)/pip install -q --disable-pip-version-check -e '.[test,lint]'
+$(VENV)/.test: $(VENV)/bin/python pyproject.toml lab/pyproject.toml
+	$(BIN)/pip install -q --disable-pip-version-check -e '.[test,lint]' -e ./lab
 	touch $@ $(VENV)/.core
 
 demo: $(VENV)/.core
 	$(BIN)/worldstate demo --out out/demo
 
+# While working: the core first, so that what it breaks shows within seconds, then the rest of what every commit
+# can break. Types are fast with a warm cache.
+check: $(VENV)/.test
+	$(BIN)/python -m pytest -x tests/core
+	$(BIN)/ruff check .
+	$(BIN)/mypy -p worldstate
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -x -n 2 --dist loadgroup tests/frontend tests/ground tests/house/test_house.py tests/house/test_readme.py
+
+# The library's tests and the laboratory's.
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import BoolArray, FloatArray
 
@@ -86,10 +87,9 @@ def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
     B. Zadrozny and C. Elkan, "Transforming classifier scores into accurate multiclass probability estimates",
     2002.
     """
-    from sklearn.isotonic import IsotonicRegression
-
     scores, labels = _checked_sample(statistics, hazards)
-    fit = IsotonicRegression(y_min=0.0, y_max=1.0, out_of_bounds="clip").fit(scores, labels)
+    regression = optional("sklearn.isotonic").IsotonicRegression
+    fit = regression(y_min=0.0, y_max=1.0, out_of_bounds="clip").fit(scores, labels)
     return IsotonicMap(tuple(fit.X_thresholds_.tolist()), tuple(fit.y_thresholds_.tolist()))
 
 

@@ -6,10 +6,10 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.linear_model import LogisticRegression
 
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
 from .ensemble import PRIOR_S, EnsembleModel
@@ -245,6 +245,7 @@ def _prior_s(levels: FloatArray, sites: AnyArray) -> float:
 
 def _fit_expert(recipe: Recipe, seen: FloatArray, codes: IndexArray, weights: FloatArray) -> Expert:
     mean, scale = standardisation(seen, weights)
-    machine = LogisticRegression(C=1.0 / (recipe.ridge * weights.sum()), max_iter=_ITERATIONS)
+    regression = optional("sklearn.linear_model").LogisticRegression
+    machine = regression(C=1.0 / (recipe.ridge * weights.sum()), max_iter=_ITERATIONS)
     machine.fit((seen - mean) / scale, codes, weights)
     return Expert(recipe.view, mean, scale, machine.coef_, machine.intercept_)

@@ -1,5 +1,6 @@
 """The layout itself: what is packaged, and who may import whom."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -13,12 +14,11 @@ import worldstate
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+SIBLINGS = ["abduction", "adapters", "frontend", "simulation"]
 
 
 def packages_in_tree() -> set[str]:
-    homes = {"worldstate": ROOT / "worldstate"} | {
-        f"worldstate.{name}": ROOT / name for name in ("abduction", "adapters", "frontend")
-    }
+    homes = {"worldstate": ROOT / "worldstate"} | {f"worldstate.{name}": ROOT / name for name in SIBLINGS}
     found = set()
     for package, folder in homes.items():
         for init in folder.rglob("__init__.py"):
@@ -31,7 +31,7 @@ def test_every_package_of_the_tree_is_shipped():
     assert set(PROJECT["tool"]["setuptools"]["packages"]) == packages_in_tree()
 
 
-@pytest.mark.parametrize("name", ["abduction", "adapters", "frontend"])
+@pytest.mark.parametrize("name", SIBLINGS)
 def test_siblings_are_reached_through_links(name):
     link = ROOT / "worldstate" / name
     assert link.is_symlink()
@@ -42,6 +42,42 @@ def test_layers_hold():
     command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_laboratory_is_of_the_same_version():
+    lab = tomllib.loads((ROOT / "lab" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert lab["version"] == worldstate.__version__
+    assert lab["dependencies"] == ["worldstate[all]"]
+
+
+def modules_of_the_product() -> str:
+    folders = ("abduction", "adapters", "frontend", "simulation", "worldstate")
+    return "\n".join(
+        path.read_text(encoding="utf-8") for name in folders for path in (ROOT / name).rglob("*.py")
+    )
+
+
+@pytest.mark.parametrize("package", ["gtsam", "networkx", "numpy", "scipy", "sklearn", "soundfile"])
+def test_what_the_project_is_built_on_is_imported_by_the_product(package):
+    said = rf"(^\s*(import|from) {package}\b|optional\(\"{package}\b)"
+    assert re.search(said, modules_of_the_product(), flags=re.MULTILINE)
+
+
+OPTIONAL = {
+    "matplotlib": ("worldstate.operations.write_timeline(None, pathlib.Path('a.png'))", "plot"),
+    "networkx": ("worldstate.WorldState(0, 0).graph()", "graph"),
+}
+
+
+@pytest.mark.parametrize("package", OPTIONAL)
+def test_a_missing_package_is_named_with_its_extra_before_any_work(package):
+    call, extra = OPTIONAL[package]
+    script = (
+        f"import pathlib, sys; sys.modules['{package}'] = None; import worldstate, worldstate.operations\n"
+        f"try: {call}\nexcept worldstate.ground.MissingExtraError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert f"pip install 'worldstate[{extra}]'" in done.stdout
 
 
 HEAVY = {"scipy.stats", "scipy.signal", "sklearn", "filterpy", "gtsam", "matplotlib", "cv2", "networkx"}

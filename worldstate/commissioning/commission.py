@@ -23,6 +23,7 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import check_extra
 from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.training.training import TrainingSettings, train_model
@@ -164,6 +165,7 @@ def commission(
     Recordings in which nobody came set the alarm in place of the simulated streets without hazards. The model
     says where the labelled windows come from and which lists of them were left out.
     """
+    check_extra("sklearn")
     streams, rng = [], np.random.default_rng(settings.seed)
     for one in heard_streams(learned_streams(settings), array, folder, jobs):
         streams.append(one)

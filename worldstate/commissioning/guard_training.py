@@ -10,6 +10,7 @@ from worldstate.abduction.signature.standardisation import standardisation
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND, MEASURES
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import significant
 
@@ -106,8 +107,6 @@ def _softmax(
     rows: GuardRows, foreign: tuple[str, ...], signals: tuple[str, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """Fit weights, shape (classes, measures), and biases of raw measures, the street first."""
-    from sklearn.linear_model import LogisticRegression
-
     names = {**dict.fromkeys((*STREET, ""), "street"), **FOREIGN, **SIGNALS}
     of_street = np.isin(rows.kinds, (*STREET, ""))
     kept = ~of_street | (np.arange(len(of_street)) % _EVERY == 0)
@@ -119,7 +118,7 @@ def _softmax(
     weights = (shares / np.bincount(labels))[labels]
     mean, scale = standardisation(rows.measures[kept], weights)
     inputs = (rows.measures[kept] - mean) / scale * _of_all()
-    fitted = LogisticRegression(C=_STRENGTH, max_iter=300, tol=1e-3)
+    fitted = optional("sklearn.linear_model").LogisticRegression(C=_STRENGTH, max_iter=300, tol=1e-3)
     fitted.fit(inputs, labels, sample_weight=weights * len(labels))
     slopes = fitted.coef_ * _of_all() / scale
     return slopes, fitted.intercept_ - slopes @ mean

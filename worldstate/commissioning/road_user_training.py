@@ -16,6 +16,7 @@ from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 from worldstate.ground.values import significant
 from worldstate.simulation.scene.kinds import vehicle_kind
@@ -156,12 +157,10 @@ def _over_a_second(power: FloatArray) -> FloatArray:
 
 def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
     """Fit a softmax to classes of equal weight, then let them be as frequent as in a town."""
-    from sklearn.linear_model import LogisticRegression
-
     classes = rows.classes
     equal = 1.0 / np.bincount(classes, minlength=len(CLASSES))[classes]
     mean, scale = standardisation(rows.measures, equal)
-    fitted = LogisticRegression(C=_STRENGTH, max_iter=300, tol=1e-3)
+    fitted = optional("sklearn.linear_model").LogisticRegression(C=_STRENGTH, max_iter=300, tol=1e-3)
     fitted.fit((rows.measures - mean) / scale, classes, sample_weight=equal * len(classes) / equal.sum())
     slopes = fitted.coef_ / scale
     biases = fitted.intercept_ - slopes @ mean + np.log(class_shares(rows))

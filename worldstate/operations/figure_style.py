@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.extras import check_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,12 +44,14 @@ def check_suffix(path: Path) -> Path:
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputFileError(path, f"expected a figure name ending in {', '.join(SUFFIXES)}")
+    check_extra("matplotlib")
     return path
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Draw in the style of the library, and leave the caller's own matplotlib settings alone."""
+    check_extra("matplotlib")
     import matplotlib
     from cycler import cycler
 

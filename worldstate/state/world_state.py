@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import ADDED, Count, Layout, decode, decode_json, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
@@ -151,10 +152,8 @@ class WorldState:
         >>> sorted(graph.nodes), graph.edges["corner_left", "ego", "left_of"]["probability"]
         (['corner_left', 'corner_right', 'ego'], 1.0)
         """
-        # Imported here: whoever never asks for a graph does not wait for networkx.
-        import networkx as nx
-
-        graph = nx.MultiDiGraph()
+        # Imported here: it takes .2 s, and few ask for a graph.
+        graph: nx.MultiDiGraph = optional("networkx").MultiDiGraph()
         graph.add_node(EGO, type="ego", value=self.context)
         for occluder in self.context.occluders:
             graph.add_node(occluder.id, type="occluder", value=occluder)

@@ -10,7 +10,7 @@ def add_command(subparsers: "Subparsers[argparse.ArgumentParser]", module: Modul
     """Declare the command of a module, with --json.
 
     Its documentation is "`worldstate [GROUP] NAME`: summary.", an empty line, and the description; it has
-    `EXAMPLE`, `add_options` and `run`.
+    `EXAMPLE`, `add_options` and `run`, and `NEEDS`, the optional modules without which it does nothing.
     """
     head, _, description = (module.__doc__ or "").partition("\n\n")
     called, _, summary = head.removeprefix("`").partition("`: ")
@@ -23,7 +23,7 @@ def add_command(subparsers: "Subparsers[argparse.ArgumentParser]", module: Modul
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    parser.set_defaults(run=module.run)
+    parser.set_defaults(run=module.run, needs=getattr(module, "NEEDS", ()))
     module.add_options(parser)
 
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from worldstate.ground.errors import WorldstateError
+from worldstate.ground.extras import check_extra
 from worldstate.ground.version import __version__
 
 from .command import add_command
@@ -66,6 +67,7 @@ def run_command(parser: Callable[[], argparse.ArgumentParser], words: Sequence[s
 def _execute(parser: argparse.ArgumentParser, words: Sequence[str]) -> int:
     """Run one command and print what it found; return its exit code."""
     arguments = parser.parse_args(words)
+    check_extra(*arguments.needs)
     result: CommandResult = arguments.run(arguments)
     print_result(result, as_json=arguments.json)
     return result.code

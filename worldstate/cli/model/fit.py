@@ -29,6 +29,8 @@ examples:
   worldstate model fit features.csv --group static --exclude testset.csv --out model.json
   worldstate model fit features.csv --labels recordings/labels.csv --out model.json"""
 
+NEEDS = ("sklearn",)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""

@@ -35,6 +35,8 @@ examples:
   worldstate model make --array mics.csv --out moving.json --streams streams --ego moving --jobs 2
   worldstate model make --array mics.csv --out try.json --quick"""
 
+NEEDS = ("sklearn",)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""

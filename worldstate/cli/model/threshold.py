@@ -27,6 +27,8 @@ examples:
   worldstate model threshold night.wav morning.wav --array mics.xml --alpha 0.02 --out my_model.json
   worldstate model threshold my_dataset --alpha 0.01 0.05 --confidence 0.95 --out my_model.json"""
 
+NEEDS = ("sklearn",)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""

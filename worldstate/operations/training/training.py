@@ -16,6 +16,7 @@ from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance
+from worldstate.ground.extras import check_extra
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 
@@ -105,6 +106,8 @@ def train_model(
 
     Raises
     ------
+    MissingExtraError
+        If scikit-learn is not installed.
     InvalidArgumentError
         If a class is missing or there are fewer recordings than folds.
 
@@ -121,6 +124,7 @@ def train_model(
     >>> model.signature.classes, model.provenance.dataset
     (('front', 'left', 'none', 'right'), 'made up')
     """
+    check_extra("sklearn")
     rng = np.random.default_rng(settings.seed)
     method = method_of(settings.method, simulated)
     inputs = method.prepare(table)

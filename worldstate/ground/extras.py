@@ -1,0 +1,60 @@
+"""Optional packages: imported where they are used; an error names the extra that brings a missing one."""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from .errors import MissingExtraError
+
+# Import name: name on the package index, and the extra that brings it.
+EXTRAS = {
+    "cv2": ("opencv-python-headless", "vision"),
+    "filterpy": ("filterpy", "smoothing"),
+    "foxglove": ("foxglove-sdk", "foxglove"),
+    "gtsam": ("gtsam", "gtsam"),
+    "matplotlib": ("matplotlib", "plot"),
+    "mcap": ("mcap", "mcap"),
+    "networkx": ("networkx", "graph"),
+    "onnxruntime": ("onnxruntime", "onnx"),
+    "osi3": ("osi-python", "osi"),
+    "rerun": ("rerun-sdk", "rerun"),
+    "rich": ("rich", "cli"),
+    "rosbags": ("rosbags", "ros"),
+    "sklearn": ("scikit-learn", "train"),
+    "sounddevice": ("sounddevice", "live"),
+}
+
+
+def optional(module: str) -> Any:
+    """Return an optional module, such as `sklearn.isotonic`.
+
+    Raises
+    ------
+    MissingExtraError
+        If its package is not installed.
+
+    Examples
+    --------
+    >>> optional("matplotlib.figure").Figure.__name__
+    'Figure'
+    """
+    check_extra(module)
+    return import_module(module)
+
+
+def check_extra(*modules: str) -> None:
+    """Refuse work of which an optional package is missing, before it begins; nothing is imported.
+
+    Raises
+    ------
+    MissingExtraError
+        If a package is not installed.
+
+    Examples
+    --------
+    >>> check_extra("sklearn", "matplotlib")
+    """
+    for module in modules:
+        package = module.partition(".")[0]
+        if find_spec(package) is None:
+            raise MissingExtraError(*EXTRAS[package])
