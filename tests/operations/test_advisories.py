@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
+from worldstate.operations.metrics.approach_table import ApproachTable, onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HopTable
 
 
@@ -17,15 +16,15 @@ def test_every_onset_is_a_change_from_quiet_to_alarm(alarm):
 
 
 def test_lead_time_counts_from_the_first_onset_within_five_seconds():
-    assert detection([6.0, 6.5], 7.0).lead_time_s == pytest.approx(1.0)
-    early = detection([1.0, 1.9, 4.0], 7.0)
-    assert early.lead_time_s == pytest.approx(3.0)
-    assert early.false_advisories_before == 2
+    assert onset_outcome([6.0, 6.5], 7.0).lead_s == pytest.approx(1.0)
+    early = onset_outcome([1.0, 1.9, 4.0], 7.0)
+    assert early.lead_s == pytest.approx(3.0)
+    assert early.onsets_earlier == 2
 
 
 @pytest.mark.parametrize("onsets", [[], [7.0, 8.0], [0.5]])
 def test_too_late_or_too_early_is_a_miss(onsets):
-    assert not detection(onsets, 7.0).detected
+    assert not onset_outcome(onsets, 7.0).detected
 
 
 def test_the_static_set_s_quantum():
@@ -33,18 +32,14 @@ def test_the_static_set_s_quantum():
     hops = round(0.103 * 36000)
     alarm = np.zeros(hops, dtype=bool)
     alarm[100:140] = True
-    assert false_alarms_per_hour([alarm[:2000], alarm[2000:]]) == pytest.approx(9.7, abs=0.02)
-
-
-def test_a_hop_must_last():
-    with pytest.raises(InvalidArgumentError, match="hop_s"):
-        false_alarms_per_hour([[True]], hop_s=0.0)
+    found = ApproachTable([], [alarm[:2000], alarm[2000:]]).figures()
+    assert found["onsets_per_hour"] == pytest.approx(9.7, abs=0.02)
 
 
 def test_an_onset_at_line_of_sight_is_no_warning():
     # At 47,998 Hz the hop that ends at T0 = 7 s ends at sample 335,986: 6.3 us before it.
     at_t0_s = round(7.0 * 47_998) / 47_998 - 6.3e-6
-    assert not detection([at_t0_s], 7.0).detected
-    assert detection([at_t0_s - 0.1], 7.0).detected
+    assert not onset_outcome([at_t0_s], 7.0).detected
+    assert onset_outcome([at_t0_s - 0.1], 7.0).detected
     table = HopTable({"time_s": np.array([7.0 + 9e-6, 7.1])}, label="left", t0_s=7.0)
     assert table.before_sight().tolist() == [True, False]

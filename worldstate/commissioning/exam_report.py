@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
+from worldstate.operations.metrics.approach_table import Figures
+
 from .bearing_exam import in_view_bearings
 from .stream_exam import ExaminedStream, examine
 
-Figures = dict[str, float | int | None]
 # What OVAD's 56 microphones reach with the model that ships, in 395 loud approaches and six hours without
 # hazards (seeds 1 to 3 of the exam; docs/commission.md). Its window model knows real windows of these
 # junctions.

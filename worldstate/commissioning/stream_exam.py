@@ -1,9 +1,7 @@
 """What a sequence model is worth on streams: approaches detected, alarms an hour, calibration, times.
 
-An approach is one vehicle, two that come from both sides at once, or one with another behind it. It is
-detected where an alarm stands at some hop of the five seconds before the first T0, and its lead is counted
-from the first such hop; the next approach lies farther away than that. An onset is a rising edge of the alarm
-of either side in a stream without hazards.
+An approach is one vehicle, two that come from both sides at once, or one with another behind it; the next one
+lies farther away than an alarm is counted for, so that the first hop in alarm counts.
 """
 
 from collections.abc import Sequence
@@ -24,42 +22,33 @@ from worldstate.abduction.sequence.sequence_model import (
 )
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.metrics.alarm_rate import poisson_interval, share_interval
-from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.metrics.time_to_visible import visible_errors
-from worldstate.operations.recordings.advisories import (
+from worldstate.operations.metrics.approach_table import (
+    AFTER_S,
     LONGEST_LEAD_S,
     SECONDS_PER_HOUR,
     SLACK_S,
+    Approach,
+    ApproachOutcome,
+    ApproachTable,
+    Figures,
+    hop_outcome,
+    mean_of,
     rising_edges,
 )
+from worldstate.operations.metrics.roc import auroc
+from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.recordings.hop_stream import HOP_S
 
 from .heard_stream import HeardStream
 from .stream_labels import QUIET_KINDS, StreamTruth
 
-TOGETHER_S, FOLLOWING_S, AFTER_S = 4.0, 6.0, 6.0
+TOGETHER_S, FOLLOWING_S = 4.0, 6.0
 # A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at
 # 20 an hour leave .22, .17, .13 and .08 of other junctions above that, and detect .888, .881, .870 and .849.
 LOUDEST = 3.0
 _CALIBRATED_S = (1.0, 2.0, 3.0)
 # The ten hops before T0, without T0 itself: there the vehicle is as good as in view.
 _LAST_SECOND_S = np.arange(1, 11) * HOP_S
-
-
-@dataclass(frozen=True, slots=True)
-class StreamApproach:
-    """Vehicles that belong together, the first to come into view first."""
-
-    flow: str  # "single", "both" or "queue"
-    entries_s: tuple[float, ...]
-    sides: tuple[int, ...]
-    kinds: tuple[str, ...]
-
-    @property
-    def quiet(self) -> bool:
-        """Whether any of them is a quiet road user, which has no target of its own."""
-        return any(kind in QUIET_KINDS for kind in self.kinds)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +61,7 @@ class ExaminedStream:
     alarm: SequenceAlarm
 
 
-def approaches(heard: HeardStream) -> list[StreamApproach]:
+def approaches(heard: HeardStream) -> list[Approach]:
     """Collect the approaches of a stream by the flows that its vehicles arrived in."""
     vehicles = heard.vehicles
     order = np.argsort(vehicles.entry_s)
@@ -87,11 +76,12 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
         left = [i for i in left if i not in with_it]
         every = [first, *with_it]
         found.append(
-            StreamApproach(
+            Approach(
                 flow if flow in ("both", "queue") else "single",
                 tuple(vehicles.entry_s[every].tolist()),
                 tuple(SIDES.index(arm) for arm in vehicles.arm[every]),
                 tuple(vehicles.kind[every].tolist()),
+                bool(np.isin(vehicles.kind[every], list(QUIET_KINDS)).any()),
             )
         )
     return found
@@ -138,98 +128,43 @@ def _onsets(quiet: Sequence[SequencePosterior]) -> tuple[FloatArray, FloatArray,
     return thresholds, np.array(onsets, np.float64), hours
 
 
-def examine(streams: Sequence[ExaminedStream]) -> dict[str, float | int | None]:
+def examine(streams: Sequence[ExaminedStream]) -> Figures:
     """Return the figures of some streams together, ready for a table and for JSON."""
-    told = [one for stream in streams for one in _outcomes(stream)]
-    loud = [one for one in told if not one.approach.quiet]
-    found: dict[str, float | int | None] = {"approaches": len(loud), **_detections(loud)}
+    every = _table(streams)
+    loud = _loud(every)
+    found = loud.detections()
     for flow in ("single", "both", "queue"):
-        found[f"detected_{flow}"] = mean_of([one.detected for one in loud if one.approach.flow == flow])
-    found["detected_quiet"] = mean_of([one.detected for one in told if one.approach.quiet])
-    singles = [one for one in loud if one.approach.flow == "single"]
-    found["other_side_too"] = mean_of([one.other_side for one in singles])
-    found["wrong_side_only"] = mean_of([one.other_side and not one.own_side for one in singles])
-    found["both_sides_found"] = mean_of([one.every_side for one in loud if one.approach.flow == "both"])
-    found["onsets_after"] = mean_of([one.onsets_after for one in loud])
-    found |= _ranking(streams) | _false_alarms(streams) | _worst(streams)
-    return found | _calibration(streams) | _times(streams) | _by_kind(told)
+        found[f"detected_{flow}"] = loud.of_flow(flow).detections()["detected"]
+    found["detected_quiet"] = mean_of([one.detected for one in every.outcomes if one.approach.quiet])
+    found |= loud.sides()
+    found["onsets_after"] = mean_of([one.onsets_after for one in loud.outcomes])
+    found |= _ranking(streams) | loud.false_alarms() | _worst(streams)
+    return found | _calibration(streams) | _times(streams) | _by_kind(every.outcomes)
 
 
-@dataclass(frozen=True, slots=True)
-class AlarmOutcome:
-    """What alarms made of one approach, from five seconds before its first T0 to six after its last."""
-
-    approach: StreamApproach
-    lead_s: float  # 0 where missed
-    own_side: bool
-    other_side: bool
-    every_side: bool
-    onsets_after: int
-
-    @property
-    def detected(self) -> bool:
-        """Whether an alarm stood before the first T0."""
-        return self.lead_s > 0.0
+def alarm_outcomes(heard: HeardStream, time_s: FloatArray, raised: BoolArray) -> list[ApproachOutcome]:
+    """Return the outcome of every approach that lies whole within the hops, shapes (n,) and (n, 2)."""
+    return [
+        hop_outcome(one, time_s, raised)
+        for one in approaches(heard)
+        if one.entries_s[0] - LONGEST_LEAD_S >= time_s[0] and max(one.entries_s) + AFTER_S <= time_s[-1]
+    ]
 
 
-def alarm_outcomes(heard: HeardStream, time_s: FloatArray, raised: BoolArray) -> list[AlarmOutcome]:
-    """Return the outcome of every approach that lies whole within the hops, whoever raised the alarms.
-
-    Shapes: time_s (n,), raised (n, 2).
-    """
-    any_side = np.asarray(raised.any(axis=1))
-    onsets_s = time_s[rising_edges(any_side)]
-    told = []
-    for one in approaches(heard):
-        first, last = one.entries_s[0], max(one.entries_s)
-        if first - LONGEST_LEAD_S < time_s[0] or last + AFTER_S > time_s[-1]:
-            continue
-        before = shortly_before(time_s, first)
-        alarms_s = time_s[before & any_side]
-        by_side = np.asarray(raised[before].any(axis=0))
-        told.append(
-            AlarmOutcome(
-                approach=one,
-                lead_s=first - float(alarms_s[0]) if alarms_s.size else 0.0,
-                own_side=bool(by_side[one.sides[0]]),
-                other_side=bool(by_side[1 - one.sides[0]]),
-                every_side=all(
-                    raised[shortly_before(time_s, entry_s), side].any()
-                    for entry_s, side in zip(one.entries_s, one.sides, strict=True)
-                ),
-                onsets_after=int(((onsets_s >= last) & (onsets_s < last + AFTER_S)).sum()),
-            )
-        )
-    return told
+def _table(streams: Sequence[ExaminedStream]) -> ApproachTable:
+    raised = [np.asarray(one.alarm.raised(one.posterior)) for one in streams]
+    pairs = list(zip(streams, raised, strict=True))
+    return ApproachTable(
+        [told for one, alarm in pairs for told in alarm_outcomes(one.heard, one.heard.hops.time_s, alarm)],
+        [alarm for one, alarm in pairs if one.heard.hazard_free],
+    )
 
 
-def _outcomes(stream: ExaminedStream) -> list[AlarmOutcome]:
-    raised = np.asarray(stream.alarm.raised(stream.posterior))
-    return alarm_outcomes(stream.heard, stream.heard.hops.time_s, raised)
+def _loud(table: ApproachTable) -> ApproachTable:
+    return ApproachTable([one for one in table.outcomes if not one.approach.quiet], table.hazard_free)
 
 
-def _loud(streams: Sequence[ExaminedStream]) -> list[AlarmOutcome]:
-    return [one for stream in streams for one in _outcomes(stream) if not one.approach.quiet]
-
-
-def shortly_before(time_s: FloatArray, entry_s: float) -> BoolArray:
-    """Return the hops of the five seconds before a T0, shape (n,)."""
-    return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
-
-
-def _detections(told: Sequence[AlarmOutcome]) -> dict[str, float | None]:
-    hits, n = sum(one.detected for one in told), len(told)
-    low, high = share_interval(hits, n) if n else (None, None)
-    return {
-        "detected": mean_of([one.detected for one in told]),
-        "detected_low": low,
-        "detected_high": high,
-        "lead_s": mean_of([one.lead_s for one in told if one.detected]),
-        "lead_missed_as_0_s": mean_of([one.lead_s for one in told]),
-    }
-
-
-def _ranking(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+def _ranking(streams: Sequence[ExaminedStream]) -> Figures:
     """Return the mean AUROC over the last second before T0, and that at single times before it."""
     times = {f"auroc_{before:g}s_before": np.array([before]) for before in _CALIBRATED_S}
     asked = {"auroc_last_second": _LAST_SECOND_S, **times}
@@ -237,60 +172,36 @@ def _ranking(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     return {name: area if np.isfinite(area) else None for name, area in areas.items()}
 
 
-def _by_kind(told: Sequence[AlarmOutcome]) -> dict[str, float | int | None]:
+def _by_kind(told: Sequence[ApproachOutcome]) -> Figures:
     """Return three figures for each kind that came alone, quiet ones too."""
     # With a bicycle comes a car in half of the others, and the car is what is heard.
     alone = [one for one in told if len(one.approach.kinds) == 1]
-    found: dict[str, float | int | None] = {}
+    found: Figures = {}
     for kind in sorted({one.approach.kinds[0] for one in alone}):
-        leads = [one.lead_s for one in alone if one.approach.kinds[0] == kind]
-        detected = [lead for lead in leads if lead > 0.0]
-        found[f"approaches_{kind}"] = len(leads)
-        found[f"detected_{kind}"] = len(detected) / len(leads)
-        found[f"lead_{kind}_s"] = mean_of(detected)
+        figures = ApproachTable([one for one in alone if one.approach.kinds[0] == kind], ()).detections()
+        found |= {f"approaches_{kind}": figures["approaches"], f"detected_{kind}": figures["detected"]}
+        found[f"lead_{kind}_s"] = figures["lead_s"]
     return found
 
 
-def _false_alarms(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
-    quiet = [one for one in streams if one.heard.hazard_free]
-    found = quiet_figures([np.asarray(one.alarm.raised(one.posterior)) for one in quiet])
-    hours, rate = found["hazard_free_hours"], found["onsets_per_hour"]
-    if not hours or rate is None:
-        return found
-    low, high = poisson_interval(round(rate * hours), hours)
-    return found | {"onsets_low": low, "onsets_high": high}
-
-
-def quiet_figures(raised: Sequence[BoolArray]) -> dict[str, float | None]:
-    """Return the onsets an hour of streams in which nobody comes, and the share of their hops in alarm.
-
-    Shapes: raised (hops, 2).
-    """
-    alarms = [np.asarray(one.any(axis=1)) for one in raised]
-    hours = sum(map(len, alarms)) * HOP_S / SECONDS_PER_HOUR
-    if not hours:
-        return {"hazard_free_hours": 0.0, "onsets_per_hour": None, "hazard_free_share": None}
-    onsets = sum(rising_edges(one).size for one in alarms)
-    share = mean_of(np.concatenate(alarms))
-    return {"hazard_free_hours": hours, "onsets_per_hour": onsets / hours, "hazard_free_share": share}
-
-
-def _worst(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+def _worst(streams: Sequence[ExaminedStream]) -> Figures:
     """Return what is detected at the junction with the least of it, and the most onsets of any junction."""
     sites = np.array([one.heard.site for one in streams])
-    there = [[streams[i] for i in np.flatnonzero(sites == site).tolist()] for site in np.unique(sites)]
-    shares = [mean_of([one.detected for one in _loud(here)]) for here in there]
-    rates = [_false_alarms(here)["onsets_per_hour"] for here in there]
+    there = [
+        _loud(_table([streams[i] for i in np.flatnonzero(sites == site).tolist()])).figures()
+        for site in np.unique(sites)
+    ]
+    shares, rates = ([one[name] for one in there] for name in ("detected", "onsets_per_hour"))
     return {
         "detected_worst_junction": min((one for one in shares if one is not None), default=None),
         "onsets_per_hour_worst_junction": max((one for one in rates if one is not None), default=None),
     }
 
 
-def _calibration(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+def _calibration(streams: Sequence[ExaminedStream]) -> Figures:
     within = np.concatenate([one.posterior.within().reshape(-1, len(HORIZONS_S)) for one in streams])
     coming_s = np.concatenate([one.truth.coming_s.reshape(-1) for one in streams])
-    found: dict[str, float | None] = {}
+    found: Figures = {}
     for horizon_s in _CALIBRATED_S:
         said, true = within[:, HORIZONS_S.index(horizon_s)], coming_s <= horizon_s
         found[f"skill_{horizon_s:g}s"] = brier_skill(said, true)
@@ -298,12 +209,12 @@ def _calibration(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
     return found
 
 
-def _times(streams: Sequence[ExaminedStream]) -> dict[str, float | None]:
+def _times(streams: Sequence[ExaminedStream]) -> Figures:
     stated = np.concatenate([one.posterior.time_to_visible_s().reshape(-1, 3) for one in streams])
     return time_figures(stated, np.concatenate([one.truth.coming_s.reshape(-1) for one in streams]))
 
 
-def time_figures(stated: FloatArray, coming_s: FloatArray) -> dict[str, float | None]:
+def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:
     """Return how true the times are of those who come within five seconds; None where none is stated.
 
     Shapes: stated (n, 3), coming_s (n,).
@@ -319,14 +230,9 @@ def time_figures(stated: FloatArray, coming_s: FloatArray) -> dict[str, float | 
     }
 
 
-def mean_of(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
-    """Return the mean, None of nothing."""
-    return float(np.mean(values)) if len(values) else None
-
-
 def warned_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
     """Return the share of approaches whose alarm stood that long before T0 or earlier, shape (times,)."""
-    leads = np.array([one.lead_s for one in _loud(streams)])
+    leads = np.array([one.lead_s for one in _loud(_table(streams)).outcomes])
     return np.array([np.mean(leads > before) if leads.size else np.nan for before in before_s])
 
 

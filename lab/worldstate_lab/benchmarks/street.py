@@ -35,7 +35,7 @@ from worldstate.ground.values import wrap_angle
 from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.hidden_times import with_hidden_times
 from worldstate.operations.labelling.street_passes import WatchedRecording, seen_edge, streets_after
-from worldstate.operations.recordings.advisories import rising_edges
+from worldstate.operations.metrics.approach_table import rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.settings import rate_for

@@ -13,7 +13,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.alarm_rate import poisson_interval
-from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, detection, rising_edges
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, alarm_outcome, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
@@ -206,7 +206,7 @@ def _judge(others: Sequence[Staged], settings: AwarenessSettings) -> Callable[[H
 def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> AwarenessRow:
     free = [one for one in judged if one.recording.hazard_free]
     outcomes = [
-        detection(one.recording.time_s[rising_edges(one.alarm)].tolist(), one.recording.t0_s)
+        alarm_outcome(one.recording.time_s, one.alarm, one.recording.t0_s)
         for one in judged
         if not one.recording.hazard_free
     ]
@@ -222,7 +222,7 @@ def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> Awaren
         awareness=_estimate(*counts.awareness()),
         unseen_awareness=_mean(heard[~found]),
         detected=float(np.mean([one.detected for one in outcomes])),
-        lead_time_s=_mean([one.lead_time_s for one in outcomes if one.lead_time_s is not None]),
+        lead_time_s=_mean([one.lead_s for one in outcomes if one.detected]),
         false_alarms_per_hour=_rate([one.alarm for one in free], _hours(judged)),
         false_awareness_per_hour=_rate([one.raised for one in free], _hours(judged)),
         false_awareness=float(np.concatenate([one.raised for one in free]).mean()),

@@ -24,7 +24,7 @@ from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper
-from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, rising_edges
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate_lab.metrics.recording_draws import DRAWS, middle

@@ -8,8 +8,8 @@ import numpy as np
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.sequence.sequence_model import held
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
 from worldstate.operations.metrics.weighted_figures import draw_weights, ratio
-from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate_lab.methods.sustained_rule import SUSTAIN_CHOICES
 from worldstate_lab.metrics.recording_draws import middle

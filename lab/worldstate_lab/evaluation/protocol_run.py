@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR, caution
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, caution
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.trial import Decisions, Method, Trial

@@ -9,8 +9,8 @@ from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import wrap_angle
+from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, SLACK_S, onset_outcome, rising_edges
 from worldstate.operations.metrics.time_to_visible import visible_errors
-from worldstate.operations.recordings.advisories import LONGEST_LEAD_S, SLACK_S, detection, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.metrics.gospa import gospa_bearing
@@ -37,14 +37,14 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     lead_s = t0_s - said.time_s
     before = lead_s > SLACK_S
     # Relative to T0, so that the lead comes back to the last bit and finds its hop.
-    outcome = detection((-lead_s[onsets]).tolist(), 0.0)
-    first = onsets[lead_s[onsets] == outcome.lead_time_s]
+    outcome = onset_outcome(-lead_s[onsets], 0.0)
+    first = onsets[lead_s[onsets] == outcome.lead_s]
     named = int(said.side[first[0]]) if outcome.detected else NO_SIDE
     return {
         "approaches": 1.0,
         "detected": float(outcome.detected),
-        "lead_s": outcome.lead_time_s or 0.0,
-        "early_onsets": float(outcome.false_advisories_before),
+        "lead_s": outcome.lead_s,
+        "early_onsets": float(outcome.onsets_earlier),
         "side_right": float(named != NO_SIDE and named == _SIDES.get(trial.label)),
         "onsets_before": float(before[onsets].sum()),
         # Hops at which an onset would be counted: an alarm at random has one of them with equal chances.

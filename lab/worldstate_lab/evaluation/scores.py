@@ -11,6 +11,7 @@ from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper, random_detection
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
 from worldstate.operations.metrics.roc import rank_wins
 from worldstate.operations.metrics.weighted_figures import (
     draw_weights,
@@ -19,7 +20,6 @@ from worldstate.operations.metrics.weighted_figures import (
     ratio,
     weighted_median,
 )
-from worldstate.operations.recordings.advisories import SECONDS_PER_HOUR
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, joined

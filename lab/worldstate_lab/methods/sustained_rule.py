@@ -6,7 +6,7 @@ import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.operations.recordings.advisories import detection, rising_edges
+from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
 from worldstate_lab.trials.classification import SIDE_COLUMNS, posteriors
 from worldstate_lab.trials.trial import LEFT, RIGHT, Trial
 
@@ -42,7 +42,7 @@ def best_sustain(calibration: Sequence[Trial], evidence: str) -> int:
             if trial.hazard_free:
                 alarmed.append(bool(onsets))
             else:
-                found.append(detection(onsets, trial.t0_s).detected)
+                found.append(onset_outcome(onsets, trial.t0_s).detected)
         return _share(found) - _share(alarmed)
 
     # Of equals the smallest: it leaves the most lead.

@@ -16,9 +16,8 @@ from worldstate.abduction.cueing.risk_map import fit_isotonic
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.operations.metrics.approach_table import ApproachTable, alarm_outcome
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.recordings.advisories import detection, false_alarms_per_hour, rising_edges
-from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import (
     StatisticSwitches,
@@ -82,8 +81,8 @@ class AblationRow:
     auroc: float | None  # Windows before T0 against hazard-free ones
     detected: float | None  # Share of approaches announced before T0, and by how much in the mean
     lead_time_s: float | None
-    false_alarms_per_hour: float  # On hazard-free recordings
-    window_rate: float
+    false_alarms_per_hour: float | None  # On hazard-free recordings
+    window_rate: float | None
     ece: float | None  # Of the risk on the same windows, with its sampling floor
     ece_floor: float | None
     brier: float | None
@@ -244,15 +243,17 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
     risk, _ = _windows(
         [one.risk for one in free], [one.risk[b] for one, b in zip(approaches, before, strict=True)]
     )
-    found = [detection(_onsets_s(one), one.stream.t0_s) for one in approaches]
-    leads = [one.lead_time_s for one in found if one.lead_time_s is not None]
+    found = ApproachTable(
+        [alarm_outcome(one.stream.time_s, one.alarm, one.stream.t0_s) for one in approaches],
+        [one.alarm for one in free],
+    ).figures()
     both = bool(approaches) and bool(free)
     return AblationRow(
         auroc=auroc(statistic, hazards),
-        detected=float(np.mean([one.detected for one in found])) if found else None,
-        lead_time_s=float(np.mean(leads)) if leads else None,
-        false_alarms_per_hour=false_alarms_per_hour([one.alarm for one in free], HOP_S),
-        window_rate=float(np.mean(np.concatenate([one.alarm for one in free]))) if free else 0.0,
+        detected=found["detected"],
+        lead_time_s=found["lead_s"],
+        false_alarms_per_hour=found["onsets_per_hour"],
+        window_rate=found["hazard_free_share"],
         ece=expected_calibration_error(risk, hazards) if both else None,
         ece_floor=calibration_error_floor(risk, rng) if both else None,
         brier=brier_score(risk, hazards) if both else None,
@@ -260,10 +261,6 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
         vision_only=_share_in_sight(approaches, [one.stream.seen for one in approaches]),
         approach_weight=float(np.mean([one.weight for one in scored])),
     )
-
-
-def _onsets_s(one: _Scored) -> list[float]:
-    return [float(time_s) for time_s in one.stream.time_s[rising_edges(one.alarm)]]
 
 
 def _share_in_sight(scored: Sequence[_Scored], flags: Sequence[BoolArray]) -> float | None:

@@ -13,22 +13,17 @@ import numpy as np
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.stream_exam import (
-    AlarmOutcome,
-    StreamApproach,
-    alarm_outcomes,
-    approaches,
-    mean_of,
-    quiet_figures,
-    shortly_before,
-    time_figures,
-)
+from worldstate.commissioning.stream_exam import alarm_outcomes, approaches, time_figures
 from worldstate.commissioning.stream_labels import StreamTruth
 from worldstate.ground.values import wrap_angle
-from worldstate.operations.recordings.advisories import (
-    LONGEST_LEAD_S,
+from worldstate.operations.metrics.approach_table import (
     SLACK_S,
-    rising_edges,
+    Approach,
+    ApproachOutcome,
+    ApproachTable,
+    Figures,
+    mean_of,
+    shortly_before,
 )
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.state import Entity
@@ -52,8 +47,7 @@ class PassedStream:
 class PassOutcome:
     """One approach: what the advisories made of it, and the entities."""
 
-    alarm: AlarmOutcome
-    onsets: int  # Of advisories, from five seconds before T0 to T0
+    alarm: ApproachOutcome
     hidden_before: int  # Different entities believed hidden before T0
     identity: bool | None  # None where nobody was believed there, or nobody was seen
 
@@ -61,22 +55,20 @@ class PassOutcome:
 def outcomes(stream: PassedStream) -> list[PassOutcome]:
     """Return the outcome of every approach that lies whole within the stream."""
     followed = stream.followed
-    onsets_s = followed.time_s[rising_edges(followed.advisory.any(axis=1))]
     found = []
     for alarm in alarm_outcomes(stream.heard, followed.time_s, followed.advisory):
-        first, last = alarm.approach.entries_s[0], max(alarm.approach.entries_s)
+        last = max(alarm.approach.entries_s)
         hidden = {
             entity.id
             for hop in np.flatnonzero(shortly_before(followed.time_s, last))
             for side in (0, 1)
             for entity in followed.hidden(int(hop), side, EXISTS)
         }
-        onsets = int(((onsets_s > first - LONGEST_LEAD_S) & (onsets_s < first)).sum())
-        found.append(PassOutcome(alarm, onsets, len(hidden), _identity(stream, alarm.approach)))
+        found.append(PassOutcome(alarm, len(hidden), _identity(stream, alarm.approach)))
     return found
 
 
-def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
+def _identity(stream: PassedStream, one: Approach) -> bool | None:
     """Tell whether the entity hidden on the first vehicle's side at T0 is the one seen in its place later."""
     followed, entry_s = stream.followed, one.entries_s[0]
     hop = int(np.searchsorted(followed.time_s, entry_s - SLACK_S)) - 1
@@ -113,30 +105,29 @@ def _seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
     return nearest if distance <= NEAR_RAD else None
 
 
-def pass_figures(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
+def pass_figures(streams: Sequence[PassedStream]) -> Figures:
     """Return the figures of some streams together, ready for a table and for JSON."""
-    told = [one for stream in streams for one in outcomes(stream)]
-    loud = [one for one in told if not one.alarm.approach.quiet]
-    singles, both = ([one for one in loud if one.alarm.approach.flow == flow] for flow in ("single", "both"))
+    loud = [one for stream in streams for one in outcomes(stream) if not one.alarm.approach.quiet]
     judged = [one.identity for one in loud if one.identity is not None]
-    found: dict[str, float | int | None] = {
-        "approaches": len(loud),
-        "detected": mean_of([one.alarm.detected for one in loud]),
-        "lead_missed_as_0_s": mean_of([one.alarm.lead_s for one in loud]),
-        "onsets_per_approach": mean_of([one.onsets for one in loud if one.alarm.detected]),
-        "both_sides_found": mean_of([one.alarm.every_side for one in both]),
-        "other_side_too": mean_of([one.alarm.other_side for one in singles]),
-        "wrong_side_only": mean_of([one.alarm.other_side and not one.alarm.own_side for one in singles]),
-        "phantom_third": mean_of([one.hidden_before > 2 for one in both]),
+    table = ApproachTable(
+        [one.alarm for one in loud], [one.followed.advisory for one in streams if one.heard.hazard_free]
+    )
+    figures = table.figures() | table.sides()
+    named = ("approaches", "detected", "lead_missed_as_0_s", *table.sides())
+    found = {name: figures[name] for name in named} | {
+        "onsets_per_approach": mean_of([one.onsets for one in table.outcomes if one.detected]),
+        "phantom_third": mean_of(
+            [one.hidden_before > 2 for one in loud if one.alarm.approach.flow == "both"]
+        ),
         "identity_judged": len(judged),
         "identity_kept": mean_of(judged),
-        "onset_after_pass": mean_of([one.alarm.onsets_after > 0 for one in singles]),
+        "onset_after_pass": mean_of([one.onsets_after > 0 for one in table.of_flow("single").outcomes]),
     }
-    quiet = quiet_figures([one.followed.advisory for one in streams if one.heard.hazard_free])
-    return found | quiet | _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
+    found |= {name: figures[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")}
+    return found | _ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams)
 
 
-def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
+def _ahead(streams: Sequence[PassedStream]) -> Figures:
     """Return how often a vehicle first seen straight ahead takes the identity of a hidden one."""
     taken = []
     for stream in streams:
@@ -157,7 +148,7 @@ def _ahead(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
     return {"seen_ahead": len(taken), "took_hidden_identity": mean_of(taken)}
 
 
-def _kept(streams: Sequence[PassedStream]) -> dict[str, float | None]:
+def _kept(streams: Sequence[PassedStream]) -> Figures:
     """Return how often an entity stands near a vehicle in the three seconds after T0, and how many do."""
     near = []
     for stream in streams:
@@ -180,7 +171,7 @@ def _kept(streams: Sequence[PassedStream]) -> dict[str, float | None]:
     }
 
 
-def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
+def _forecast(streams: Sequence[PassedStream]) -> Figures:
     within = np.concatenate([one.followed.within[:, :, HORIZONS_S.index(2.0)].ravel() for one in streams])
     coming_s = np.concatenate([one.truth.coming_s.ravel() for one in streams])
     risk = np.concatenate([one.followed.risk.ravel() for one in streams])
@@ -197,7 +188,7 @@ def _forecast(streams: Sequence[PassedStream]) -> dict[str, float | None]:
     }
 
 
-def _bearing(streams: Sequence[PassedStream]) -> dict[str, float | int | None]:
+def _bearing(streams: Sequence[PassedStream]) -> Figures:
     """Return how far hidden azimuths are off, and the same over their variance, in the 3 s before T0."""
     errors_rad, stds_rad = [], []
     for stream in streams:

@@ -8,8 +8,8 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.plan import junction_named
-from worldstate.commissioning.stream_exam import AFTER_S
 from worldstate.ground.typing import FloatArray
+from worldstate.operations.metrics.approach_table import AFTER_S
 from worldstate.simulation.camera.simulated_detector import BOX_NOISE_PX, inside, miss_rate, project
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind

@@ -5,9 +5,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from worldstate.commissioning.stream_exam import StreamApproach, approaches
+from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.approach_table import Approach
 
 from .believed_stream import GONE_M, BelievedStream
 from .ego_vehicle import EgoVehicle
@@ -55,13 +56,13 @@ def joined_encounters(parts: Sequence[Encounters]) -> Encounters:
 
 def recorded_approaches(
     streams: Sequence[BelievedStream], *, quiet: bool
-) -> list[tuple[BelievedStream, StreamApproach]]:
+) -> list[tuple[BelievedStream, Approach]]:
     """Return all approaches of loud vehicles alone, or those with a quiet one among them."""
     return [(stream, one) for stream in streams for one in approaches(stream.heard) if one.quiet is quiet]
 
 
 def approach_encounters(
-    recorded: Sequence[tuple[BelievedStream, StreamApproach]],
+    recorded: Sequence[tuple[BelievedStream, Approach]],
     count: int,
     ego: EgoVehicle,
     rng: np.random.Generator,
@@ -100,7 +101,7 @@ def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.rand
     return joined_encounters(found)
 
 
-def _meets_s(stream: BelievedStream, one: StreamApproach, ego: EgoVehicle) -> float:
+def _meets_s(stream: BelievedStream, one: Approach, ego: EgoVehicle) -> float:
     """Return when an ego that never brakes has to begin to meet the first vehicle of an approach."""
     first = min(stream.ways, key=lambda way: abs(way.entry_s - one.entries_s[0]))
     middle_s = float(np.interp(0.0, -first.to_come_m - 0.5 * first.length_m, first.time_s))

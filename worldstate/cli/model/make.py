@@ -21,9 +21,9 @@ from worldstate.cli.common.progress import progress_bar
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_table import FeatureTable
     from worldstate.adapters.files.model_file import Model
-    from worldstate.commissioning.exam_report import Figures
     from worldstate.commissioning.plan import CommissionSettings
     from worldstate.frontend.array.microphone_array import MicrophoneArray
+    from worldstate.operations.metrics.approach_table import Figures
 
 # Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
 ONSETS = {"standing": 30.0, "moving": 60.0}

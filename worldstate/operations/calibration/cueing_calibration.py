@@ -15,7 +15,7 @@ from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.recordings.advisories import caution
+from worldstate.operations.metrics.approach_table import caution
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic

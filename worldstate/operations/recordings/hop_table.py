@@ -12,8 +12,7 @@ from worldstate.adapters.files.npz_file import load_npz, save_npz
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray
-
-from .advisories import SLACK_S
+from worldstate.operations.metrics.approach_table import SLACK_S
 
 # An hour of hops with a feature of 60 values each takes 20 MB.
 MAX_BYTES = 512 << 20

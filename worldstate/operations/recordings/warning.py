@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 
 from worldstate.ground.values import seconds
+from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, onset_outcome
 from worldstate.state import RiskCue, WorldState
-
-from .advisories import LONGEST_LEAD_S, detection
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +52,14 @@ class WarningMeter:
     def summary(self) -> WarningSummary:
         """Return the figures of all states so far."""
         onsets_s = tuple(time_s for time_s, _ in self._onsets)
-        found = None if self.t0_s is None else detection(onsets_s, self.t0_s)
+        found = None if self.t0_s is None else onset_outcome(onsets_s, self.t0_s)
         counted = list(filter(self._speaks_of_vehicle, self._onsets))
-        false = found.false_advisories_before if found else len(onsets_s) if self.hazard_free else None
+        false = found.onsets_earlier if found else len(onsets_s) if self.hazard_free else None
         first_s, hidden_id = next(iter(counted), (None, None))
         return WarningSummary(
             t0_s=self.t0_s,
             first_advisory_s=first_s,
-            lead_time_s=found.lead_time_s if found else None,
+            lead_time_s=(found.lead_s or None) if found else None,
             false_advisories_before=false,
             advisories_after_t0=None
             if self.t0_s is None

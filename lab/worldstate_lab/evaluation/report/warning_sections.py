@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.recordings.advisories import detection, rising_edges
+from worldstate.operations.metrics.approach_table import alarm_outcome
 from worldstate_lab.evaluation.evaluation import ALPHA, Evaluation
 from worldstate_lab.evaluation.paper_values import paper_value
 from worldstate_lab.evaluation.protocols import STATIC
@@ -136,12 +136,12 @@ _LEADS = (
 def _leads_s(trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> FloatArray:
     """Lead of every approach and seed, NaN where it was not detected."""
     leads = [
-        detection(said.time_s[rising_edges(said.alarm)].tolist(), trial.t0_s).lead_time_s
+        alarm_outcome(said.time_s, said.alarm, trial.t0_s).lead_s
         for answers in passes
         for trial, said in zip(trials, answers, strict=True)
         if not trial.hazard_free
     ]
-    return np.array([np.nan if lead is None else lead for lead in leads])
+    return np.array([lead or np.nan for lead in leads])
 
 
 def budget_section(found: Evaluation, values: Values) -> Section:

@@ -1,0 +1,228 @@
+"""Approaches and hazard-free hours under an alarm: what is detected, how early, and how many false alarms.
+
+Onsets and leads are counted here and nowhere else. A study makes one outcome of each approach, keeps the
+alarm of each hazard-free stream, and asks the table of both for its figures:
+
+>>> calm = np.zeros(36_000, bool)
+>>> calm[100:140] = True
+>>> table = ApproachTable([onset_outcome([5.5, 6.0], t0_s=7.0), onset_outcome([], t0_s=7.0)], [calm])
+>>> found = table.figures()
+>>> found["detected"], found["lead_s"], found["lead_missed_as_0_s"], found["onsets_per_hour"]
+(0.5, 1.5, 0.75, 1.0)
+
+A detection is defined in two ways, and each kind of data keeps its own. A recording holds one approach,
+and the first *onset* counts: `alarm_outcome`. In a stream an alarm may stand since the approach before,
+and either side may be named; the first *hop* in alarm counts: `hop_outcome`. Onsets and hops more than
+five seconds before T0 belong to something else.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.signature.site_signature import HOP_S
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+
+from .alarm_rate import poisson_interval, share_interval
+
+Figures = dict[str, float | int | None]
+LONGEST_LEAD_S, AFTER_S = 5.0, 6.0
+SECONDS_PER_HOUR = 3600.0
+# A hop ends with a whole sample, T0 is a camera frame: one that ends at T0 misses it by 10 us and more.
+SLACK_S = 1e-3
+# With fewer, one recording moves a rate by more than 5 % and most intervals span what is of interest.
+FEWEST_RECORDINGS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """Vehicles that belong together, the first to come into view first."""
+
+    flow: str = "single"  # "single", "both" or "queue"
+    entries_s: tuple[float, ...] = ()
+    sides: tuple[int, ...] = ()
+    kinds: tuple[str, ...] = ()
+    quiet: bool = False  # Whether any of them is a quiet road user, which has no target of its own
+
+
+@dataclass(frozen=True, slots=True)
+class ApproachOutcome:
+    """What an alarm made of one approach.
+
+    Examples
+    --------
+    >>> ApproachOutcome(lead_s=1.7).detected, ApproachOutcome(lead_s=0.0).detected
+    (True, False)
+    """
+
+    lead_s: float  # From the first alarm that counts to T0; 0 where missed
+    onsets: int = 0  # In the five seconds before T0
+    onsets_earlier: int = 0  # Before those
+    onsets_after: int = 0  # In the six seconds after the last T0, of a stream
+    # Whether the side of the first vehicle, the other one and the side of every vehicle were named, each in
+    # the five seconds before its T0; of a stream.
+    own_side: bool = False
+    other_side: bool = False
+    every_side: bool = False
+    approach: Approach = Approach()
+
+    @property
+    def detected(self) -> bool:
+        """Whether an alarm came before line of sight."""
+        return self.lead_s > 0.0
+
+
+def rising_edges(alarm: ArrayLike) -> IndexArray:
+    """Return the hops at which an alarm begins; one that is on from the first hop begins there.
+
+    Examples
+    --------
+    >>> rising_edges([True, False, False, True, True])
+    array([0, 3])
+    """
+    on = finite_array("alarm", alarm, (None,)) > 0.5
+    return np.flatnonzero(on & ~np.concatenate([[False], on[:-1]]))
+
+
+def onset_outcome(onsets_s: ArrayLike, t0_s: float) -> ApproachOutcome:
+    """Compare the onsets of one recording with its line-of-sight entry, both in seconds from its start.
+
+    Examples
+    --------
+    >>> found = onset_outcome([0.5, 5.5, 6.75], t0_s=7.0)
+    >>> found.lead_s, found.onsets, found.onsets_earlier
+    (1.5, 2, 1)
+    """
+    lead_s = in_range("t0_s", t0_s, -np.inf, np.inf) - finite_array("onsets_s", onsets_s, (None,))
+    early = lead_s > LONGEST_LEAD_S + SLACK_S
+    counted = lead_s[(lead_s > SLACK_S) & ~early]
+    return ApproachOutcome(float(counted.max(initial=0.0)), counted.size, int(early.sum()))
+
+
+def alarm_outcome(time_s: FloatArray, alarm: BoolArray, t0_s: float) -> ApproachOutcome:
+    """Return the outcome of the approach of a recording from its alarm at every hop, shapes (n,)."""
+    return onset_outcome(time_s[rising_edges(alarm)], t0_s)
+
+
+def hop_outcome(approach: Approach, time_s: FloatArray, raised: BoolArray) -> ApproachOutcome:
+    """Return the outcome of one approach of a stream: time_s (n,), alarm of either side (n, 2).
+
+    Examples
+    --------
+    >>> time_s = 0.1 * np.arange(100)
+    >>> left = np.column_stack([time_s > 5.55, np.zeros(100, bool)])
+    >>> found = hop_outcome(Approach("single", (8.0,), (1,)), time_s, left)
+    >>> round(found.lead_s, 1), found.own_side, found.other_side
+    (2.4, False, True)
+    """
+    first_s, last_s = approach.entries_s[0], max(approach.entries_s)
+    before, any_side = shortly_before(time_s, first_s), np.asarray(raised.any(axis=1))
+    alarms_s, onsets_s = time_s[before & any_side], time_s[rising_edges(any_side)]
+    named = np.asarray(raised[before].any(axis=0))
+    pairs = zip(approach.entries_s, approach.sides, strict=True)
+    return ApproachOutcome(
+        lead_s=first_s - float(alarms_s[0]) if alarms_s.size else 0.0,
+        onsets=int(((onsets_s > first_s - LONGEST_LEAD_S) & (onsets_s < first_s)).sum()),
+        onsets_after=int(((onsets_s >= last_s) & (onsets_s < last_s + AFTER_S)).sum()),
+        own_side=bool(named[approach.sides[0]]),
+        other_side=bool(named[1 - approach.sides[0]]),
+        every_side=all(raised[shortly_before(time_s, entry_s), side].any() for entry_s, side in pairs),
+        approach=approach,
+    )
+
+
+def shortly_before(time_s: FloatArray, entry_s: float) -> BoolArray:
+    """Return the hops of the five seconds before a T0, shape (n,)."""
+    return np.asarray((time_s > entry_s - LONGEST_LEAD_S) & (time_s < entry_s - SLACK_S))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ApproachTable:
+    """Outcomes of approaches, and the alarms of hazard-free streams, of shape (n,), or (n, 2) by side.
+
+    Examples
+    --------
+    >>> table = ApproachTable([], [np.array([False, True, True, False]), np.array([True] * 5 + [False] * 3)])
+    >>> table.onsets, round(table.figures()["onsets_per_hour"]), table.figures()["detected"]
+    (2, 6000, None)
+    """
+
+    outcomes: Sequence[ApproachOutcome]
+    hazard_free: Sequence[BoolArray]
+
+    @property
+    def hours(self) -> float:
+        """Scored hazard-free time."""
+        return sum(map(len, self.hazard_free)) * HOP_S / SECONDS_PER_HOUR
+
+    @property
+    def onsets(self) -> int:
+        """False alarms: rising edges in hazard-free time."""
+        return sum(rising_edges(alarm).size for alarm in self._alarms())
+
+    def figures(self) -> Figures:
+        """Return what is detected and what false alarms it costs, None where there is nothing to count."""
+        return self.detections() | self.false_alarms()
+
+    def detections(self) -> Figures:
+        """Return the share detected with its exact 95 % interval, and the mean lead, misses left out or 0."""
+        detected = [one.detected for one in self.outcomes]
+        low, high = share_interval(sum(detected), len(detected)) if detected else (None, None)
+        return {
+            "approaches": len(detected),
+            "detected": mean_of(detected),
+            "detected_low": low,
+            "detected_high": high,
+            "lead_s": mean_of([one.lead_s for one in self.outcomes if one.detected]),
+            "lead_missed_as_0_s": mean_of([one.lead_s for one in self.outcomes]),
+        }
+
+    def sides(self) -> Figures:
+        """Return how often single vehicles are announced from the other side, and both of two are found."""
+        singles, both = (self.of_flow(flow).outcomes for flow in ("single", "both"))
+        return {
+            "other_side_too": mean_of([one.other_side for one in singles]),
+            "wrong_side_only": mean_of([one.other_side and not one.own_side for one in singles]),
+            "both_sides_found": mean_of([one.every_side for one in both]),
+        }
+
+    def false_alarms(self) -> Figures:
+        """Return onsets an hour of hazard-free time with the exact interval, and the share of it in alarm."""
+        if not self.hours:
+            return {"hazard_free_hours": 0.0, "onsets_per_hour": None, "hazard_free_share": None}
+        low, high = poisson_interval(self.onsets, self.hours)
+        return {
+            "hazard_free_hours": self.hours,
+            "onsets_per_hour": self.onsets / self.hours,
+            "hazard_free_share": mean_of(np.concatenate(self._alarms())),
+            "onsets_low": low,
+            "onsets_high": high,
+        }
+
+    def of_flow(self, flow: str) -> "ApproachTable":
+        """Return the table of the approaches of one flow."""
+        return ApproachTable([one for one in self.outcomes if one.approach.flow == flow], self.hazard_free)
+
+    def _alarms(self) -> list[BoolArray]:
+        return [one if one.ndim == 1 else np.asarray(one.any(axis=1)) for one in self.hazard_free]
+
+
+def mean_of(values: Sequence[float] | Sequence[bool] | BoolArray) -> float | None:
+    """Return the mean, None of nothing."""
+    return float(np.mean(values)) if len(values) else None
+
+
+def caution(count: int, what: str = "recordings") -> str | None:
+    """Return what to say of figures from so few; None from 20 on.
+
+    Examples
+    --------
+    >>> caution(6), caution(20)
+    ('6 recordings: figures from fewer than 20 cannot be read', None)
+    """
+    if count >= FEWEST_RECORDINGS:
+        return None
+    return f"{count} {what}: figures from fewer than {FEWEST_RECORDINGS} cannot be read"
