@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+from argparse import Namespace
 from base64 import b64decode
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worldstate_lab.cli.main import main
 from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
 from worldstate_lab.degradation.beta_curves import Band, BetaCurves
 from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, Condition
@@ -26,25 +28,18 @@ from worldstate_lab.evaluation.protocol_run import ProtocolRun
 from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC
 from worldstate_lab.evaluation.report.approach_timeline import ApproachTimeline, approach_figure
 from worldstate_lab.evaluation.report.contents import evaluation_document
-from worldstate_lab.evaluation.report.csv_table import csv_text
 from worldstate_lab.evaluation.report.cueing_panels import roc_curve
-from worldstate_lab.evaluation.report.document import (
-    Curves,
-    Document,
-    ReportFigure,
-    ReportTable,
-    Section,
-    Value,
-)
-from worldstate_lab.evaluation.report.html_page import html_page
-from worldstate_lab.evaluation.report.markdown_page import markdown_page
 from worldstate_lab.evaluation.report.study_sections import signature_values
-from worldstate_lab.evaluation.report.writing import write_document
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.calibrated_cue import CalibratedCue
 from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.methods.published_rule import PublishedRule
 from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.report.document import Document, Section
+from worldstate_lab.report.pages import html_page, markdown_page
+from worldstate_lab.report.results import keep_results, read_results
+from worldstate_lab.report.table import Figure, Table, Value
+from worldstate_lab.report.writing import write_document
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 from worldstate_lab.trials.takes import Take, TakeList
 from worldstate_lab.trials.trial import Trial
@@ -85,10 +80,8 @@ def plot(canvas):
 
 
 def small_document(text, draw=plot):
-    table = ReportTable(
-        "t", text, (text, "v"), ((text, Value(0.5, 0.4, 0.6, note=text, paper=Value(1.0))),), text
-    )
-    figure = ReportFigure("f", text, text, draw, Curves(("x", text), [(0.1, text)]))
+    table = Table("t", text, (text, "v"), ((text, Value(0.5, 0.4, 0.6, note=text, paper=Value(1.0))),), text)
+    figure = Figure("f", text, text, draw, ("x", text), [(0.1, text)])
     return Document(text, text, (Section(text, (text,), (table, figure)),), ((text, text),))
 
 
@@ -111,8 +104,8 @@ def test_what_comes_from_outside_is_text_and_never_markup():
 @settings(max_examples=30)
 @given(st.lists(st.tuples(st.text(max_size=8), st.floats(-1e6, 1e6)), min_size=1, max_size=5))
 def test_csv_gives_every_number_back_to_the_last_bit(rows):
-    table = ReportTable("t", "", ("name", "x"), tuple((name, Value(x, x - 1.0)) for name, x in rows))
-    read = list(csv.reader(io.StringIO(csv_text(table), newline="")))
+    table = Table("t", "", ("name", "x"), tuple((name, Value(x, x - 1.0)) for name, x in rows))
+    read = list(csv.reader(io.StringIO(table.csv(), newline="")))
     assert read[0] == ["name", "x value", "x low"]
     assert [(float(a), float(b)) for _, a, b in read[1:]] == [(x, x - 1.0) for _, x in rows]
 
@@ -245,9 +238,9 @@ def evaluation(tmp_path_factory):
 
 def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(evaluation, tmp_path):
     document = evaluation_document(evaluation, configuration=(("--seed", "7"),))
-    blocks = {block.name: block for block in document.all_blocks}
+    blocks = {block.name: block for block in document.blocks}
     assert ("--seed", "7") in document.facts
-    assert len(blocks) == len(document.all_blocks), "two blocks would share a file"
+    assert len(blocks) == len(document.blocks), "two blocks would share a file"
     assert len(blocks["paper"].rows) == len(PAPER_VALUES)
     row = next(row for row in blocks["table_i"].rows if row[0] == "proposed .02")
     cells = dict(zip(blocks["table_i"].columns, row, strict=True))
@@ -271,7 +264,7 @@ def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(eva
 
 
 def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(evaluation, tmp_path):
-    blocks = {block.name: block for block in evaluation_document(evaluation).all_blocks}
+    blocks = {block.name: block for block in evaluation_document(evaluation).blocks}
     hours = 8 * 60 * 0.1 / 3600.0
     told = f"16 recordings: 8 approaches and 8 hazard-free, {hours:.3f} h."
     assert {"table_i", "alpha", "calibration", "strata", "ablations", "protocol_junctions_fixed"} <= {
@@ -285,7 +278,7 @@ def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(ev
     rate = dict(zip(table.columns, row, strict=True))["false alarms (1/h)"]
     worst = max(sites, key=lambda site: sites[site]["false_alarms_per_hour"])
     assert rate.note == f"worst {worst} {sites[worst]['false_alarms_per_hour']:.0f}"
-    assert rate.note in csv_text(table)
+    assert rate.note in table.csv()
     fewer = next(row for row in blocks["paper"].rows if row[2].endswith("false alarms saved"))[5]
     assert fewer.low <= fewer.value <= fewer.high
 
@@ -294,7 +287,7 @@ def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evalua
     why = "<b>: not the array of the model"
     refused = {"static": {"shipped model": why, "shipped scores .02": why}}
     document = evaluation_document(replace(evaluation, refused=refused))
-    blocks = {block.name: block for block in document.all_blocks}
+    blocks = {block.name: block for block in document.blocks}
     for name, method in (("table_i", "shipped model"), ("grounded", "shipped scores .02")):
         (cells,) = (row[1:] for row in blocks[name].rows if row[0] == method)
         assert cells[0].number == "not scored: the model was not made for this sound"
@@ -314,7 +307,7 @@ def test_an_approach_without_video_is_drawn_without_images_and_says_so():
     )
     assert "left out" in figure.caption
     # The boxes of one image are counted at its hop, each once.
-    assert sum(row[3] for row in figure.numbers.rows) == 2
+    assert sum(row[3] for row in figure.rows) == 2
 
 
 def degradation(detectors):
@@ -349,16 +342,16 @@ def degradation(detectors):
 
 def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation, tmp_path):
     document = evaluation_document(replace(evaluation, degradation=degradation(("first", "<b>second"))))
-    names = [block.name for block in document.all_blocks]
+    names = [block.name for block in document.blocks]
     assert len(set(names)) == len(names)
     assert {"cueing_awareness_1", "cueing_awareness_2", "degradation_2", "rain_2"} <= set(names)
-    paper = {row[2]: row[3:6] for block in document.all_blocks if block.name == "paper" for row in block.rows}
+    paper = {row[2]: row[3:6] for block in document.blocks if block.name == "paper" for row in block.rows}
     least, _, found = paper["after line-of-sight entry: least hazard awareness"]
     assert (least.value, found.value) == (0.87, pytest.approx(0.94))
     _, _, found = paper["miss rate of the camera: clean, 20 to 30 deg"]
     assert found.value == pytest.approx(0.07)
-    (panel,) = (block for block in document.all_blocks if block.name == "cueing_awareness_1")
-    (worst,) = (row[2:4] for row in panel.numbers.rows if row[0] == "blur" and row[1] == 4)
+    (panel,) = (block for block in document.blocks if block.name == "cueing_awareness_1")
+    (worst,) = (row[2:4] for row in panel.rows if row[0] == "blur" and row[1] == 4)
     assert worst == pytest.approx((0.45, 0.94))
     write_document(document, tmp_path)
     assert "<b>second" not in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -377,3 +370,20 @@ def test_signature_rows_fill_the_paper_s_numbers_and_a_range_its_two_ends():
         "auroc_shape_least": 0.7,
         "auroc_shape_most": 0.8,
     }
+
+
+def test_results_are_merged_by_the_words_that_change_a_figure(tmp_path, capsys):
+    path = tmp_path / "results.json"
+    for words in (["bench", "--seed", "3"], ["bench", "--seed", "3", "--jobs", "2"], ["bench", "--smoke"]):
+        given = Namespace(seed=3, smoke="--smoke" in words)
+        keep_results(path, words, given, {"beta": np.array([0.1, np.nan])})
+    found = read_results(path)
+    assert {key: one["smoke"] for key, one in found.items()} == {
+        "bench --seed 3": False,
+        "bench --smoke": True,
+    }
+    assert found["bench --seed 3"]["figures"] == {"beta": [0.1, None]}
+    assert found["bench --seed 3"]["seeds"] == [3] and "commit" in found["bench --seed 3"]
+    path.write_text("{")
+    assert main(["place", "none.csv", "--results", str(path)]) == 2
+    assert "expected results" in capsys.readouterr().err

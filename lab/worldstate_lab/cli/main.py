@@ -1,9 +1,14 @@
 """Entry point of `worldstate-lab`: one module per study, each with `EXAMPLE`, `add_options` and `run`."""
 
+import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 
 from worldstate.cli.common.entry import build_parser, run_command
+from worldstate.cli.common.output import CommandResult
+from worldstate_lab.report.results import keep_results, read_results
 
 COMMANDS = {
     name: f"worldstate_lab.cli.{name}"
@@ -26,10 +31,33 @@ DESCRIPTION = "The evaluation of the paper, and studies of our own."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
 
 
+Run = Callable[[argparse.Namespace], CommandResult]
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one study; return its exit code: 0, or 2 and one line on standard error for bad input."""
     words = sys.argv[1:] if argv is None else argv
-    return run_command(lambda: build_parser("worldstate-lab", DESCRIPTION, EPILOG, COMMANDS), words)
+    return run_command(lambda: _parser(words), words)
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser, in which every study can keep its figures in a results file."""
+    parser = build_parser("worldstate-lab", DESCRIPTION, EPILOG, COMMANDS)
+    (studies,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
+    for study in studies.choices.values():
+        study.add_argument("--results", type=Path, metavar="FILE", help="merge the figures into this file")
+        study.set_defaults(run=partial(_run, study.get_default("run"), words))
+    return parser
+
+
+def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> CommandResult:
+    """Run a study and keep its figures, in a file that is read before the work begins."""
+    if arguments.results is None:
+        return run(arguments)
+    read_results(arguments.results)
+    result = run(arguments)
+    keep_results(arguments.results, words, arguments, result.report)
+    return result
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ PASSAGES = 6
 # What two evaluations must have in common for their figures to be comparable.
 COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
 # Where the work is done and what is printed of it.
-_NO_FIGURE = ("run", "json", "dataset", "out", "jobs", "engine", "scheduler", "against")
+_NO_FIGURE = ("run", "json", "results", "dataset", "out", "jobs", "engine", "scheduler", "against")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
 
 
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate_lab.evaluation.against import save_scores
     from worldstate_lab.evaluation.evaluation import EvaluationSettings, evaluate, lacking_data
     from worldstate_lab.evaluation.report.contents import evaluation_document
-    from worldstate_lab.evaluation.report.writing import write_document
+    from worldstate_lab.report.writing import write_document
     from worldstate_lab.trials.engine import Engine
     from worldstate_lab.trials.hearing import Hearing
 

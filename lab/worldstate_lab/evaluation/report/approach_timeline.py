@@ -12,13 +12,13 @@ from worldstate.adapters.camera.video import open_video
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray
 from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.report.table import Figure
 
-from .document import Curves, ReportFigure
 from .panels import legend_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 # The paper's first image is 2.5 s before line-of-sight entry, with the vehicle still behind the corner.
 HIDDEN_S = 2.5
@@ -53,10 +53,10 @@ class ApproachTimeline:
     images: tuple[ApproachImage, ...] = ()
 
 
-def approach_figure(approach: ApproachTimeline) -> ReportFigure:
+def approach_figure(approach: ApproachTimeline) -> Figure:
     """Draw an approach as the paper's timeline figure does; without images their row is left out."""
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         rows = 2 if approach.images else 1
         grid = canvas.add_gridspec(rows, max(len(approach.images), 1), height_ratios=(0.62, 1.0)[-rows:])
         for i, image in enumerate(approach.images):
@@ -75,16 +75,14 @@ def approach_figure(approach: ApproachTimeline) -> ReportFigure:
         if approach.images
         else "The recording has no video that could be read, so the row of camera images is left out. "
     )
-    return ReportFigure(
+    return Figure(
         "approach_timeline",
         approach.title,
         f"{camera}Below: hazard statistic at the end of each 1-s window, threshold, advisory, moving boxes "
         "of the camera, and line-of-sight entry T0.",
         draw,
-        Curves(
-            ("time_s", "statistic", "advisory", "moving_boxes"),
-            [(float(t), float(s), int(on), int(n)) for t, s, on, n in zip(*columns, strict=True)],
-        ),
+        ("time_s", "statistic", "advisory", "moving_boxes"),
+        [(float(t), float(s), int(on), int(n)) for t, s, on, n in zip(*columns, strict=True)],
         size_in=(9.0, 5.4 if approach.images else 3.4),
     )
 

@@ -13,11 +13,12 @@ from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.protocols import PROTOCOLS, STATIC
 from worldstate_lab.evaluation.report import study_sections as study
 from worldstate_lab.evaluation.report import warning_sections as warning
+from worldstate_lab.report.document import Document, Section
+from worldstate_lab.report.table import Table, Value
 from worldstate_lab.signatures.signature_study import SignatureStudy
 from worldstate_lab.trials.hearing import data_fingerprint
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
-from .document import Document, ReportTable, Section, Value
 from .measured_values import Values, measured_values
 
 
@@ -85,11 +86,11 @@ def _data_section(found: Evaluation, values: Values) -> Section:
         "published classifier trained on",
         "state",
     )
-    blocks = [ReportTable("protocols", "Protocols", heads, tuple(rows))]
+    blocks = [Table("protocols", "Protocols", heads, tuple(rows))]
     if found.failed:
         failed = tuple((one.name, one.problem) for one in found.failed)
         blocks.append(
-            ReportTable("skipped", "Recordings that could not be heard", ("recording", "problem"), failed)
+            Table("skipped", "Recordings that could not be heard", ("recording", "problem"), failed)
         )
     sound = (
         "Every recording is simulated: no figure of this report is a measurement on real sound, and "

@@ -9,12 +9,12 @@ import numpy as np
 from worldstate.abduction.cueing.calibration_error import reliability_curve
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from worldstate_lab.report.table import Figure, Value
 
-from .document import Curves, ReportFigure, Value
 from .panels import GREY, legend_below, mark_chance, thinned
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 _COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
@@ -37,9 +37,7 @@ def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray,
     return false, true
 
 
-def roc_figure(
-    hazards: Mapping[str, FloatArray], free: FloatArray, areas: Mapping[str, Value]
-) -> ReportFigure:
+def roc_figure(hazards: Mapping[str, FloatArray], free: FloatArray, areas: Mapping[str, Value]) -> Figure:
     """Draw the ROC of hazard windows against hazard-free ones, one curve a horizon.
 
     `hazards` holds the statistic of the windows by horizon, `free` that of hazard-free windows, `areas` the
@@ -47,7 +45,7 @@ def roc_figure(
     """
     curves = {name: thinned(*roc_curve(scores, free)) for name, scores in hazards.items() if scores.size}
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         mark_chance(axes)
         for name, curve in curves.items():
@@ -56,26 +54,27 @@ def roc_figure(
         legend_below(canvas, columns=1)
 
     rows = [(name, *point) for name, curve in curves.items() for point in zip(*curve, strict=True)]
-    return ReportFigure(
+    return Figure(
         "cueing_roc",
         "(a) Windows told apart, by time to line of sight",
         "ROC of the hazard statistic: windows of occluded approaches that end within the horizon before T0 "
         "against hazard-free windows. Area with its 95 % interval; the grey diagonal is chance.",
         draw,
-        Curves(("horizon", "false_positive_rate", "true_positive_rate"), rows),
+        ("horizon", "false_positive_rate", "true_positive_rate"),
+        rows,
     )
 
 
 def reliability_figure(
     risks: Mapping[str, FloatArray], labels: BoolArray, errors: Mapping[str, Value]
-) -> ReportFigure:
+) -> Figure:
     """Draw the observed share of hazards over what was predicted, by reading (raw, calibrated).
 
     `risks` holds the probabilities by reading, each as long as `labels`; `errors` their ECE.
     """
     curves = {name: reliability_curve(values, labels) for name, values in risks.items()}
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes, counts = canvas.subplots(2, 1, sharex=True, height_ratios=(1.0, 0.28))
         mark_chance(axes)
         for (name, curve), mark in zip(curves.items(), _MARKS, strict=False):
@@ -97,13 +96,14 @@ def reliability_figure(
         for name, one in curves.items()
         for point in zip(one.predicted, one.observed, one.counts, strict=True)
     ]
-    return ReportFigure(
+    return Figure(
         "cueing_reliability",
         "(b) Reliability of the stated probability",
         f"Ten equal bins, held-out folds, {labels.mean():.0%} of the windows are hazards. "
         "Below: windows in each bin. On the diagonal a probability means what it says.",
         draw,
-        Curves(("reading", "predicted", "observed", "windows"), rows),
+        ("reading", "predicted", "observed", "windows"),
+        rows,
         size_in=(4.4, 4.2),
     )
 
@@ -118,10 +118,10 @@ class OperatingPoint:
     alpha: float | None = None
 
 
-def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) -> ReportFigure:
+def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) -> Figure:
     """Draw detection against achieved false alarms an hour: the curve over alpha, the others as points."""
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         _draw_operating(canvas, points, max(quantum_per_hour, 1e-3))
 
     names = ("detection", "false_alarms_per_hour")
@@ -135,26 +135,27 @@ def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) 
         )
         for one in points
     ]
-    return ReportFigure(
+    return Figure(
         "cueing_operating",
         "(c) Detection against achieved false alarms",
         f"Bars are 95 % intervals; open marks are the paper's. One alarm onset is {quantum_per_hour:.3g} "
         "an hour: left of it the axis is linear, right of it logarithmic.",
         draw,
-        Curves(("method", "alpha", *columns), rows),
+        ("method", "alpha", *columns),
+        rows,
         size_in=(4.4, 4.4),
     )
 
 
 def awareness_figure(
     families: Mapping[str, Sequence[tuple[Value, Value]]], paper_least: float | None = None
-) -> ReportFigure:
+) -> Figure:
     """Draw hazard awareness over the measured miss rate beta, one line a family of degradations.
 
     `families` holds (beta, awareness) by level, the clean camera first.
     """
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         axes.plot([0.0, 1.0], [1.0, 0.0], color=GREY, linestyle="--", label=r"vision alone, $1-\beta$")
         for (name, levels), mark in zip(families.items(), _MARKS, strict=False):
@@ -174,18 +175,19 @@ def awareness_figure(
         for name, levels in families.items()
         for level, (beta, aware) in enumerate(levels)
     ]
-    return ReportFigure(
+    return Figure(
         "cueing_awareness",
         "(d) Hazard awareness while the camera fails",
         "Share of the hops after T0 in which the vehicle is seen or said to be there, over the share that "
         "the camera misses; level 0 is the clean camera. Bands are 95 % intervals over recordings.",
         draw,
-        Curves(("family", "level", "miss_rate", "awareness", "awareness_low", "awareness_high"), rows),
+        ("family", "level", "miss_rate", "awareness", "awareness_low", "awareness_high"),
+        rows,
         size_in=(4.4, 4.2),
     )
 
 
-def _draw_operating(canvas: "Figure", points: Sequence[OperatingPoint], linear: float) -> None:
+def _draw_operating(canvas: "Canvas", points: Sequence[OperatingPoint], linear: float) -> None:
     curve = sorted((one for one in points if one.alpha is not None), key=lambda one: one.alpha or 0.0)
     others = [one for one in points if one.alpha is None]
     axes = canvas.subplots()
@@ -221,7 +223,7 @@ def _numbers(one: Value) -> tuple[float, float, float, float]:
     return one.value, one.low, one.high, one.paper.value if one.paper else float("nan")
 
 
-def _mark(canvas: "Figure", one: OperatingPoint, colour: str, mark: str, label: str) -> None:
+def _mark(canvas: "Canvas", one: OperatingPoint, colour: str, mark: str, label: str) -> None:
     """Draw a point with its two intervals, and the paper's as an open mark of the same shape."""
     axes = canvas.axes[0]
     x, y = one.false_alarms_per_hour, one.detection

@@ -10,9 +10,10 @@ from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
 from worldstate_lab.degradation.stream_sweep import StreamSweep
 from worldstate_lab.evaluation.paper_values import COMMANDS, paper_value
+from worldstate_lab.report.document import Section
+from worldstate_lab.report.table import Cell, Figure, Table, Value
 
 from .cueing_panels import awareness_figure
-from .document import Cell, ReportFigure, ReportTable, Section, Value
 from .measured_values import Place
 from .miss_rate_panels import miss_rate_angle_figure, miss_rate_level_figure
 
@@ -48,7 +49,7 @@ def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
     return rates | {("degradation", _AWARE, name): _value(one) for name, one in least.items()}
 
 
-def awareness_figures(study: DegradationStudy) -> tuple[ReportFigure, ...]:
+def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
     """Return panel (d) for every detector, the paper's least awareness beside it."""
     paper = paper_value("degradation", _AWARE, "awareness_least")
     figures = []
@@ -91,7 +92,7 @@ def degradation_section(
     return Section(title, tuple(text), streams, parts)
 
 
-def _streams(sweep: StreamSweep) -> ReportTable:
+def _streams(sweep: StreamSweep) -> Table:
     rows = tuple(
         (
             row.name,
@@ -102,7 +103,7 @@ def _streams(sweep: StreamSweep) -> ReportTable:
         )
         for row in sweep.rows
     )
-    return ReportTable(
+    return Table(
         "staged_streams",
         "Advisories where nobody comes, while the camera fails and it rains",
         ("state", "onsets", "an hour", "at most (90 %)", "to the clean camera"),
@@ -136,9 +137,9 @@ def _detector_section(sweep: DetectorSweep, number: int) -> Section:
     )
 
 
-def _conditions(sweep: DetectorSweep, number: int) -> ReportTable:
+def _conditions(sweep: DetectorSweep, number: int) -> Table:
     rows = tuple(_condition(row) for row in sweep.awareness.rows)
-    return ReportTable(
+    return Table(
         f"degradation_{number}",
         f"Awareness by condition, {sweep.detector}",
         _CONDITION,
@@ -163,7 +164,7 @@ def _condition(row: AwarenessRow) -> tuple[Cell, ...]:
     )
 
 
-def _rain(sweep: DetectorSweep, number: int) -> ReportTable:
+def _rain(sweep: DetectorSweep, number: int) -> Table:
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (
             str(one.level),
@@ -181,7 +182,7 @@ def _rain(sweep: DetectorSweep, number: int) -> ReportTable:
         "if effects added up",
         "optimism of (A1)",
     )
-    return ReportTable(
+    return Table(
         f"rain_{number}",
         f"Rain as a common cause: awareness (share), {sweep.detector}",
         heads,
@@ -191,7 +192,7 @@ def _rain(sweep: DetectorSweep, number: int) -> ReportTable:
     )
 
 
-def _of_detector(figure: ReportFigure, sweep: DetectorSweep, number: int) -> ReportFigure:
+def _of_detector(figure: Figure, sweep: DetectorSweep, number: int) -> Figure:
     return replace(figure, name=f"{figure.name}_{number}", title=f"{figure.title}, {sweep.detector}")
 
 

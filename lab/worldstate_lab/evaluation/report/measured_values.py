@@ -17,8 +17,7 @@ from worldstate_lab.evaluation.protocols import RETRAINED, STATIC
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s
 from worldstate_lab.metrics.recording_draws import middle
-
-from .document import Value
+from worldstate_lab.report.table import Value
 
 Place = tuple[str, str, str]  # Group, row and figure, as in `PAPER_VALUES`
 Values = Mapping[Place, Value]

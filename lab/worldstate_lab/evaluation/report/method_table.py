@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
+from worldstate_lab.report.table import Cell, Table, Value
 
-from .document import Cell, ReportTable, Value
 from .measured_values import Values
 
 _UNSTATED = {
@@ -30,7 +30,7 @@ def method_table(
     name: str,
     title: str,
     caption: str,
-) -> ReportTable:
+) -> Table:
     """Return a table with a row for each method and a column, head and figure, for each of `columns`."""
     refused = found.refused.get(protocol, {})
     rows: list[tuple[Cell, ...]] = []
@@ -43,7 +43,7 @@ def method_table(
             cells = (values.get((protocol, method, figure), Value(np.nan)) for _, figure in columns)
             rows.append((method, *(_cell(one, f) for one, (_, f) in zip(cells, columns, strict=True))))
     told = " ".join((f"{stands_on(found, protocol)}.", caption, *reasons))
-    return ReportTable(name, title, ("method", *(head for head, _ in columns)), tuple(rows), told)
+    return Table(name, title, ("method", *(head for head, _ in columns)), tuple(rows), told)
 
 
 def methods_of(found: Evaluation, protocol: str) -> list[str]:

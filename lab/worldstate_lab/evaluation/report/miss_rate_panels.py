@@ -6,21 +6,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from worldstate.ground.typing import FloatArray, IntArray
+from worldstate_lab.report.table import Figure, Value
 
-from .document import Curves, ReportFigure, Value
 from .panels import legend_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 _MARKS = ("o", "s", "^", "D", "v", "P")
 
 
-def miss_rate_level_figure(families: Mapping[str, Sequence[tuple[str, Value]]]) -> ReportFigure:
+def miss_rate_level_figure(families: Mapping[str, Sequence[tuple[str, Value]]]) -> Figure:
     """Draw beta over the level, one line a family; `families` holds (d as text, beta), clean first."""
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for (name, levels), mark in zip(families.items(), _MARKS, strict=False):
             _line(axes, np.arange(len(levels)), [value for _, value in levels], mark, name)
@@ -34,21 +34,22 @@ def miss_rate_level_figure(families: Mapping[str, Sequence[tuple[str, Value]]]) 
         for name, levels in families.items()
         for level, value in levels
     ]
-    return ReportFigure(
+    return Figure(
         "miss_rate_level",
         "Miss rate of the camera by degradation",
         "Share of the hops with a vehicle in view in which the detector reports none, with its 95 % interval "
         "over recordings. The paper: 0.04 clean at boresight, 0.97 in the harshest noise.",
         draw,
-        Curves(("family", "level", "miss_rate", "low", "high"), rows),
+        ("family", "level", "miss_rate", "low", "high"),
+        rows,
     )
 
 
-def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Sequence[float]) -> ReportFigure:
+def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Sequence[float]) -> Figure:
     """Draw beta over |azimuth|, one line a state of the camera; one value between two edges."""
     middle = 0.5 * (np.asarray(edges_deg)[1:] + np.asarray(edges_deg)[:-1])
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for (name, values), mark in zip(states.items(), _MARKS, strict=False):
             _line(axes, middle, values, mark, name)
@@ -63,13 +64,14 @@ def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Seq
         for name, values in states.items()
         for low, high, value in zip(edges_deg[:-1], edges_deg[1:], values, strict=True)
     ]
-    return ReportFigure(
+    return Figure(
         "miss_rate_angle",
         "Miss rate of the camera by angle",
         "As before, by the angle between the vehicle and the optical axis. The paper, clean camera: 0.04 at "
         "boresight, 0.14 at 20 to 30 degrees.",
         draw,
-        Curves(("state", "from_deg", "to_deg", "miss_rate", "low", "high"), rows),
+        ("state", "from_deg", "to_deg", "miss_rate", "low", "high"),
+        rows,
     )
 
 

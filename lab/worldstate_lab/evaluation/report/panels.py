@@ -8,14 +8,14 @@ from worldstate.ground.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 # A curve of more points than this looks the same at 600 pixels, and its CSV takes megabytes.
 MOST_POINTS = 200
 GREY = "0.55"
 
 
-def legend_below(canvas: "Figure", columns: int = 2) -> None:
+def legend_below(canvas: "Canvas", columns: int = 2) -> None:
     """Put one legend below all axes, where it hides no data, each label once."""
     found = [axes.get_legend_handles_labels() for axes in canvas.axes]
     once = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}

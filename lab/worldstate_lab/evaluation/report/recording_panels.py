@@ -10,22 +10,22 @@ from worldstate.ground.values import NotUsable
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
 from worldstate.operations.recordings.bearing_gating import bearing_curve, draw_gating
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.report.table import Figure, Value
 
-from .document import Curves, ReportFigure, Value
 from .panels import legend_below
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 _COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 _MARKS = ("o", "s", "^", "D", "v", "P")
 
 
-def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float]) -> ReportFigure:
+def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float]) -> Figure:
     """Draw the lead time of every detected approach, one row a method; NaN is an approach not detected."""
     names = [name for name, leads in leads_s.items() if np.isfinite(leads).any()]
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for row, name in enumerate(names):
             leads = np.sort(leads_s[name][np.isfinite(leads_s[name])])
@@ -43,14 +43,15 @@ def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float])
         legend_below(canvas)
 
     rows = [(name, float(lead)) for name, leads in leads_s.items() for lead in leads]
-    return ReportFigure(
+    return Figure(
         "lead_times",
         "Lead time of every detected approach",
         "One dot an approach and seed of the folds: line-of-sight entry minus the first alarm within the 5 s "
         "before it. The number of detected approaches stands below the name; methods that detect none are "
         "left out. An empty cell of the CSV is an approach that was not detected.",
         draw,
-        Curves(("method", "lead_s"), rows),
+        ("method", "lead_s"),
+        rows,
         size_in=(4.8, 1.6 + 0.52 * max(len(names), 1)),
     )
 
@@ -61,7 +62,7 @@ def junction_figure(
     unit: str,
     values: Mapping[str, Mapping[str, Value]],
     worst: Literal["low", "high"],
-) -> ReportFigure:
+) -> Figure:
     """Draw a figure by junction, one colour a method, the worst junction of each ringed.
 
     `values` holds junction to value by method; `worst` says whether the lowest or the highest is the worst.
@@ -70,7 +71,7 @@ def junction_figure(
     # Side by side within the row of a junction, at most .3 of it up or down.
     offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else np.zeros(1)
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for (method, by_site), offset, colour, mark in zip(
             values.items(), offsets, _COLOURS, _MARKS, strict=False
@@ -92,13 +93,14 @@ def junction_figure(
         for method, by_site in values.items()
         for site, value in by_site.items()
     ]
-    return ReportFigure(
+    return Figure(
         name,
         title,
         "Bars are 95 % intervals over the recordings of the junction; the ring marks the worst junction of "
         "a method.",
         draw,
-        Curves(("method", "junction", "value", "low", "high"), rows),
+        ("method", "junction", "value", "low", "high"),
+        rows,
         size_in=(4.4, 1.6 + 0.18 * len(values) + 0.5 * max(len(sites), 1)),
     )
 
@@ -116,7 +118,7 @@ def worst_junction(by_site: Mapping[str, Value], worst: Literal["low", "high"]) 
     return choose(known, key=lambda site: known[site]) if known else None
 
 
-def bearing_gating_figure(checks: HopTable) -> ReportFigure:
+def bearing_gating_figure(checks: HopTable) -> Figure:
     """Draw the median bearing error over the share of bearings kept by prominence."""
     curve = bearing_curve(checks)
     points = (
@@ -125,7 +127,7 @@ def bearing_gating_figure(checks: HopTable) -> ReportFigure:
         else (curve.coverage, np.degrees(curve.median_error_rad), curve.threshold)
     )
 
-    def draw(canvas: "Figure") -> None:
+    def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         draw_gating(axes, checks)
         legend = axes.get_legend()
@@ -133,14 +135,12 @@ def bearing_gating_figure(checks: HopTable) -> ReportFigure:
             legend.remove()
         legend_below(canvas)
 
-    return ReportFigure(
+    return Figure(
         "bearing_gating",
         "Bearing error, gated by prominence",
         "Median absolute error of the bearings whose peak stands out most, over the share kept; windows "
         "with a moving box in view. Open circles: the paper's 3.4 degrees on all and 2.4 on 16 %.",
         draw,
-        Curves(
-            ("share_kept", "median_error_deg", "prominence"),
-            [tuple(map(float, row)) for row in zip(*points, strict=True)],
-        ),
+        ("share_kept", "median_error_deg", "prominence"),
+        [tuple(map(float, row)) for row in zip(*points, strict=True)],
     )

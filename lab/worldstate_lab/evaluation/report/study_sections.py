@@ -10,9 +10,10 @@ from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.paper_values import COMMANDS, PAPER_VALUES, PaperValue
 from worldstate_lab.evaluation.protocols import FIXED, RETRAINED, STATIC
 from worldstate_lab.methods.table_rows import GROUNDED
+from worldstate_lab.report.document import Section
+from worldstate_lab.report.table import Cell, Table, Value
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 
-from .document import Cell, ReportTable, Section, Value
 from .measured_values import Place, Values, site_values
 from .method_table import method_table, methods_of, stands_on
 from .recording_panels import bearing_gating_figure, junction_figure
@@ -86,16 +87,14 @@ _WORDS = {
 }
 
 
-def group_table(
-    name: str, title: str, values: Values, groups: Sequence[str], caption: str = ""
-) -> ReportTable:
+def group_table(name: str, title: str, values: Values, groups: Sequence[str], caption: str = "") -> Table:
     """Return the paper's values of some groups beside ours, a row each."""
     rows = tuple(
         (_label(one), _ours(one, values), _paper(one), one.unit)
         for one in PAPER_VALUES
         if one.group in groups and one.basis != "stated"
     )
-    return ReportTable(name, title, ("figure", "here", "paper", "unit"), rows, caption)
+    return Table(name, title, ("figure", "here", "paper", "unit"), rows, caption)
 
 
 def _label(one: PaperValue) -> str:
@@ -141,7 +140,7 @@ def front_end_section(found: Evaluation, values: Values) -> Section:
             "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0; MUSIC on the "
             "same hops; gated: the 16 % of the bearings whose peak stands out most.",
         ),
-        ReportTable(
+        Table(
             "bearing_by_junction",
             "Bearing error by junction",
             ("junction", "median error (deg)", "hops"),
@@ -214,7 +213,7 @@ def _junctions(found: Evaluation) -> Section:
     return Section("By junction", (), (*figures, _junction_table(found, sites)))
 
 
-def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[str, Value]]]) -> ReportTable:
+def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[str, Value]]]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, by_site in sites.items():
         run = found.runs[name]
@@ -222,7 +221,7 @@ def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[
         for site, one in by_site.items():
             figures = (one.get(figure, Value(np.nan)) for figure in _BY_SITE)
             rows.append((run.protocol.title, site, str(counts[site]), *figures))
-    return ReportTable(
+    return Table(
         "junctions",
         f"Every junction, {PROPOSED}",
         ("protocol", "junction", "recordings", *_BY_SITE.values()),
@@ -252,7 +251,7 @@ def ablation_section(found: Evaluation, values: Values) -> Section:
         "awareness (share)",
     )
     vision = cell("Vision-only", "hazard_awareness")
-    table = ReportTable(
+    table = Table(
         "ablations",
         "Ablations, standing ego",
         ("part", *heads),
@@ -299,7 +298,7 @@ def signature_section(study: SignatureStudy | None) -> Section:
     rows = tuple(
         (row.name, row.corpus, row.figure, _signature(row), str(row.n_clips), row.note) for row in study.rows
     )
-    table = ReportTable(
+    table = Table(
         "signatures",
         "Separability of single clips",
         ("row", "corpus", "figure", "value", "clips", "how"),
@@ -340,7 +339,7 @@ def paper_section(found: Evaluation, values: Values) -> Section:
         if simulated
         else "Numbers of real sound stand on the recordings that were given."
     )
-    table = ReportTable(
+    table = Table(
         "paper",
         "Every number of sections IV, VII, VIII and IX",
         ("section", "about", "figure", "paper", "unit", "here", "filled by"),

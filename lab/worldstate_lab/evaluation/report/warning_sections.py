@@ -16,11 +16,12 @@ from worldstate_lab.evaluation.protocols import STATIC
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
 from worldstate_lab.methods.table_rows import CURVE_ALPHAS
+from worldstate_lab.report.document import Section
+from worldstate_lab.report.table import Cell, Figure, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .approach_timeline import ApproachImage, ApproachTimeline, approach_figure, approach_images
 from .cueing_panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
-from .document import Cell, ReportFigure, ReportTable, Section, Value
 from .measured_values import Values, figure_digits, score_values
 from .method_table import method_table, methods_of, stands_on
 from .recording_panels import lead_figure
@@ -156,7 +157,7 @@ def budget_section(found: Evaluation, values: Values) -> Section:
         names = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
         cells = [values[STATIC.name, method, name] if method else curve[name] for name in names]
         rows.append((f"{alpha:g}", *cells))
-    table = ReportTable(
+    table = Table(
         "alpha",
         "Budget and achieved false alarms, proposed method",
         (
@@ -174,7 +175,7 @@ def budget_section(found: Evaluation, values: Values) -> Section:
     return Section("Budget and false alarms", (), (table, _equal_table(found)))
 
 
-def _equal_table(found: Evaluation) -> ReportTable:
+def _equal_table(found: Evaluation) -> Table:
     """Return what the world-state and the sustained baseline cost where both detect as much."""
     rows = tuple(
         (
@@ -185,7 +186,7 @@ def _equal_table(found: Evaluation) -> ReportTable:
         )
         for one in found.equal.get(STATIC.name, ())
     )
-    return ReportTable(
+    return Table(
         "equal_detection",
         "False alarms at equal detection",
         ("detected (share)", "world-state (1/h)", "published, sustained (1/h)", "ratio"),
@@ -195,7 +196,7 @@ def _equal_table(found: Evaluation) -> ReportTable:
     )
 
 
-def cueing_section(found: Evaluation, values: Values, awareness: Sequence[ReportFigure]) -> Section:
+def cueing_section(found: Evaluation, values: Values, awareness: Sequence[Figure]) -> Section:
     """Return the four panels of calibrated cueing; the last one comes with the degradation study."""
     run = found.runs[STATIC.name]
     pairs = [
@@ -243,7 +244,7 @@ def _known(values: Values, method: str, figure: str) -> bool:
     return value is not None and math.isfinite(value.value)
 
 
-def _reliability(pairs: Sequence[tuple[Trial, Decisions]], values: Values) -> ReportFigure:
+def _reliability(pairs: Sequence[tuple[Trial, Decisions]], values: Values) -> Figure:
     labels = np.concatenate([np.full(scored_windows(t, s.risk).size, not t.hazard_free) for t, s in pairs])
     risks = {
         "raw statistic": np.concatenate([scored_windows(t, s.score) for t, s in pairs]),
@@ -359,7 +360,7 @@ def difference_section(found: Evaluation) -> Section:
                 run = found.runs[protocol]
                 rows.append((run.protocol.title, str(len(run.trials)), f"{ours} less {other}", *cells))
     heads = ("detected (share)", "lead (s)", "false alarms (1/h)", "AUROC", "ECE", "GOSPA (deg)")
-    table = ReportTable(
+    table = Table(
         "differences",
         "Differences between methods",
         ("protocol", "recordings", "difference", *heads),

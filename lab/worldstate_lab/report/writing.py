@@ -1,4 +1,4 @@
-"""A report as files: the page, the same as Markdown, every picture and all numbers."""
+"""A document as files: the page, the same as Markdown, every picture and all numbers."""
 
 import tempfile
 from pathlib import Path
@@ -7,10 +7,9 @@ from worldstate.adapters.files.atomic import check_target, deferred_signals
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.figure_style import figure_file
 
-from .csv_table import csv_text
-from .document import Document, ReportFigure
-from .html_page import html_page
-from .markdown_page import markdown_page
+from .document import Document
+from .pages import html_page, markdown_page
+from .table import Figure
 
 PAGE, MARKDOWN, FILES = "report.html", "report.md", "report_files"
 
@@ -38,26 +37,20 @@ def write_document(document: Document, folder: Path) -> None:
                 (new / name).replace(folder / name)
 
 
-def _write(path: Path, text: str) -> None:
-    # A file name that is no UTF-8 comes in with surrogates, which cannot be written.
-    path.write_text(text, encoding="utf-8", errors="replace")
-
-
 def _write_all(document: Document, folder: Path) -> None:
-    files = folder / FILES
+    files, pictures = folder / FILES, {}
     files.mkdir()
-    pictures = {}
-    for block in document.all_blocks:
-        figure = block if isinstance(block, ReportFigure) else None
-        numbers = block.numbers if isinstance(block, ReportFigure) else block
-        _write(files / f"{block.name}.csv", csv_text(numbers))
-        if figure:
-            pictures[block.name] = _picture(figure, files / f"{block.name}.png")
+    for block in document.blocks:
+        _write(files / f"{block.name}.csv", block.csv())
+        if isinstance(block, Figure):
+            picture = files / f"{block.name}.png"
+            with figure_file(picture, *block.size_in) as canvas:
+                block.draw(canvas)
+            pictures[block.name] = picture.read_bytes()
     _write(folder / PAGE, html_page(document, pictures, FILES))
     _write(folder / MARKDOWN, markdown_page(document, FILES))
 
 
-def _picture(figure: ReportFigure, path: Path) -> bytes:
-    with figure_file(path, *figure.size_in) as canvas:
-        figure.draw(canvas)
-    return path.read_bytes()
+def _write(path: Path, text: str) -> None:
+    # A file name that is no UTF-8 comes in with surrogates, which cannot be written.
+    path.write_text(text, encoding="utf-8", errors="replace")

@@ -1,0 +1,216 @@
+"""The one table that every study fills: printed, written as JSON and CSV, and set into a page.
+
+A study returns its findings as `Table` values, and as `Figure` values where a picture is drawn. A command
+prints ``table.lines()``, puts ``plain(findings)`` into its JSON report and writes ``table.csv()``; a
+`Document` sets tables and figures into `report.html` and `report.md`.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+MISSING = "\u2013"
+_PARTS = ("value", "low", "high", "note", "paper", "paper_low", "paper_high")
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A number with its interval and the paper's beside it; NaN where there is none.
+
+    Examples
+    --------
+    >>> Value(0.881, 0.79, 0.98, paper=Value(0.88)).text
+    '0.88 [0.79, 0.98]'
+    >>> Value(float("nan"), note="states no bearing").text
+    'states no bearing'
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    digits: int = 2
+    note: str = ""  # Printed after the value, or in its place
+    paper: "Value | None" = None
+
+    @property
+    def number(self) -> str:
+        """Value alone, rounded; its note, or a dash, where there is none."""
+        return self._rounded(self.value) if math.isfinite(self.value) else self.note or MISSING
+
+    @property
+    def interval(self) -> str:
+        """Interval alone, empty where there is none."""
+        if not all(map(math.isfinite, (self.value, self.low, self.high))):
+            return ""
+        return f"[{self._rounded(self.low)}, {self._rounded(self.high)}]"
+
+    @property
+    def text(self) -> str:
+        """Value, interval and note in one line."""
+        note = f"({self.note})" if self.note and math.isfinite(self.value) else ""
+        return " ".join(filter(None, (self.number, self.interval, note)))
+
+    def _rounded(self, value: float) -> str:
+        # A rounded -0.001 would print as -0.00; adding zero takes the sign away.
+        return f"{round(value, self.digits) + 0.0:.{self.digits}f}"
+
+
+# A float without an interval is printed with three decimals, one that is not known (None, NaN) as a dash.
+Cell: TypeAlias = Value | str | float | None
+
+
+def cell_text(cell: Cell) -> str:
+    """Return a cell as a line of text.
+
+    Examples
+    --------
+    >>> cell_text(0.5), cell_text(3), cell_text(Value(0.5, digits=1)), cell_text(None) == MISSING
+    ('0.500', '3', '0.5', True)
+    """
+    if cell is None:
+        return MISSING
+    if isinstance(cell, float):
+        return Value(cell, digits=3).text
+    return cell.text if isinstance(cell, Value) else str(cell)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Named columns, which carry their units, and rows of cells; the name is that of its CSV file.
+
+    Examples
+    --------
+    >>> table = Table("leads", "Leads", ("method", "lead (s)"), (("ours", Value(1.7, 1.3, 2.1)),))
+    >>> for line in table.lines():
+    ...     print(line)
+    Leads
+    method        lead (s)
+    ours    1.70 [1.30, 2.10]
+    >>> plain(table.records())
+    [{'method': 'ours', 'lead (s)': [1.7, 1.3, 2.1]}]
+    """
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[Cell, ...]]
+    caption: str = ""
+
+    def lines(self) -> list[str]:
+        """Return the title and the aligned columns for a terminal; the caption is left to pages."""
+        texts = [list(self.columns), *([cell_text(cell) for cell in row] for row in self.rows)]
+        widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+        return [self.title, *(_aligned(row, widths) for row in texts)]
+
+    def records(self) -> list[dict[str, Cell]]:
+        """Return the rows by column, for JSON through `plain`."""
+        return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
+
+    def csv(self) -> str:
+        """Return the numbers to the last digit."""
+        return csv_text(self.columns, self.rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One picture with the numbers behind it; `draw` is given an empty figure of matplotlib."""
+
+    name: str
+    title: str
+    caption: str
+    draw: "Callable[[Canvas], None]"
+    columns: tuple[str, ...]
+    rows: Sequence[Sequence[Cell]]
+    size_in: tuple[float, float] = (4.4, 3.7)
+
+    def csv(self) -> str:
+        """Return the numbers to the last digit."""
+        return csv_text(self.columns, self.rows)
+
+
+Block: TypeAlias = Table | Figure
+
+
+def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
+    """Return rows as CSV; a column of values becomes one column for each part that any of them has.
+
+    Examples
+    --------
+    >>> print(csv_text(("method", "lead (s)"), (("ours", Value(1.7, 1.3, paper=Value(1.69))),)))
+    method,lead (s) value,lead (s) low,lead (s) paper
+    ours,1.7,1.3,1.69
+    <BLANKLINE>
+    """
+    split = chain.from_iterable(_split(title, [row[i] for row in rows]) for i, title in enumerate(columns))
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(zip(*split, strict=True))
+    return buffer.getvalue()
+
+
+def plain(value: Any) -> Any:
+    """Return findings as JSON-able values: dataclasses, tuples and arrays in any depth, null for NaN.
+
+    Examples
+    --------
+    >>> plain({"lead": Value(1.5), "beta": np.array([0.5, np.nan]), "out": Path("a")})
+    {'lead': 1.5, 'beta': [0.5, None], 'out': 'a'}
+    """
+    if isinstance(value, Value):
+        known = all(map(math.isfinite, (value.low, value.high)))
+        return plain([value.value, value.low, value.high] if known else value.value)
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(one) for key, one in value.items()}
+    if is_dataclass(value):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
+    """Return a line with the first column to the left and the numbers to the right."""
+    cells = [
+        row[0].ljust(widths[0]),
+        *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
+    ]
+    return "  ".join(cells).rstrip()
+
+
+def _split(title: str, cells: Sequence[Cell]) -> Iterable[list[float | str]]:
+    """Return the columns of a CSV file that a column of cells becomes, each with its head."""
+    if not any(isinstance(cell, Value) for cell in cells):
+        return [[title, *map(_written, cells)]]
+    rows = [[_written(part) for part in _parts(cell)] for cell in cells]
+    # The first part stays even where no row knows it: a column that was measured and found empty.
+    kept = [i for i in range(len(_PARTS)) if i == 0 or any(row[i] != "" for row in rows)]
+    return [[f"{title} {_PARTS[i]}", *(row[i] for row in rows)] for i in kept]
+
+
+def _parts(cell: Cell) -> tuple[Cell, ...]:
+    if not isinstance(cell, Value):
+        return (cell, *[None] * (len(_PARTS) - 1))
+    paper = cell.paper or Value(math.nan)
+    # The note of an unknown value stands in its place, as in the report.
+    value, note = (cell.note, "") if math.isnan(cell.value) else (cell.value, cell.note)
+    return value, cell.low, cell.high, note, paper.value, paper.low, paper.high
+
+
+def _written(cell: Cell) -> float | str:
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return ""
+    # The writer does not quote a lone carriage return, and readers end the row there.
+    return " ".join(cell.split()) if isinstance(cell, str) else cell  # type: ignore[return-value]
