@@ -12,13 +12,13 @@ from worldstate.smoothing.learned_street import (
     DAY_S,
     LearnedStreet,
     StreetPass,
+    context_of,
     forgotten,
     watched,
     with_looks,
     with_pass,
 )
 from worldstate.smoothing.running_moments import Moments, NormalPrior
-from worldstate.smoothing.street_context import context_of
 from worldstate.state.context import Context, Rates
 
 LEFT, RIGHT = math.radians(24.0), math.radians(-29.0)
@@ -89,13 +89,10 @@ def test_a_first_stray_pass_is_outvoted_and_no_change_of_the_place():
 
 def test_time_takes_weight_and_leaves_means():
     street = watched(street_of(10), 600.0)
-    for arm in ("left", "right"):
-        street = with_pass(street, StreetPass(arm, None, None, in_view_s=4.0))
     later = forgotten(street, 30.0 * DAY_S)
     for before, after in zip(street.arms, later.arms, strict=True):
         assert after.arrivals == pytest.approx(before.arrivals / math.e)
         assert after.exposure_s == pytest.approx(before.exposure_s / math.e)
-        assert after.departures.exposure_s == pytest.approx(4.0 / math.e)
         assert after.edge.mean_rad == pytest.approx(before.edge.mean_rad, abs=math.radians(0.2))
         assert after.edge.std_rad > before.edge.std_rad
 
@@ -113,25 +110,8 @@ def test_rates_are_those_of_gamma_and_poisson():
     assert street.arms[0].rate_hz == pytest.approx((1.0 + 5.0) / (20.0 + 100.0))
 
 
-def test_times_of_passes_become_the_rates_that_the_filter_takes():
-    """A hundred passes, each 5 s heard and 2 s in view, half on either arm: the prior counts as one."""
-    street = LearnedStreet()
-    for i in range(100):
-        one = StreetPass(("left", "right")[i % 2], None, None, hidden_s=5.0, in_view_s=2.0)
-        street = with_pass(street, one)
-    rates, usual = context_of(street).rates, Rates()
-    assert rates.emergence_hz + rates.departure_hz == pytest.approx(101.0 / (500.0 + 2.5))
-    assert rates.visible_departure_hz + rates.reocclusion_hz == pytest.approx(101.0 / (200.0 + 1.0 / 0.35))
-    # Which way a time ends is not learned.
-    assert rates.emergence_hz / rates.departure_hz == pytest.approx(usual.emergence_hz / usual.departure_hz)
-    assert (rates.arrival_hz, rates.visible_arrival_hz) == (usual.arrival_hz, usual.visible_arrival_hz)
-    world = WorldFilter(context_of(street))
-    assert world.state.context.priors.hidden > WorldFilter().state.context.priors.hidden
-
-
-def test_a_pass_of_which_no_times_are_known_leaves_the_usual_rates():
+def test_a_learned_street_keeps_the_usual_rates():
     assert context_of(street_of(10)).rates == Rates()
-    assert street_of(10).arms[0].reveals.count == 0.0
 
 
 def test_misses_lower_the_detection_where_they_were():

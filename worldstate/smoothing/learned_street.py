@@ -1,6 +1,6 @@
-"""What a street's passes tell of it: edges, pace, who comes when and for how long, what the camera misses.
+"""A street learned from the vehicles that passed: edges, pace, arrivals, missed boxes, sound of its arms.
 
-Sufficient statistics only, so that a pass is added and time forgotten without anything else being kept.
+Only sufficient statistics are kept: a pass is added, and time forgotten, without the passes before it.
 """
 
 import math
@@ -12,9 +12,8 @@ from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout
-from worldstate.state.context import Rates
+from worldstate.state.context import Context, Occluder, Rates
 
-from .event_rate import EventRate
 from .learned_edge import LearnedEdge
 from .running_moments import Moments, NormalPrior
 
@@ -23,10 +22,6 @@ ARMS: tuple[Arm, Arm] = ("left", "right")
 # A building stands for years, traffic changes with the season: after a month a pass counts a third.
 DAY_S = 86400.0
 FORGETTING_S = 30.0 * DAY_S
-# Who is hidden comes into view or turns away, who is in view leaves it or hides again: a time ends by either.
-_USUAL = Rates()
-USUAL_REVEAL_HZ = _USUAL.emergence_hz + _USUAL.departure_hz
-USUAL_DEPARTURE_HZ = _USUAL.reocclusion_hz + _USUAL.visible_departure_hz
 # Of the logarithm: drivers at a usual corner have .5 per second; simulated junctions have .4 to .7 in the
 # median, and their drivers differ by a factor of 1.35.
 PACE_PRIOR = NormalPrior(math.log(0.5), 0.22, 0.3)
@@ -34,6 +29,8 @@ PACE_PRIOR = NormalPrior(math.log(0.5), 0.22, 0.3)
 BIN_RAD, BINS = math.radians(5.0), 18
 # One miss in 25 looks, the paper's at boresight, until the bin has seen more.
 _USUAL_MISSES, _USUAL_LOOKS = 1.0, 25.0
+# An arm of which no edge was seen keeps the corner of a usual junction.
+_LEAST_WEIGHT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,39 +46,25 @@ class StreetPass:
     arm: Arm
     edge_rad: float | None  # Azimuth of the edge that it came out of; None where the image ends before it
     pace_hz: float | None  # How fast the tangent of its azimuth fell there
-    hidden_s: float | None = None  # Heard before it came into view; None where nobody listened
-    in_view_s: float | None = None  # From there until it was last seen; None where nobody knows
-    gone: bool = True  # Whether it had left the view then, and not the recording had ended
     sound: PassSound | None = None  # Before it came into view
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedArm:
-    """One arm: its edge, its drivers, how many came in which time, how long they were hidden and in view."""
+    """One arm: its edge, the pace of its drivers, and how many vehicles came in which time."""
 
     direction: Arm
     edge: LearnedEdge = field(default_factory=LearnedEdge)
     log_pace: Moments = field(default_factory=Moments)
     arrivals: float = 0.0
     exposure_s: float = 0.0
-    # Of those who came into view: out of hiding, over the time heard there, and out of view again.
-    reveals: EventRate = field(default_factory=EventRate, metadata=ADDED)
-    departures: EventRate = field(default_factory=EventRate, metadata=ADDED)
 
     @property
     def rate_hz(self) -> float:
-        """Expected arrivals a second."""
-        return EventRate(self.arrivals, self.exposure_s).mean_hz(_USUAL.arrival_hz)
-
-    @property
-    def reveal_hz(self) -> float:
-        """Expected rate at which who is heard there comes into view, 1/s."""
-        return self.reveals.mean_hz(USUAL_REVEAL_HZ)
-
-    @property
-    def departure_hz(self) -> float:
-        """Expected rate at which who came from there leaves the view, 1/s."""
-        return self.departures.mean_hz(USUAL_DEPARTURE_HZ)
+        """Expected arrivals a second: a Gamma prior about the usual rate, which counts as one arrival."""
+        # A minute of watching outweighs it: streets differ by a factor of three either way.
+        usual_hz = Rates().arrival_hz
+        return usual_hz * (1.0 + self.arrivals) / (1.0 + usual_hz * self.exposure_s)
 
     @property
     def pace_hz(self) -> float:
@@ -96,18 +79,12 @@ class LearnedArm:
 
     def with_pass(self, one: StreetPass) -> "LearnedArm":
         """Return it after one more vehicle came out of it."""
-        edge, log_pace, reveals, departures = self.edge, self.log_pace, self.reveals, self.departures
+        edge, log_pace = self.edge, self.log_pace
         if one.edge_rad is not None:
             edge = edge.with_pass(abs(one.edge_rad))
         if one.pace_hz is not None:
             log_pace = log_pace.plus(math.log(one.pace_hz))
-        if one.hidden_s is not None:
-            reveals = reveals.after(one.hidden_s)
-        if one.in_view_s is not None:
-            departures = departures.after(one.in_view_s, happened=one.gone)
-        return LearnedArm(
-            self.direction, edge, log_pace, self.arrivals + 1.0, self.exposure_s, reveals, departures
-        )
+        return LearnedArm(self.direction, edge, log_pace, self.arrivals + 1.0, self.exposure_s)
 
     def faded(self, factor: float) -> "LearnedArm":
         """Return it with everything weighed less."""
@@ -117,8 +94,6 @@ class LearnedArm:
             self.log_pace.faded(factor),
             factor * self.arrivals,
             factor * self.exposure_s,
-            self.reveals.faded(factor),
-            self.departures.faded(factor),
         )
 
 
@@ -136,7 +111,7 @@ class LearnedStreet:
     (0.5, 0.44)
     """
 
-    LAYOUT: ClassVar = Layout("worldstate.LearnedStreet", "1.1.0")
+    LAYOUT: ClassVar = Layout("worldstate.LearnedStreet", "1.2.0")
 
     site: str | None = None
     arms: tuple[LearnedArm, LearnedArm] = (LearnedArm("left"), LearnedArm("right"))
@@ -167,7 +142,7 @@ def with_pass(street: LearnedStreet, one: StreetPass) -> LearnedStreet:
 
 
 def watched(street: LearnedStreet, time_s: float) -> LearnedStreet:
-    """Return the street after it was watched for a time, whoever came."""
+    """Return the street after it was watched for a time."""
     in_range("time_s", time_s, 0.0, 1e9)
     left, right = (replace(arm, exposure_s=arm.exposure_s + time_s) for arm in street.arms)
     return replace(street, arms=(left, right))
@@ -197,3 +172,37 @@ def forgotten(street: LearnedStreet, time_s: float) -> LearnedStreet:
 
 def _bin(azimuth_rad: float) -> int:
     return min(max(math.floor(azimuth_rad / BIN_RAD) + BINS // 2, 0), BINS - 1)
+
+
+def context_of(street: LearnedStreet) -> Context:
+    """Return a street as the context of a filter: its edges and paces; the rest is as in `Context()`.
+
+    Arrivals are left to the filter, which learns the traffic of the hour: given as priors, they move its
+    alarm away from the onsets an hour that it was set for.
+
+    Examples
+    --------
+    >>> street = with_pass(LearnedStreet(site="Elm Street"), StreetPass("left", 0.45, 0.6))
+    >>> [(round(one.edge_azimuth_rad, 2), one.assumed) for one in context_of(street).occluders]
+    [(0.45, False), (-0.56, True)]
+    """
+    usual = Context()
+    occluders = tuple(map(_occluder, street.arms, usual.occluders))
+    return replace(usual, occluders=occluders, site=street.site)
+
+
+def _occluder(arm: LearnedArm, usual: Occluder) -> Occluder:
+    sign = math.copysign(1.0, usual.edge_azimuth_rad)
+    known = arm.edge.moments.weight >= _LEAST_WEIGHT
+    edge_rad = arm.edge.mean_rad if known else abs(usual.edge_azimuth_rad)
+    slope, pace_hz = math.tan(edge_rad), arm.pace_hz
+    near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
+    return replace(
+        usual,
+        edge_azimuth_rad=sign * edge_rad,
+        hidden_azimuth_rad=sign * middle,
+        hidden_std_rad=0.5 * (far - near),
+        edge_std_rad=arm.edge.std_rad if known else usual.edge_std_rad,
+        pace_hz=pace_hz,
+        assumed=not known,
+    )

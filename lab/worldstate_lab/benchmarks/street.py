@@ -8,15 +8,13 @@ at a time. Corners are the plan's. A change is the same arm at another junction,
 streams (approaches of the named junctions) the filter follows each with the usual street and with the one
 learned from its first ten passes, or --passes; the passes after these are compared in pairs, intervals of
 95 % by 1000 draws of passes. What is left of the azimuth's error with the true time to visible, and with the
-true azimuth at T0 in place of the edge besides, says what is the time's and what the place's. Rates are those
-of all passes, reveals from the snapshots of the filter with the usual street.
+true azimuth at T0 in place of the edge besides, says what is the time's and what the place's.
 """
 
 import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +31,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.labelling.box_tracks import box_tracks
-from worldstate.operations.labelling.hidden_times import with_hidden_times
-from worldstate.operations.labelling.street_passes import WatchedRecording, seen_edge, streets_after
+from worldstate.operations.labelling.street_passes import seen_edge, streets_after
 from worldstate.operations.metrics.approach_table import rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
@@ -43,8 +40,7 @@ from worldstate.simulation.stream.drawn_stream import draw_stream
 from worldstate.simulation.stream.settings import StreamSettings
 from worldstate.simulation.stream.traffic import traffic_named
 from worldstate.smoothing.learned_edge import LearnedEdge
-from worldstate.smoothing.learned_street import USUAL_DEPARTURE_HZ, USUAL_REVEAL_HZ, LearnedStreet
-from worldstate.smoothing.street_context import context_of
+from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Context
 from worldstate_lab.passes.followed_stream import FollowedStream, followed
 from worldstate_lab.passes.pass_outcomes import true_azimuth
@@ -172,22 +168,7 @@ def filtered(path: Path, passes: int, window_s: list[float]) -> dict[str, object
         "passes": {
             name: passes_of(stream, one, since_s, window_s, contexts[name]) for name, one in told.items()
         },
-        "rates": rates_of(recording, told["usual"]),
         "figures": {name: figures_of(stream, one, since_s) for name, one in told.items()},
-    }
-
-
-def rates_of(recording: WatchedRecording, one: FollowedStream) -> dict[str, object]:
-    """Rates of reveal and departure of either arm, each with its interval, passes and seconds."""
-    passes = with_hidden_times(recording.passes, zip(one.time_s.tolist(), one.entities, strict=True))
-    *_, street = streets_after(LearnedStreet(), replace(recording, passes=passes))
-    return {
-        f"{arm.direction} {name}": [rate.mean_hz(hz), rate.interval_hz(hz), rate.count, rate.exposure_s]
-        for arm in street.arms
-        for name, rate, hz in (
-            ("reveals", arm.reveals, USUAL_REVEAL_HZ),
-            ("departures", arm.departures, USUAL_DEPARTURE_HZ),
-        )
     }
 
 
@@ -298,9 +279,7 @@ def main() -> None:
     streams = [filtered(path, arguments.passes, arguments.window) for path in arguments.streams]
     if streams:
         report["street"] = paired(streams, "street")
-        report["figures"] = [
-            {"site": stream["site"], **stream["figures"], "rates": stream["rates"]} for stream in streams
-        ]
+        report["figures"] = [{"site": stream["site"], **stream["figures"]} for stream in streams]
     print(json.dumps(report, indent=None if arguments.json else 1))
 
 

@@ -69,7 +69,7 @@ def given_context(arguments: argparse.Namespace) -> "Context | None":
     from worldstate.adapters.files.context_file import read_context
     from worldstate.ground.errors import InvalidArgumentError
     from worldstate.operations.labelling.street_file import read_street
-    from worldstate.smoothing.street_context import context_of
+    from worldstate.smoothing.learned_street import context_of
 
     if arguments.street is None:
         return None if arguments.context is None else read_context(arguments.context)

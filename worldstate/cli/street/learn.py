@@ -1,10 +1,9 @@
 """`worldstate street learn`: what the vehicles that passed tell of a street.
 
 Join the camera's boxes into passes, smooth them, and learn from each vehicle that came out of hiding: where
-the edge stands past which it came into view, how fast it was there and how long it stayed in view, what
-either arm sounded like before, how many come from either side in which time, and how often the camera misses
-somebody in view, by azimuth. For a standing ego. Boxes do not tell how long somebody was hidden; --states,
-the snapshots of the same recording, do: from when `worldstate run` believed somebody there until T0.
+the edge stands past which it came into view, how fast it was there, what either arm sounded like before, how
+many come from either side in which time, and how often the camera misses a vehicle in view, by azimuth. For a
+standing ego.
 
 INPUT is a recording with boxes of a camera, as `worldstate street label` takes it. --known goes on from a
 street that was learned before. `worldstate run --street` takes what --out writes.
@@ -25,17 +24,12 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from worldstate.operations.labelling.street_passes import WatchedRecording
-    from worldstate.smoothing.event_rate import EventRate
     from worldstate.smoothing.learned_street import LearnedArm, LearnedStreet
-    from worldstate.state import Entity
 
 EXAMPLE = """\
 examples:
   worldstate street learn monday.wav --array mics.csv --detections boxes.json --out street.json
-  worldstate street learn monday.wav --detections boxes.json --states monday.jsonl --out street.json
   worldstate street learn ovad_dataset/SB1/left/* --out street.json --figure street.png
   worldstate street learn tuesday.wav --detections boxes.json --known street.json --days 1 --out street.json
   worldstate run ovad_dataset/SB1/left/2_00_0005 --street street.json"""
@@ -49,7 +43,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_camera_options(parser)
     add = parser.add_argument
     add("input", type=Path, nargs="+", metavar="INPUT", help="recordings of one place, in order")
-    add("--states", type=Path, metavar="JSONL", help="snapshots of it, as `worldstate run --out` writes them")
     add("--known", type=Path, metavar="JSON", help="a street that was learned before")
     add("--days", type=float, default=0.0, metavar="D", help="since then (default: %(default)g)")
     add("--site", metavar="NAME", help="name of the place (default: the known street's)")
@@ -74,7 +67,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     before = street = _known(arguments)
     stages: list[LearnedStreet] = []
     for one in track(arguments.input, "learning", len(arguments.input)):
-        *passed, street = streets_after(street, _recording(arguments, one))
+        *passed, street = streets_after(street, _seen(arguments, one))
         stages += passed
     write_street(arguments.out, street)
     if arguments.figure is not None:
@@ -96,9 +89,8 @@ def _check(arguments: argparse.Namespace) -> None:
     from worldstate.ground.errors import InvalidArgumentError
 
     in_range("--days", arguments.days, 0.0, 1e5)
-    for name in ("detections", "states"):
-        if getattr(arguments, name) is not None and len(arguments.input) > 1:
-            raise InvalidArgumentError(f"--{name}: expected one INPUT with it, they are of one recording")
+    if arguments.detections is not None and len(arguments.input) > 1:
+        raise InvalidArgumentError("--detections: expected one INPUT with it, they are of one recording")
     # What is known may be written over: it is read before, and its passes are kept.
     apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
     check_outputs(apart, "out", figures=("figure",))
@@ -112,18 +104,6 @@ def _known(arguments: argparse.Namespace) -> "LearnedStreet":
 
     street = LearnedStreet() if arguments.known is None else read_street(arguments.known)
     return replace(forgotten(street, arguments.days * DAY_S), site=arguments.site or street.site)
-
-
-def _recording(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
-    """Return the passes of a recording, with the times heard where snapshots of it are given."""
-    from dataclasses import replace
-
-    from worldstate.operations.labelling.hidden_times import with_hidden_times
-
-    seen = _seen(arguments, path)
-    if arguments.states is None:
-        return seen
-    return replace(seen, passes=with_hidden_times(seen.passes, _snapshots(arguments.states)))
 
 
 def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
@@ -143,13 +123,6 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     return replace(watched, heard=heard_street(source, model)) if arguments.sides else watched
 
 
-def _snapshots(path: Path) -> "Iterator[tuple[float, tuple[Entity, ...]]]":
-    from worldstate.adapters.state_log import read_log
-    from worldstate.ground.values import seconds
-
-    return ((seconds(state.stamp_ns), state.entities) for _, state in read_log(path))
-
-
 def _draw(arguments: argparse.Namespace, stages: "list[LearnedStreet]", street: "LearnedStreet") -> None:
     from worldstate.operations.labelling.street_figure import write_street_figure
 
@@ -159,8 +132,6 @@ def _draw(arguments: argparse.Namespace, stages: "list[LearnedStreet]", street: 
 
 
 def _figures(arm: "LearnedArm") -> dict[str, float | int]:
-    from worldstate.smoothing.learned_street import USUAL_DEPARTURE_HZ, USUAL_REVEAL_HZ
-
     return {
         "edge_deg": math.degrees(arm.edge.mean_rad),
         "edge_std_deg": math.degrees(arm.edge.std_rad),
@@ -169,18 +140,6 @@ def _figures(arm: "LearnedArm") -> dict[str, float | int]:
         "pace_factor": math.exp(arm.pace_spread),
         "arrivals": arm.arrivals,
         "rate_per_minute": 60.0 * arm.rate_hz,
-        **_rate("reveal", arm.reveals, USUAL_REVEAL_HZ),
-        **_rate("departure", arm.departures, USUAL_DEPARTURE_HZ),
-    }
-
-
-def _rate(name: str, told: "EventRate", usual_hz: float) -> dict[str, float]:
-    low_hz, high_hz = told.interval_hz(usual_hz)
-    return {
-        f"{name}s": told.count,
-        f"{name}_hz": told.mean_hz(usual_hz),
-        f"{name}_low_hz": low_hz,
-        f"{name}_high_hz": high_hz,
     }
 
 
@@ -189,16 +148,8 @@ def _line(arm: "LearnedArm") -> str:
     return (
         f"{arm.direction:5}  edge {told['edge_deg']:.1f} +- {told['edge_std_deg']:.1f} degrees, "
         f"pace {arm.pace_hz:.2f} /s within a factor of {told['pace_factor']:.2f}, "
-        f"{told['rate_per_minute']:.1f} a minute; "
-        f"{_rate_words('reveal', told)}, {_rate_words('departure', told)}"
+        f"{told['rate_per_minute']:.1f} a minute"
     )
-
-
-def _rate_words(name: str, told: dict[str, float | int]) -> str:
-    if not told[f"{name}s"]:
-        return f"{name} not observed"
-    mean, low, high = (told[f"{name}{end}_hz"] for end in ("", "_low", "_high"))
-    return f"{name} {mean:.2f} /s ({low:.2f} to {high:.2f})"
 
 
 def _heard(street: "LearnedStreet") -> str:

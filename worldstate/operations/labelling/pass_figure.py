@@ -10,9 +10,8 @@ import numpy as np
 from worldstate.ground.typing import BoolArray
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, figure_file, legend_beside
 from worldstate.operations.recordings.true_track import TrueTrack
-from worldstate.smoothing.learned_street import LearnedStreet, with_pass
+from worldstate.smoothing.learned_street import LearnedStreet, context_of, with_pass
 from worldstate.smoothing.smoothed_track import SmoothedTrack
-from worldstate.smoothing.street_context import context_of
 
 from .pass_labels import PassLabel
 from .street_figure import draw_edge

@@ -51,7 +51,6 @@ class PassLabel:
     t0: FirstSight
     track: SmoothedTrack  # From some seconds before T0 until it was last seen
     edge_rad: float = math.nan  # Azimuth of its corner by its own first box; NaN where the image cuts that
-    heard_s: float | None = None  # Since when it was believed hidden; None where nobody listened
 
 
 def label_passes(

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.operations.figure_style import BLUE, GREEN, figure_file
-from worldstate.smoothing.learned_street import LearnedStreet
-from worldstate.smoothing.street_context import context_of
+from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Context, Occluder
 
 if TYPE_CHECKING:

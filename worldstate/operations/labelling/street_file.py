@@ -1,11 +1,13 @@
 """Learned streets on disk: one JSON file a place."""
 
 import json
+import warnings
 from pathlib import Path
+from typing import Any
 
 from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.json_file import read_record
-from worldstate.ground.serialisation import encode
+from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.ground.serialisation import decode, encode
 from worldstate.smoothing.learned_street import LearnedStreet
 
 
@@ -17,6 +19,9 @@ def write_street(path: str | Path, street: LearnedStreet) -> None:
 def read_street(path: str | Path) -> LearnedStreet:
     """Read what `write_street` wrote.
 
+    Files of worldstate 0.2 also hold rates of reveal and departure, which brought nothing: a warning says
+    that they are left out.
+
     Raises
     ------
     InputFileError
@@ -24,4 +29,9 @@ def read_street(path: str | Path) -> LearnedStreet:
     SchemaVersionError
         If it is of another major version, or no street.
     """
-    return read_record(LearnedStreet, path, "learned street")
+    with refused_as_file(path):
+        told: Any = read_json(path, "a learned street file")
+        street = decode(LearnedStreet, told, "learned street")
+    if any("reveals" in arm for arm in told["arms"]):
+        warnings.warn(f"{path}: its rates of reveal and departure are no longer used", stacklevel=2)
+    return street

@@ -12,7 +12,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_looks, with_pass
 
-from .box_tracks import LONGEST_GAP_S, BoxTrack, box_tracks
+from .box_tracks import BoxTrack, box_tracks
 from .pass_labels import HOP_S, PassLabel, label_passes
 from .street_sound import HeardStreet
 
@@ -22,23 +22,15 @@ _LEAST_EDGE_RAD = math.radians(5.0)
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 3.0
 
 
-def street_pass(one: PassLabel, until_s: float = math.inf, sound: PassSound | None = None) -> StreetPass:
-    """Return what a labelled pass tells of its arm: edge, pace, times hidden and in view, sound before.
-
-    A pass smoothed from boxes tells nothing of the time in hiding: its past begins at a fixed time before T0.
-    """
+def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
+    """Return what a labelled pass tells of its arm: edge, pace, and the sound before."""
     x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
-    last_s = float(one.track.time_s[-1])
     return StreetPass(
         "left" if one.arm == "left" else "right",
         seen_edge(one.arm, one.edge_rad),
         pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None,
-        None if one.heard_s is None else max(one.t0.time_s - one.heard_s, 0.0),
-        max(last_s - one.t0.time_s, 0.0),
-        # As boxes are joined: without one for longer it has left the view.
-        gone=until_s - last_s > LONGEST_GAP_S,
-        sound=sound,
+        sound,
     )
 
 
@@ -75,7 +67,7 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
     for one in sorted(recording.passes, key=lambda one: one.t0.time_s):
         now_s = min(max(one.t0.time_s, before_s), recording.duration_s)
         sound = None if recording.heard is None else recording.heard.before(one, recording.passes)
-        told = street_pass(one, recording.duration_s, sound)
+        told = street_pass(one, sound)
         street = with_pass(watched(street, now_s - before_s), told)
         before_s = now_s
         yield street
