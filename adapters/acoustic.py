@@ -25,8 +25,14 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, wrap_angle
-from worldstate.measurement.measurement import Approach, Bearing, Measurement
-from worldstate.measurement.protocols import CoEvidenceChannel, MeasurementAdapter, Side
+from worldstate.measurement.measurement import (
+    Approach,
+    Bearing,
+    CoEvidenceChannel,
+    Measurement,
+    MeasurementAdapter,
+    Side,
+)
 
 from .acoustic_grounding import Grounding, observe
 from .acoustic_kinds import check_road_users, expected_labels, heard_kinds

@@ -44,8 +44,7 @@ from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
-from worldstate.measurement.measurement import Measurement
-from worldstate.measurement.protocols import CoEvidenceChannel
+from worldstate.measurement.measurement import CoEvidenceChannel, Measurement
 from worldstate.measurement.sector import Sector
 from worldstate.state import Context, WorldState
 

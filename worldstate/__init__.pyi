@@ -19,14 +19,14 @@ from .ground.values import NotUsable as NotUsable
 from .ground.values import nanoseconds as nanoseconds
 from .measurement.measurement import Approach as Approach
 from .measurement.measurement import Bearing as Bearing
+from .measurement.measurement import CoEvidenceChannel as CoEvidenceChannel
 from .measurement.measurement import Measurement as Measurement
+from .measurement.measurement import MeasurementAdapter as MeasurementAdapter
 from .measurement.measurement import Sighting as Sighting
-from .measurement.protocols import CoEvidenceChannel as CoEvidenceChannel
-from .measurement.protocols import MeasurementAdapter as MeasurementAdapter
 from .state.context import Context as Context
 from .state.cue import RiskCue as RiskCue
 from .state.entity import Entity as Entity
-from .state.relation import Relation as Relation
+from .state.entity import Relation as Relation
 from .state.world_state import WorldState as WorldState
 
 __version__: str

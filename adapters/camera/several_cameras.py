@@ -8,8 +8,7 @@ from dataclasses import replace
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, wrap_angle
-from worldstate.measurement.measurement import Bearing, CameraLook, Look, Sighting
-from worldstate.measurement.protocols import Side
+from worldstate.measurement.measurement import Bearing, CameraLook, Look, Side, Sighting
 from worldstate.measurement.sector import Sector
 
 from .vision_query import VisionQuery

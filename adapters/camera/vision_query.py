@@ -12,8 +12,7 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
-from worldstate.measurement.measurement import Bearing, Look, Sighting
-from worldstate.measurement.protocols import Side
+from worldstate.measurement.measurement import Bearing, Look, Side, Sighting
 from worldstate.measurement.sector import WHOLE_SIDES, Sector
 
 from .detections import DetectionFilter, DetectionLog

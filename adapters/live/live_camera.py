@@ -11,8 +11,7 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.listen import Source
 from worldstate.ground.values import NotUsable
-from worldstate.measurement.measurement import Bearing, Look, Sighting
-from worldstate.measurement.protocols import Side
+from worldstate.measurement.measurement import Bearing, Look, Side, Sighting
 
 # Looks that are remembered: whether a box stands still is asked over the last second, and a camera of more
 # than 60 images a second brings nothing to a decision every 0.1 s.

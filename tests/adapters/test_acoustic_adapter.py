@@ -18,8 +18,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, Measurement
-from worldstate.measurement.protocols import MeasurementAdapter
+from worldstate.measurement.measurement import Approach, Bearing, Measurement, MeasurementAdapter
 
 RATE_HZ = 16_000
 SPEED_OF_SOUND_M_S = 343.0

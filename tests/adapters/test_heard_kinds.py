@@ -22,8 +22,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.values import NotUsable
-from worldstate.measurement.measurement import Bearing, Measurement, Sighting
-from worldstate.measurement.protocols import Side
+from worldstate.measurement.measurement import Bearing, Measurement, Side, Sighting
 
 RATE_HZ = 6000
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])

@@ -15,8 +15,7 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
-from worldstate.measurement.measurement import Bearing
-from worldstate.measurement.protocols import CoEvidenceChannel
+from worldstate.measurement.measurement import Bearing, CoEvidenceChannel
 from worldstate.measurement.sector import Sector
 
 CENTRED = PinholeCamera(position_m=(-0.567, 0.0, -0.485))

@@ -10,8 +10,7 @@ from scipy.linalg import expm
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.belief.explanation import ExplanationBelief
-from worldstate.belief.markov_chain import equilibrium, generator, transition
+from worldstate.belief.explanation import ExplanationBelief, equilibrium, generator, transition
 from worldstate.belief.vision_update import log_co_evidence
 
 DIRECTIONS = ("left", "right")

@@ -16,7 +16,7 @@ from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unquer
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
-from worldstate.belief.arrival_rate import ArrivalRate
+from worldstate.core.sequence_memory import ArrivalRate
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Bearing, Look

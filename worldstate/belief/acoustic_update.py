@@ -15,7 +15,7 @@ from worldstate.belief.kinematics.motion import (
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
-from .hidden_belief import HiddenBelief
+from .explanation import HiddenBelief
 from .settings import FilterSettings
 from .track import Track, merged
 

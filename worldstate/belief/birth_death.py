@@ -9,8 +9,7 @@ from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 
-from .explanation import ExplanationBelief
-from .hidden_belief import HiddenBelief
+from .explanation import ExplanationBelief, HiddenBelief
 from .site_geometry import SiteGeometry
 from .track import Track, entity_id, heard_as
 

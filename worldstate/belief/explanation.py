@@ -1,7 +1,14 @@
-"""The belief over explanations, a hidden Markov model filtered in log space."""
+r"""The belief over explanations: a Markov chain in continuous time, filtered in log space.
+
+Its states are, in order: hidden in direction 1 .. K, in view having come from direction 1 .. K, in view from
+elsewhere, none. All visible states leave at the same rates, so the chain lumps exactly onto (hidden_1 ..
+hidden_K, visible, none) and, with equal rates for all directions, onto the three explanations. What the finer
+chain adds is whether a source in view is the one that was heard while hidden.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from operator import attrgetter
 from typing import Annotated, TypeAlias
 
@@ -10,10 +17,44 @@ import numpy as np
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, posterior_of
+from worldstate.abduction.rate_matrix import transitions
 from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 
-from .markov_chain import RatesHz, equilibrium, transition
+RatesHz = tuple[float, ...]
+"""arrival (each), emergence, departure, reocclusion (all together), visible arrival, visible departure"""
+
+
+@lru_cache(maxsize=64)
+def generator(rates_hz: RatesHz, directions: int) -> FloatArray:
+    r"""Return Q, shape (2K + 2, 2K + 2), 1/s: row i holds the rates out of state i and sums to zero."""
+    arrival, emergence, departure, reocclusion, visible_arrival, visible_departure = rates_hz
+    hidden, emerged = np.arange(directions), np.arange(directions, 2 * directions)
+    elsewhere, none = 2 * directions, 2 * directions + 1
+    rate = np.zeros((none + 1, none + 1))
+    rate[hidden, emerged] = emergence
+    rate[hidden, none] = departure
+    rate[directions:none, :directions] = reocclusion / directions
+    rate[directions:none, none] = visible_departure
+    rate[none, hidden] = arrival
+    rate[none, elsewhere] = visible_arrival
+    np.fill_diagonal(rate, -rate.sum(axis=1))
+    rate.flags.writeable = False
+    return rate
+
+
+@lru_cache(maxsize=256)
+def transition(rates_hz: RatesHz, directions: int, step_ns: int) -> FloatArray:
+    r"""Return exp(Q dt), shape (2K + 2, 2K + 2), rows sum to one; cached, hops repeat a few lengths only."""
+    return transitions(generator(rates_hz, directions), step_ns)
+
+
+@lru_cache(maxsize=64)
+def equilibrium(rates_hz: RatesHz, directions: int) -> FloatArray:
+    """Return the distribution that the chain reaches from "none" after a long time, shape (2K + 2,)."""
+    settled: FloatArray = transition(rates_hz, directions, 10**12)[-1]
+    return settled
+
 
 # About 1e-261: keeps every log finite, and is far below what the likelihoods of a few windows could raise
 # again.
@@ -40,7 +81,7 @@ class ExplanationBelief:
     (0.176, 0.235, 0.588)
     """
 
-    log_probabilities: tuple[float, ...]  # In the order of `markov_chain`, length 2K + 2, nats
+    log_probabilities: tuple[float, ...]  # In the order of the chain, length 2K + 2, nats
 
     @classmethod
     def settled(cls, k: int, rates_hz: RatesHz) -> "ExplanationBelief":
@@ -62,7 +103,7 @@ class ExplanationBelief:
 
     @property
     def probabilities(self) -> FloatArray:
-        """Shape (2K + 2,), in the order of `markov_chain`."""
+        """Shape (2K + 2,), in the order of the chain."""
         return np.exp(self.log_probabilities)
 
     @property
@@ -152,3 +193,28 @@ AsLogs: TypeAlias = Annotated[
 def _logs(probabilities: FloatArray) -> tuple[float, ...]:
     with np.errstate(divide="ignore"):
         return tuple(np.maximum(np.log(probabilities), LOG_FLOOR).tolist())
+
+
+@dataclass(frozen=True, slots=True)
+class HiddenBelief:
+    """P(hidden) and P(in view, come from there), side by side; sides do not exclude each other.
+
+    Examples
+    --------
+    >>> both = HiddenBelief((0.9, 0.8), (0.0, 0.1))
+    >>> [round(both.existence(side), 2) for side in (0, 1)]
+    [0.9, 0.9]
+    """
+
+    hidden: tuple[float, ...]
+    emerged: tuple[float, ...]
+
+    def existence(self, side: int) -> float:
+        """Return the probability that there is such a vehicle."""
+        # The sum of two exponentials exceeds one by rounding where nothing else is possible.
+        return min(self.hidden[side] + self.emerged[side], 1.0)
+
+    def hidden_share(self, side: int) -> float:
+        """Return P(hidden | exists)."""
+        either = self.hidden[side] + self.emerged[side]
+        return self.hidden[side] / either if either > 0.0 else 1.0

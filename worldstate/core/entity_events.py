@@ -7,7 +7,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.track import Track
 from worldstate.ground.values import nanoseconds
 from worldstate.state import Event
-from worldstate.state.event import EventKind
+from worldstate.state.entity import EventKind
 
 from .memory import Memory
 

@@ -12,8 +12,7 @@ from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.belief.belief_lag import BeliefLag
 from worldstate.belief.ego_motion import EgoBelief
-from worldstate.belief.explanation import AsLogs, ExplanationBelief
-from worldstate.belief.hidden_belief import HiddenBelief
+from worldstate.belief.explanation import AsLogs, ExplanationBelief, HiddenBelief
 from worldstate.belief.track import Track
 from worldstate.ground.serialisation import ADDED, Count, Keys, written_as
 from worldstate.ground.values import NotUsable

@@ -13,7 +13,7 @@ from worldstate.belief.track import Track
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import nanoseconds
 from worldstate.state import Context, Relation
-from worldstate.state.relation import EGO
+from worldstate.state.entity import EGO
 
 from .memory import Memory
 

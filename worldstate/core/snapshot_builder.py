@@ -11,20 +11,58 @@ from worldstate.abduction.road_users import UNKNOWN
 from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.announced import time_to_visible
 from worldstate.belief.ego_motion import EgoBelief
+from worldstate.belief.explanation import HiddenBelief
 from worldstate.belief.hidden_bearing import hidden_bearing
-from worldstate.belief.hidden_belief import HiddenBelief
-from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
+from worldstate.belief.kinematics.motion import FARTHEST_M, NEAREST_M, MotionBelief
+from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LEAST_Q, LOG_RANGE, RADIAL_RATE
+from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Track
+from worldstate.belief.track import PARKED_ACCELERATION, Track
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.state import Classification, Context, Entity, SearchedView, SensorHealth, Visibility
-from worldstate.state.ego import Ego
+from worldstate.state.sensor import Ego
 
-from .forecast import Forecast, forecasts
 from .memory import CountedLook, Memory
 from .sequence_memory import SequenceMemory
 from .step import NEWS_HOLDS_NS
+
+# Beyond two seconds vehicles at junctions have turned or braked.
+_AFTER_S = np.array([1.0, 2.0])
+_CUBES = _AFTER_S**3 / 3.0
+_NAMES = tuple(f"{after_s:g}" for after_s in _AFTER_S)
+Forecast: TypeAlias = dict[str, tuple[float, float]]
+
+
+def forecasts(
+    tracks: tuple[Track, ...], means: FloatArray, covariances: FloatArray, settings: FilterSettings
+) -> list[Forecast]:
+    r"""Return where entities will be, one forecast a track: constant velocity, all of them at once.
+
+    With the state :math:`(\theta, \dot\theta, \rho, \log r)` and its covariance P, after t seconds
+
+    .. math:: \theta_t = \theta + \operatorname{atan2}(b, a), \quad a = 1 + \rho t, \quad
+              b = \dot\theta t, \quad q = a^2 + b^2, \qquad
+              \sigma_t^2 = h^T P h + \frac{s t^3}{3 r^2 q}, \quad h = (1, a t / q, -b t / q, 0),
+
+    with white acceleration of density s.
+
+    Shapes: means (n, 4), covariances (n, 4, 4).
+    """
+    theta, omega, rho, log_range = means.T[:, :, None]
+    a, b = 1.0 + rho * _AFTER_S, omega * _AFTER_S
+    q = np.maximum(a * a + b * b, LEAST_Q)
+    gradient = np.stack([np.ones_like(a), a * _AFTER_S / q, -b * _AFTER_S / q], axis=-1)
+    known = (gradient @ covariances[:, :LOG_RANGE, :LOG_RANGE] * gradient).sum(axis=-1)
+    density = np.array([settings.acceleration_psd if one.moving else PARKED_ACCELERATION for one in tracks])
+    range_m = np.exp(np.minimum(np.maximum(log_range, math.log(NEAREST_M)), math.log(FARTHEST_M)))
+    variance = known + density[:, None] * _CUBES / (range_m**2 * q)
+    azimuth_rad = theta + np.arctan2(b, a)
+    azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
+    # Full precision would take twice as long to write.
+    rows = np.stack([azimuth_rad, np.sqrt(variance)], axis=-1)
+    return [dict(zip(_NAMES, map(tuple, row), strict=True)) for row in rows.round(6).tolist()]
+
 
 # Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
 _KNOWN_LOG_RANGE_STD = 0.25

@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
-from .protocols import Side
+from .measurement import Side
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,6 @@ from .observations import EgoStep as EgoStep
 from .observations import PastEdge as PastEdge
 from .observations import Range as Range
 from .observations import ReflectedBearing as ReflectedBearing
-from .settings import SmoothingSettings as SmoothingSettings
+from .observations import SmoothingSettings as SmoothingSettings
 from .smoothed_track import FirstSight as FirstSight
 from .smoothed_track import SmoothedTrack as SmoothedTrack

@@ -16,8 +16,7 @@ from worldstate.measurement.measurement import Approach, Bearing
 from worldstate.measurement.position import Position
 
 from .geometry import azimuth, cartesian, closing_rate, in_ego_axes, log_range, reflected_place
-from .observations import AngularHeight, EgoStep, PastEdge, Range, ReflectedBearing
-from .settings import SmoothingSettings
+from .observations import AngularHeight, EgoStep, PastEdge, Range, ReflectedBearing, SmoothingSettings
 from .vector_factor import Factor, NoiseModel, vector_factor
 
 _PLANE = 2

@@ -20,8 +20,15 @@ from worldstate.smoothing import factors as f
 
 from .geometry import moved, polar
 from .graph import FactorGraph, Refined
-from .observations import AngularHeight, EgoStep, Observation, PastEdge, Range, ReflectedBearing
-from .settings import SmoothingSettings
+from .observations import (
+    AngularHeight,
+    EgoStep,
+    Observation,
+    PastEdge,
+    Range,
+    ReflectedBearing,
+    SmoothingSettings,
+)
 from .smoothed_track import FirstSight, SmoothedTrack
 from .vector_factor import CORNER, EGO, ENTITY, HEIGHT, WALL, Factor, key_of
 

@@ -8,11 +8,11 @@ from .cue import EvidenceTerms as EvidenceTerms
 from .cue import RiskCue as RiskCue
 from .entity import Classification as Classification
 from .entity import Entity as Entity
+from .entity import Event as Event
+from .entity import Relation as Relation
 from .entity import Visibility as Visibility
-from .event import Event as Event
-from .relation import Relation as Relation
+from .sensor import Delivery as Delivery
 from .sensor import SearchedView as SearchedView
 from .sensor import SensorHealth as SensorHealth
-from .world_state import Delivery as Delivery
 from .world_state import WorldState as WorldState
 from .world_state import snapshot_schema as snapshot_schema

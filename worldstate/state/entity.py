@@ -1,4 +1,4 @@
-"""Entities: road users of the world-state, seen or hidden."""
+"""Entities: road users of the world-state, seen or hidden; their relations, and events in their life."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -148,3 +148,73 @@ class Entity:
     sector_rad: tuple[float, float] | None = None
     azimuth_covariance: Vector | None = None
     forecast: Mapping[str, tuple[float, float]] | None = None
+
+
+EventKind: TypeAlias = Literal["born", "handed_over", "coasting", "hidden_again", "died", "merged"]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A change in the life of an entity.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Of the measurement that brought it, ns.
+    kind : {"born", "handed_over", "coasting", "hidden_again", "died", "merged"}
+        Begun; come into view of a sensor that had not seen it; in view before and not found by the last look;
+        seen before and now behind an occluder; dropped; gone on as another one.
+    entity_id : str
+        Whose.
+    into : str or None
+        As whom a merged one goes on; None of all other kinds.
+
+    Examples
+    --------
+    >>> Event(0, "born", "a").kind
+    'born'
+    """
+
+    stamp_ns: int
+    kind: EventKind
+    entity_id: str
+    into: str | None = None
+
+
+EGO = "ego"
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """An edge of the scene graph.
+
+    Parameters
+    ----------
+    src, dst : str
+        Ids of entities or occluders, or ``"ego"``.
+    kind : str
+        ``"occluded_by"``, ``"approaching_from"`` and ``"emerged_from"`` lead to an occluder,
+        ``"approaching"`` and ``"conflicts_with_ego_path"`` (on the path ahead of it within five seconds) to
+        the ego vehicle, ``"same_lane"`` and ``"in_front_of"`` to whom an entity is next ahead of, the ego
+        vehicle or another entity; these three are told of entities with a position.
+    probability : float
+        Probability that it holds, given that both ends exist.
+    stamp_ns : int
+        Time of the belief, ns.
+    since_ns, until_ns : int or None
+        Interval in which the probability was last at least .5, ns; the first is None if it never was, the
+        second while it is. Both are forgotten five seconds after its end.
+
+    Examples
+    --------
+    >>> Relation("a", EGO, "approaching", 0.9, 0).kind
+    'approaching'
+    """
+
+    src: str
+    dst: str
+    kind: str
+    probability: Probability
+    stamp_ns: int
+    since_ns: int | None = None
+    until_ns: int | None = None

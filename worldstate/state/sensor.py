@@ -1,9 +1,9 @@
-"""Sensors of a snapshot: how each is, and what each searched last."""
+"""Sensors of a snapshot: health, last views, order of delivery, and the ego vehicle by its odometry."""
 
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from worldstate.ground.serialisation import Probability
+from worldstate.ground.serialisation import Count, Probability
 
 Condition: TypeAlias = Literal["working", "impaired", "silent"]
 
@@ -64,3 +64,58 @@ class SearchedView:
     miss_rate: Probability
     clutter_rate: Probability
     sector_rad: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Ego:
+    """Pose in the map frame and twist of the ego vehicle.
+
+    Parameters
+    ----------
+    position_m : (float, float)
+        Of `base_link` in the map frame, m.
+    yaw_rad : float
+        Its x axis, counter-clockwise from that of the map.
+    covariance : nested tuple of floats, shape (3, 3)
+        Of (x, y, yaw).
+    speed_mps, yaw_rate_rad_s : float
+        Along its x axis and about its z axis, left positive.
+
+    Examples
+    --------
+    >>> Ego((2.0, 0.0), 0.0, ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 1e-4)), 5.0, 0.0).speed_mps
+    5.0
+    """
+
+    position_m: tuple[float, float]
+    yaw_rad: float
+    covariance: tuple[tuple[float, ...], ...]
+    speed_mps: float
+    yaw_rate_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """What has been wrong with the order of measurements since the filter began.
+
+    Parameters
+    ----------
+    replayed : int
+        Late ones that were put where they belong.
+    repeated : int
+        Delivered before, and dropped.
+    too_late : int
+        Later than the filter's lag, and dropped.
+    reanchored : int
+        Times that everything came too late for a second, by clocks that changed, and the belief began anew.
+
+    Examples
+    --------
+    >>> Delivery().too_late
+    0
+    """
+
+    replayed: Count = 0
+    repeated: Count = 0
+    too_late: Count = 0
+    reanchored: Count = 0

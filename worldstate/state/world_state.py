@@ -8,47 +8,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from worldstate.abduction.signature.domain_guard import DomainVerdict
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import optional
-from worldstate.ground.serialisation import ADDED, Count, Layout, decode, decode_json, encode
+from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
 from .cue import RiskCue
-from .ego import Ego
-from .entity import Entity
-from .event import Event
-from .relation import EGO, Relation
-from .sensor import SearchedView, SensorHealth
+from .entity import EGO, Entity, Event, Relation
+from .sensor import Delivery, Ego, SearchedView, SensorHealth
 
 if TYPE_CHECKING:
     import networkx as nx
-
-
-@dataclass(frozen=True, slots=True)
-class Delivery:
-    """What has been wrong with the order of measurements since the filter began.
-
-    Parameters
-    ----------
-    replayed : int
-        Late ones that were put where they belong.
-    repeated : int
-        Delivered before, and dropped.
-    too_late : int
-        Later than the filter's lag, and dropped.
-    reanchored : int
-        Times that everything came too late for a second, by clocks that changed, and the belief began anew.
-
-    Examples
-    --------
-    >>> Delivery().too_late
-    0
-    """
-
-    replayed: Count = 0
-    repeated: Count = 0
-    too_late: Count = 0
-    reanchored: Count = 0
 
 
 @dataclass(frozen=True, slots=True)

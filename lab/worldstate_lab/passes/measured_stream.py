@@ -14,8 +14,7 @@ from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.acoustic import asked_again
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, Measurement
-from worldstate.measurement.protocols import CoEvidenceChannel
+from worldstate.measurement.measurement import Approach, Bearing, CoEvidenceChannel, Measurement
 
 
 def measurements(

@@ -16,8 +16,7 @@ from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.measurement.position import Position
 
-from .gaussian import GaussianBelief
-from .motion import MotionBelief
+from .motion import GaussianBelief, MotionBelief
 from .polar import AZIMUTH, AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
 
 # A lane and a half: of a position that is less sure, a number would be taken for more than it says.

@@ -11,8 +11,7 @@ from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother
-from worldstate.smoothing.observations import AngularHeight, Observation
-from worldstate.smoothing.settings import SmoothingSettings
+from worldstate.smoothing.observations import AngularHeight, Observation, SmoothingSettings
 from worldstate.smoothing.smoothed_track import FirstSight, SmoothedTrack
 from worldstate.state.context import blind_corner
 
