@@ -15,7 +15,7 @@ from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.adapters.camera.several_cameras import SeveralCameras
 from worldstate.adapters.files.acoustic_domain import feature_order
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.direct_sound import direct_probability
+from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.settings import FrontEndSettings

@@ -35,11 +35,10 @@ from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.core.filter import WorldFilter
 from worldstate.core.fixed_lag import Timed
-from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import CLEANED_FEATURE_VERSION, feature_nfft
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
-from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.settings import FrontEndSettings, default_band_hz
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError

@@ -15,9 +15,7 @@ from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.spectra.phat import power, whiten
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
 from worldstate.ground.typing import Complex64Array, Complex128Array, Float32Array, FloatArray
 
 from .settings import FrontEndSettings

@@ -6,21 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.frontend.approach.energy_floor import EnergyFloor
-from worldstate.frontend.approach.looming import Looming, fitted_looming
+from worldstate.frontend.approach.looming import EnergyFloor, Looming, fitted_looming
 from worldstate.frontend.approach.tone_stage import ToneStage
-from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
+from worldstate.frontend.array.geometry import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.bearing import bearing_of
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
-from worldstate.frontend.direction.noise_floor import noise_prominence
 from worldstate.frontend.direction.peaks import highest_peaks
-from worldstate.frontend.direction.srp import normalised
+from worldstate.frontend.direction.srp import noise_prominence, normalised
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise
-from worldstate.frontend.spectra.bands import SILENCE
-from worldstate.frontend.spectra.bins import bin_frequencies_hz
+from worldstate.frontend.levels import SILENCE
 from worldstate.frontend.spectra.hop_cutter import Hop, HopCutter
 from worldstate.frontend.spectra.sound_character import SoundCharacter
+from worldstate.frontend.spectra.stft import bin_frequencies_hz
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
@@ -112,7 +110,7 @@ class FrontEnd:
         self._azimuths = settings.azimuths_rad()
         self._elevations = settings.elevations_rad()
         self._azimuths.flags.writeable = self._elevations.flags.writeable = False
-        self._ambiguity, self._mirror = array.ambiguity, mirror_reflection(array)
+        self._ambiguity, self._mirror = array.ambiguity, mirror_reflection(array.positions_m)
         self._cutter = HopCutter(array.n_microphones, self.sample_rate_hz, settings.hop_rate_hz)
         with one_blas_thread():
             self._spectra = HopSpectra(array, self.sample_rate_hz, settings)

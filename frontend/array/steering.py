@@ -6,14 +6,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray
+from worldstate.ground.typing import BoolArray, Complex64Array, Complex128Array, FloatArray, IndexArray
 
-from .angular_interpolation import AngularInterpolation
 from .geometry import SPEED_OF_SOUND_M_S
 from .microphone_array import MicrophoneArray
 
-# Largest error of a steering vector by the factors, relative to its length: that of single precision.
-_TOLERANCE = 1e-6
+# Largest errors by interpolation, relative to the largest possible power, and of a steering vector by the
+# factors, relative to its length: those of single precision.
+_POWER_TOLERANCE, _TOLERANCE = 1e-7, 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +134,7 @@ def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: byte
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeBeams:
-    """Beams at the node directions of `AngularInterpolation`."""
+    """Beams at the few directions from which the power in all others is interpolated."""
 
     weights: Complex64Array  # shape (bins, r or M, N): C at the nodes, and its conjugate
     conjugate: Complex64Array
@@ -143,11 +143,46 @@ class NodeBeams:
     @classmethod
     def of(cls, weights: Complex128Array) -> "NodeBeams | None":
         r"""Choose nodes for weights (bins, r or M, directions); None if that saves no work."""
-        nodes = AngularInterpolation.of(weights)
+        nodes = interpolation_nodes(weights)
         if nodes is None:
             return None
-        chosen = np.ascontiguousarray(weights[:, :, nodes.index], np.complex64)
-        return cls(chosen, chosen.conj(), nodes.spread)
+        index, spread = nodes
+        chosen = np.ascontiguousarray(weights[:, :, index], np.complex64)
+        return cls(chosen, chosen.conj(), spread)
+
+
+def interpolation_nodes(vectors: Complex128Array) -> tuple[IndexArray, FloatArray] | None:
+    r"""Choose nodes N among the directions of steering vectors (bins, M, directions), and their weights.
+
+    .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta), \qquad s = G_{NN}^{-1} G_{N\theta}, \qquad
+              G(\theta, \phi) = \sum_k \big| a_k(\theta)^H a_k(\phi) \big|^2
+
+    A quadratic form :math:`P = \sum_k a_k(\theta)^H Q_k\, a_k(\theta)` is a smooth function of the direction,
+    whatever the Q_k: below the alias frequency of an array it lies in a space of some thirty dimensions,
+    however fine the grid. The nodes follow from a pivoted Cholesky factorisation of G (N. J. Higham,
+    "Analysis of the Cholesky decomposition of a semi-definite matrix", 1990): each where the ones before
+    predict the power worst, until all are predicted; None if more than half of the directions would be
+    needed.
+    """
+    count = vectors.shape[2]
+    rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)
+    limit = _POWER_TOLERANCE**2 * rest.max()
+    rows, index = np.empty((count // 2, count)), np.empty(count // 2, np.intp)
+    for n in range(count // 2):
+        worst = int(rest.argmax())
+        if rest[worst] <= limit:
+            return index[:n].copy(), np.linalg.solve(rows[:n, index[:n]], rows[:n])
+        kernel = _kernel(vectors, worst) - rows[:n, worst] @ rows[:n]
+        index[n], rows[n] = worst, kernel / np.sqrt(rest[worst])
+        rest = rest - np.square(rows[n])
+        rest[index[: n + 1]] = 0.0
+    return None
+
+
+def _kernel(vectors: Complex128Array, index: int) -> FloatArray:
+    """G between one direction and all, (directions,)."""
+    inner = (vectors[:, None, :, index].conj() @ vectors)[:, 0]
+    return np.asarray((np.square(inner.real) + np.square(inner.imag)).sum(axis=0))
 
 
 def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:

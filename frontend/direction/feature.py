@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike
 from worldstate.frontend.array.geometry import SPEED_OF_SOUND_M_S
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.spectra.phat import whiten
+from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz, whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError

@@ -27,17 +27,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.frontend.array.steering import Steering, cross_spectra
-from worldstate.frontend.spectra.phat import whiten
+from worldstate.frontend.spectra.stft import whiten
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, FloatArray
 
 from .elevation_split import ElevationSplit, share_of
-from .guard_delay import GuardDelay
 from .harmonic_cancellation import HarmonicCanceller
-from .noise_memory import NoiseCovariance, NoiseLevel
-from .prewhitening import shrunk_inverse_root, white_share
-from .whitened_beams import WhitenedBeams
+from .noise_memory import GuardDelay, NoiseCovariance, NoiseLevel
+from .prewhitening import WhitenedBeams, shrunk_inverse_root, white_share
 
 _TINY = np.float32(1e-30)
 # Shares of below-horizon power at which whitening begins and is complete. Simulated streets: below 0.1;

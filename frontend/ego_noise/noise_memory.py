@@ -1,12 +1,34 @@
 """Recursive means of the noise: its covariance, and its level after whitening."""
 
 import math
+from collections import deque
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from worldstate.ground.typing import Complex64Array
 
-from .guard_delay import GuardDelay
+Item = TypeVar("Item")
+
+
+class GuardDelay(Generic[Item]):
+    r"""Queue of hops, weighted :math:`w'_n = \min(w_n, \dots, w_{n + hops})` over the guard interval."""
+
+    # Each hop leaves after `hops` hops. Without the delay a source is learned as noise in the moments before
+    # it is detected.
+
+    def __init__(self, hops: int) -> None:
+        self._waiting: deque[Item] = deque()
+        self._weights: deque[float] = deque(maxlen=hops + 1)
+
+    def push(self, item: Item, weight: float) -> tuple[Item, float] | None:
+        """Take a hop with its weight; return the one that leaves the delay, None while it fills."""
+        self._waiting.append(item)
+        self._weights.append(weight)
+        if len(self._waiting) < (self._weights.maxlen or 0):
+            return None
+        return self._waiting.popleft(), min(self._weights)
+
 
 # Memory of the level of whitened noise, hops: one second, for the level follows the speed of the vehicle.
 _LEVEL_HOPS = 10.0

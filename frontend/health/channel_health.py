@@ -157,3 +157,11 @@ class ArrayHealth:
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:
     """List one kind of fault for all channels in which it was found; both arrays have shape (M,)."""
     return [ChannelFault(int(m), fault, float(values[m])) for m in np.flatnonzero(found)]
+
+
+def repeated(
+    found: list[ChannelFault], before: list[ChannelFault]
+) -> tuple[list[ChannelFault], list[ChannelFault]]:
+    """Return the faults that were found the last time, too, and all of them for the next time."""
+    known = {(one.channel, one.fault) for one in before}
+    return [one for one in found if (one.channel, one.fault) in known], found

@@ -1,6 +1,7 @@
 """Monitor the channels of a stream, hop by hop, against each other."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -12,9 +13,28 @@ from .channel_levels import ChannelLevels
 from .clipping import ClippingCounter
 from .dropouts import Dropout, DropoutFinder
 from .geometry_check import GeometryCheck
-from .plane_wave_check import PlaneWaveCheck
-from .running_mean import RunningMean
 from .sample_clock import SampleClock
+
+# Time constant, hops: three seconds.
+_HOPS = 30
+
+
+class RunningMean:
+    """Exponential mean over hops, an ordinary mean until its time constant has passed."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.mean = np.zeros(shape)
+        self.count = np.zeros(shape[1], np.int64)
+
+    def add(self, values: ArrayLike, good: BoolArray) -> None:
+        r"""Take the values of a hop, shape (statistics, M), and the usable channels, shape (M,).
+
+        .. math:: \mu_{sm} \leftarrow \mu_{sm} + g_m \frac{x_{sm} - \mu_{sm}}{\min(n_m, 30)}
+        """
+        self.count += good
+        weight = good / np.clip(self.count, 1, _HOPS)
+        self.mean += weight * (np.asarray(values) - self.mean)
+
 
 # Mean square of the band, relative to the median channel, below which a channel is silent: -30 dB, far below
 # the few dB by which usable microphones differ.
@@ -60,7 +80,6 @@ class ChannelMonitor:
         self._dropouts: tuple[Dropout, ...] = ()
         self._n_dropouts = 0
         self._geometry_check = GeometryCheck(array, frequencies_hz, speed_of_sound_m_s)
-        self._plane_waves = PlaneWaveCheck(array, frequencies_hz, speed_of_sound_m_s)
 
     def push(
         self,
@@ -90,10 +109,7 @@ class ChannelMonitor:
         silent = self._silent(energies, alive)
         self._levels.push(powers.mean(axis=0, dtype=np.float64), ~silent)
         bad = self._judge_hop(samples, span, silent)
-        active = ~self._activity.suspects
-        self._geometry_check.push(matrices, len(energies), active)
-        proposed = [one for one in self._geometry_check.faults() if one.fault is Fault.SWAPPED]
-        self._plane_waves.push(matrices, len(energies), active, proposed)
+        self._geometry_check.push(matrices, len(energies), ~self._activity.suspects)
         return self._report(bad)
 
     def _silent(self, energies: FloatArray, alive: BoolArray) -> BoolArray:
@@ -123,7 +139,7 @@ class ChannelMonitor:
         if self._n_hops % _EVERY_HOPS == 0:
             self._single_channel = self._single_channel_faults()
         self._n_hops += 1
-        faults = [*self._activity.faults(), *self._positional_faults(), *self._single_channel]
+        faults = [*self._activity.faults(), *self._geometry_check.faults, *self._single_channel]
         faults.sort(key=lambda fault: (fault.channel, fault.fault))
         keep = ~bad
         for fault in faults:
@@ -137,21 +153,6 @@ class ChannelMonitor:
             self._geometry_check.coherence,
             rate,
         )
-
-    def _positional_faults(self) -> list[ChannelFault]:
-        """Faults seen in the phases between channels, one a channel, the more specific one."""
-        waves, geometry = self._plane_waves.faults(), self._geometry_check.faults()
-        # Microphones half a metre apart hardly predict each other: noisy is what no wave agrees with, either.
-        incoherent = self._plane_waves.incoherent
-        geometry = [
-            one
-            for one in geometry
-            if one.fault is Fault.INVERTED or (one.fault is Fault.NOISY and incoherent[one.channel])
-        ]
-        inverted = {one.channel for one in geometry if one.fault is Fault.INVERTED}
-        found = [one for one in waves if one.channel not in inverted]
-        elsewhere = {one.channel for one in found}
-        return found + [one for one in geometry if one.channel not in elsewhere]
 
     def _single_channel_faults(self) -> list[ChannelFault]:
         """Faults seen on a channel by itself: clipping, offset, level, gusts."""

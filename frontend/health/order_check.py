@@ -48,7 +48,7 @@ class OrderCheck:
         usual = log_sharpness(self._waves.agreement(coherence))
         gains = sharpness_gains(coherence, self._waves.beams, np.array(pairs, int).reshape(-1, 2))
         rival = log_sharpness_undelayed - usual
-        # What nobody proposes any more is forgotten.
+        # An exchange that is no longer proposed is forgotten.
         before, self._gains = self._gains, {}
         for pair, gain in zip(pairs, gains.tolist(), strict=True):
             self._gains[pair] = before.get(pair, deque(maxlen=_MEMORY_S))

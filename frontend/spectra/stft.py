@@ -1,9 +1,57 @@
-"""Short-time Fourier transform of a stream, for a range of bins only."""
+"""Short-time Fourier transform of a stream for a range of bins, and the phase transform of its spectra."""
 
 import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, Float32Array, IntArray
+
+# Smallest power of a bin that is not silence: far below 24-bit quantisation, far above float32 underflow.
+_POWER_FLOOR = np.float32(1e-30)
+
+
+def power(spectra: Complex64Array) -> Float32Array:
+    """Squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, without a square root, same shape.
+
+    Examples
+    --------
+    >>> power(np.array([3 + 4j], np.complex64))
+    array([25.], dtype=float32)
+    """
+    squared = np.square(spectra.real)
+    squared += np.square(spectra.imag)
+    return squared
+
+
+def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Complex64Array:
+    r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
+
+    Source: C. Knapp and G. C. Carter, IEEE Trans. ASSP 24, 1976.
+    """
+    squared = power(spectra) if powers is None else powers
+    weights = np.maximum(squared, _POWER_FLOOR)
+    np.sqrt(weights, out=weights)
+    np.reciprocal(weights, out=weights)
+    return np.asarray(spectra * weights)
+
+
+def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
+    """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded."""
+    low, high = (int(np.round(frequency / sample_rate_hz * nfft)) for frequency in band_hz)
+    if not 0 <= low < high:
+        raise InvalidArgumentError(
+            f"band_hz: expected a band of at least one bin of {nfft}, got {band_hz} Hz"
+        )
+    if high > nfft // 2:
+        raise InvalidArgumentError(
+            f"band_hz: expected less than half the sample rate of {sample_rate_hz} Hz, got {band_hz} Hz: "
+            "choose a lower band, or sound of a higher rate (simulate: --bandwidth)"
+        )
+    return range(low, high)
+
+
+def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
+    """Centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,)."""
+    return np.arange(bins.start, bins.stop) * (sample_rate_hz / nfft)
 
 
 class StreamingStft:

@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 
 from worldstate.abduction.bearing_vote import with_bearing_vote
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.frontend.direction.direct_sound import direct_probability
+from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.peaks import Peak
 
 likelihoods = st.floats(-8.0, 8.0)

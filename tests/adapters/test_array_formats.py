@@ -8,8 +8,8 @@ import pytest
 
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.cli.common.array_options import stance
-from worldstate.frontend.array.default_band import default_band_hz
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.settings import default_band_hz
 
 PLACES = [[0.5, 0.2, 1.4], [0.5, -0.2, 1.4], [0.1, 0.0, 1.5]]
 

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from worldstate.frontend.array.front_back_ambiguity import mirror_azimuth_rad, mirror_reflection
+from worldstate.frontend.array.geometry import mirror_azimuth_rad, mirror_reflection
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.direction.music import covariance, covariance_subspace, music_spectrum
 from worldstate.frontend.direction.music_stage import MusicReading
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
@@ -122,7 +121,7 @@ def test_the_twin_sounds_the_same(tilt_deg: float, azimuth_deg: float) -> None:
     c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
     array = MicrophoneArray(ARRAY.positions_m @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
     bearing = np.radians(azimuth_deg)
-    twin = mirror_azimuth_rad(mirror_reflection(array), bearing)
+    twin = mirror_azimuth_rad(mirror_reflection(array.positions_m), bearing)
     assert isinstance(twin, float)
     assert np.degrees(
         np.angle(np.exp(1j * (twin - np.pi - 2 * np.radians(tilt_deg) + bearing)))
@@ -133,11 +132,11 @@ def test_the_twin_sounds_the_same(tilt_deg: float, azimuth_deg: float) -> None:
 
 def test_twins_of_lines_and_solids() -> None:
     line = MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)])
-    assert mirror_azimuth_rad(mirror_reflection(line), 0.3) == pytest.approx(np.pi - 0.3)
+    assert mirror_azimuth_rad(mirror_reflection(line.positions_m), 0.3) == pytest.approx(np.pi - 0.3)
     lying = MicrophoneArray(ARRAY.positions_m[:, [2, 1, 0]])
     pole = MicrophoneArray([[0, 0, 0.1 * i] for i in range(4)])
     for array in (lying, pole, BLOCK):
-        assert isinstance(mirror_azimuth_rad(mirror_reflection(array), 0.3), NotUsable)
+        assert isinstance(mirror_azimuth_rad(mirror_reflection(array.positions_m), 0.3), NotUsable)
 
 
 def test_the_frame_tells_the_twin_and_the_grid_shows_it() -> None:

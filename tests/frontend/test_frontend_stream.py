@@ -20,8 +20,7 @@ from worldstate.frontend.direction.music_stage import MusicReading
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable

@@ -10,7 +10,7 @@ from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
 from worldstate.frontend.direction.srp import srp_phat
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
+from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
 from worldstate.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
 
 AZIMUTHS_RAD = np.radians(np.arange(-90.0, 91.0))

@@ -22,8 +22,7 @@ from worldstate.frontend.direction.srp import srp_phat
 from worldstate.frontend.ego_noise.ego_noise import EgoNoiseSettings
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.bins import bin_frequencies_hz
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array

@@ -19,9 +19,7 @@ from worldstate.frontend.direction.srp import normalised, steered_power
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.levels import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.bins import bin_frequencies_hz
-from worldstate.frontend.spectra.phat import power, whiten
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, power, whiten
 from worldstate.ground.typing import Float32Array
 
 from .stopwatch import Milliseconds, elapsed_ms

@@ -23,9 +23,7 @@ from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
 from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
-from worldstate.frontend.spectra.bins import bin_frequencies_hz
-from worldstate.frontend.spectra.phat import whiten
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
 
 RATE, NFFT, HOPS, WARM_UP = 47_998, 512, 120, 60
 BINS, SRP = range(1, 19), slice(2, 18)

@@ -30,8 +30,7 @@ from worldstate.frontend.direction.feature import (
     pair_sum_of,
     segment_feature,
 )
-from worldstate.frontend.spectra.bins import band_bins
-from worldstate.frontend.spectra.phat import whiten
+from worldstate.frontend.spectra.stft import band_bins, whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray

@@ -24,8 +24,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.errors import OutOfDomainError

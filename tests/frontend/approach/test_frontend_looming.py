@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.frontend.approach.energy_floor import EnergyFloor
-from worldstate.frontend.approach.looming import Looming, looming
+from worldstate.frontend.approach.looming import EnergyFloor, Looming, looming
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 

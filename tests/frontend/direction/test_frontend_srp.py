@@ -10,8 +10,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.peaks import find_peaks
 from worldstate.frontend.direction.srp import srp_phat
-from worldstate.frontend.spectra.bins import band_bins, bin_frequencies_hz
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 
 AZIMUTHS = np.radians(np.arange(-90.0, 91.0))
 BAND = (300.0, 1800.0)

@@ -20,8 +20,7 @@ from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.ego_noise.prewhitening import shrunk_inverse_root, white_share
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.spectra.phat import whiten
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, whiten
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation.sound.ego_sound import ENGINE_M, ego_noise, ego_sound

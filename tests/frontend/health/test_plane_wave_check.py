@@ -19,8 +19,8 @@ from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
-from worldstate.frontend.health.card_search import best_card, runs, untilted
 from worldstate.frontend.health.channel_health import ArrayHealth, ChannelFault
+from worldstate.frontend.health.delay_check import best_card, runs, untilted
 from worldstate.frontend.health.order_check import sharpness_gains
 from worldstate.frontend.stream import FrontEnd
 from worldstate.operations.recordings.channel_report import HealthLog

@@ -9,8 +9,7 @@ import numpy as np
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.frontend.direction.source_count import count_sources
 from worldstate.frontend.frame import AcousticFrame
-from worldstate.frontend.spectra.bins import band_bins
-from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import seconds

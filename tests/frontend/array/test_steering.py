@@ -6,14 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.frontend.array.angular_interpolation import AngularInterpolation
 from worldstate.frontend.array.channel_mask import ChannelMask
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.array.steering import Steering, interpolation_nodes
 from worldstate.frontend.direction.music import covariance_subspace
-from worldstate.frontend.direction.music_stage import MusicReading, MusicStage
-from worldstate.frontend.spectra.bins import bin_frequencies_hz
-from worldstate.frontend.spectra.window_sum import WindowSum
+from worldstate.frontend.direction.music_stage import MusicReading, MusicStage, WindowSum
+from worldstate.frontend.spectra.stft import bin_frequencies_hz
 
 RATE, NFFT, BINS = 47_998, 512, range(3, 19)
 ROOF, GRID = roof_array_56(), np.radians(np.arange(-90.0, 91.0))
@@ -41,17 +39,18 @@ def test_any_quadratic_form_is_said_by_its_nodes(seed: int, planar: bool, span: 
     rng = np.random.default_rng(seed)
     places = rng.uniform(-0.3, 0.3, (8, 3)) * [0.0 if planar else 1.0, 1.0, 1.0]
     vectors = MicrophoneArray(places).steering([400.0, 900.0], np.linspace(-span, span, 151))
-    nodes = AngularInterpolation.of(vectors)
+    nodes = interpolation_nodes(vectors)
     assert nodes is not None
-    assert len(nodes.index) < 60
+    index, spread = nodes
+    assert len(index) < 60
     Q = circular(rng, 2, 8, 8)
     power = np.einsum("kmd,kmn,knd->d", vectors.conj(), Q, vectors)
-    missed = np.abs(power[nodes.index] @ nodes.spread - power).max()
+    missed = np.abs(power[index] @ spread - power).max()
     assert missed < 1e-6 * 64 * np.linalg.norm(Q, axis=(1, 2)).max()
 
 
 def test_too_coarse_a_grid_has_no_nodes() -> None:
-    assert AngularInterpolation.of(ROOF.steering([1500.0], np.radians(np.linspace(-90, 90, 15)))) is None
+    assert interpolation_nodes(ROOF.steering([1500.0], np.radians(np.linspace(-90, 90, 15)))) is None
 
 
 def test_the_roof_needs_few_and_its_power_is_that_of_every_beam() -> None:
