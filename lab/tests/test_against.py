@@ -9,7 +9,7 @@ from made_up_trials import alarmed, made_up, random_study
 from numpy.testing import assert_equal
 from worldstate_lab.evaluation.against import compare, load_scores, save_scores
 from worldstate_lab.evaluation.scores import Score, paired
-from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.trials.trial import Trial
 
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError

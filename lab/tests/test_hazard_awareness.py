@@ -13,7 +13,7 @@ from worldstate_lab.degradation.degradation_study import DegradationSettings
 from worldstate_lab.degradation.looks import motion_detectors
 from worldstate_lab.degradation.sweep_data import sweep_data
 from worldstate_lab.evaluation.camera_failure import whole_sweep
-from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.trials.takes import Take, TakeList
 
 from worldstate.adapters.camera.degradation import LEVELS
@@ -22,7 +22,7 @@ from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.alarm_rate import poisson_interval
+from worldstate.operations.metrics.approach_table import poisson_interval
 from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERIED
 from worldstate.operations.recordings.hop_table import HopTable
 

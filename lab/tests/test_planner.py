@@ -22,7 +22,7 @@ from worldstate_lab.planner.planner_exam import (
 
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.alarm_rate import share_interval
+from worldstate.operations.metrics.approach_table import share_interval
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.junction import site
 

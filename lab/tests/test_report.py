@@ -34,7 +34,7 @@ from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.calibrated_cue import CalibratedCue
 from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.methods.published_rule import PublishedRule
-from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.report.document import Document, Section
 from worldstate_lab.report.pages import html_page, markdown_page
 from worldstate_lab.report.results import keep_results, read_results

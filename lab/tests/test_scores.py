@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from sklearn.metrics import brier_score_loss, roc_auc_score
 from worldstate_lab.evaluation.operating_curve import BASELINE, DETECTED, OURS, equal_detection
 from worldstate_lab.evaluation.scores import Score, paired
-from worldstate_lab.metrics.recording_draws import stratified_draws
+from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
 from worldstate.abduction.cueing.calibration_error import (

@@ -5,16 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, poisson
-from worldstate_lab.metrics.recording_draws import (
+from worldstate_lab.metrics.intervals import (
     FigureDraws,
+    deal_folds,
     middle,
+    poisson_upper,
+    random_detection,
     stratified_draws,
     worst_group,
 )
-from worldstate_lab.metrics.recording_folds import deal_folds
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper, random_detection
+from worldstate.operations.metrics.approach_table import poisson_interval
 
 few = settings(max_examples=40)
 

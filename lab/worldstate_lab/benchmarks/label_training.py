@@ -29,8 +29,7 @@ from worldstate.operations.metrics.roc import auroc, auroc_by_group
 from worldstate.operations.training.methods import method_of
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate.smoothing.smoothed_track import FirstSight
-from worldstate_lab.features.bootstrap import recording_draws
-from worldstate_lab.metrics.recording_draws import middle
+from worldstate_lab.metrics.intervals import middle, recording_draws
 from worldstate_lab.paper.identifiability import reach_on_table
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import EVERYBODY

@@ -12,13 +12,16 @@ from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.alarm_rate import poisson_interval
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, alarm_outcome, rising_edges
+from worldstate.operations.metrics.approach_table import (
+    SECONDS_PER_HOUR,
+    alarm_outcome,
+    poisson_interval,
+    rising_edges,
+)
 from worldstate.operations.recordings.hop_stream import HOP_S, UNQUERIED
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import stream_statistic
-from worldstate_lab.metrics.recording_draws import middle
-from worldstate_lab.metrics.recording_folds import FOLDS, deal_folds
+from worldstate_lab.metrics.intervals import FOLDS, deal_folds, middle
 
 from .conditions import CLEAN, LENS, OFF, RAIN, ROOF, Condition, all_conditions
 from .rain import RAIN_DB

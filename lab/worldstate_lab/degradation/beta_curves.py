@@ -17,7 +17,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, AbsenceTally
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.recording_draws import middle
+from worldstate_lab.metrics.intervals import middle
 
 from .conditions import FAMILIES, at_level
 from .looks import detections_in, health_of

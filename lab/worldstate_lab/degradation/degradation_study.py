@@ -18,8 +18,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.degradation import looks, staged_filter
-from worldstate_lab.metrics.recording_draws import stratified_draws
-from worldstate_lab.metrics.recording_folds import FOLDS, deal_folds
+from worldstate_lab.metrics.intervals import FOLDS, deal_folds, stratified_draws
 
 from .awareness import Awareness, AwarenessRow, AwarenessSettings, hazard_awareness
 from .beta_curves import (

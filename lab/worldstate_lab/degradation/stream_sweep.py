@@ -23,11 +23,10 @@ from worldstate.adapters.listen import Source, measure_steps, open_source, unocc
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.measurement.measurement import Measurement
-from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, rising_edges
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rising_edges
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, joined
-from worldstate_lab.metrics.recording_draws import DRAWS, middle
+from worldstate_lab.metrics.intervals import DRAWS, middle, poisson_upper
 
 from .awareness import Estimate
 from .conditions import CLEAN, LENS, OFF, RAIN, ROOF, Condition

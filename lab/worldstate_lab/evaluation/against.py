@@ -16,7 +16,7 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError, Schem
 from worldstate.ground.serialisation import decode
 from worldstate.ground.typing import AnyArray, IndexArray
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.recording_draws import DRAWS, stratified_draws
+from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 
 from .reduction import BEARING_COLUMNS, HORIZONS_S
 from .scores import COUNTS, Score, Scored, paired_on

@@ -11,7 +11,7 @@ from worldstate.ground.typing import IndexArray
 from worldstate_lab.degradation.degradation_study import DegradationSettings, DegradationStudy
 from worldstate_lab.degradation.stream_sweep import StreamSweep
 from worldstate_lab.methods.table_rows import methods_for, refused_methods
-from worldstate_lab.metrics.recording_draws import DRAWS, stratified_draws
+from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.engine import Engine, Failed
 from worldstate_lab.trials.hearing import Hearing, hear, within_hours

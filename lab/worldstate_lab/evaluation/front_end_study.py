@@ -9,7 +9,7 @@ from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.bearing_gating import bearing_figures
 from worldstate.operations.recordings.hop_table import HopTable, joined
-from worldstate_lab.metrics.recording_draws import middle, stratified_draws
+from worldstate_lab.metrics.intervals import middle, stratified_draws
 from worldstate_lab.trials.trial import Trial
 
 # The paper's figure of looming is of the last three seconds before the pass.

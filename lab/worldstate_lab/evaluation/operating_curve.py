@@ -9,10 +9,9 @@ from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.sequence.sequence_model import held
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
-from worldstate.operations.metrics.weighted_figures import draw_weights, ratio
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate_lab.methods.sustained_rule import SUSTAIN_CHOICES
-from worldstate_lab.metrics.recording_draws import middle
+from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .reduction import alarm_counts

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate_lab.metrics.recording_folds import deal_folds
+from worldstate_lab.metrics.intervals import deal_folds
 from worldstate_lab.trials.classification import TrainedOn, junction_of
 from worldstate_lab.trials.takes import Take
 from worldstate_lab.trials.trial import Trial

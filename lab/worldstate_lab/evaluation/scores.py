@@ -10,21 +10,23 @@ from worldstate.abduction.cueing.calibration_error import BINS
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
-from worldstate.operations.metrics.alarm_rate import poisson_interval, poisson_upper, random_detection
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval
 from worldstate.operations.metrics.roc import rank_wins
-from worldstate.operations.metrics.weighted_figures import (
-    draw_weights,
-    highest_share,
-    known_mean,
-    ratio,
-    weighted_median,
-)
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate_lab.evaluation import reduction
-from worldstate_lab.metrics.recording_draws import middle, worst_group
+from worldstate_lab.metrics.intervals import (
+    draw_weights,
+    highest_share,
+    known_mean,
+    middle,
+    poisson_upper,
+    random_detection,
+    ratio,
+    weighted_median,
+    worst_group,
+)
 from worldstate_lab.trials.trial import Decisions, Trial
 
 Interval = tuple[float, float]

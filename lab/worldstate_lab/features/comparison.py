@@ -7,20 +7,33 @@ import numpy as np
 from joblib import Parallel, delayed
 from scipy.special import bdtrc
 
+from worldstate.abduction.cueing.calibration_error import brier_score, expected_calibration_error
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import IndexArray
+from worldstate.operations.metrics.roc import auroc, worst_rate
 from worldstate.operations.training.feature_evaluation import Predictions
 from worldstate.operations.training.methods import ROWS, Passes, evaluate_pass, methods
 from worldstate.operations.training.splits import Protocol
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
-from worldstate_lab.metrics.recording_draws import DRAWS, FigureDraws
+from worldstate_lab.metrics.intervals import DRAWS, FigureDraws, recording_draws
 
-from .bootstrap import draw_figures, recording_draws
 from .feature_report import count_windows, mean_figures, report_groups, window_figures
 
 # The same samples for every method and run: the differences between methods are paired.
 BOOTSTRAP_SEED = 0
+FIGURES = (
+    "accuracy",
+    "auroc_macro",
+    "auroc_pooled",
+    "worst_group_auroc",
+    "tpr",
+    "fpr",
+    "worst_group_fpr",
+    "ece",
+    "brier",
+)
 
 
 def run_passes(
@@ -127,3 +140,39 @@ def _gains(
         figure: {"gain": ours[figure] - theirs[figure], "low": low, "high": high}
         for figure, (low, high) in intervals.items()
     }
+
+
+def draw_figures(
+    table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
+) -> FigureDraws:
+    """Return the figures on every bootstrap sample of recordings, mean over the passes (seeds)."""
+    # The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
+    measures = [_figures_on(table, one) for one in passes]
+    figures = np.array([[measure(rows) for rows in samples] for measure in measures]).mean(axis=0)
+    return FigureDraws(dict(zip(FIGURES, figures.T, strict=True)))
+
+
+def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], list[float]]:
+    """Return what forms one number for each of `FIGURES` from some rows."""
+    hazards, hazard_free, correct = table.hazards, table.hazard_free, one.classes == table.labels
+    sites = np.unique(table.environments, return_inverse=True)[1]
+
+    def figures(rows: IndexArray) -> list[float]:
+        scored = rows[(hazards | hazard_free)[rows]]
+        labels, score, risk, there = (values[scored] for values in (hazards, one.score, one.risk, sites))
+        areas = [auroc(score[there == site], labels[there == site]) for site in np.unique(there)]
+        known = [area for area in areas if area is not None]
+        decision = one.decision[rows]
+        return [
+            float(correct[rows].mean()),
+            float(np.mean(known)),
+            auroc(score, labels) or 0.0,
+            min(known),
+            float(decision[hazards[rows]].mean()),
+            float(decision[hazard_free[rows]].mean()),
+            worst_rate(decision, hazard_free[rows], sites[rows]),
+            expected_calibration_error(risk, labels),
+            brier_score(risk, labels),
+        ]
+
+    return figures

@@ -24,7 +24,7 @@ from worldstate.operations.recordings.stream_statistic import (
     presence_statistic,
     stream_statistic,
 )
-from worldstate_lab.metrics.recording_folds import deal_folds
+from worldstate_lab.metrics.intervals import deal_folds
 
 
 @dataclass(frozen=True, slots=True)

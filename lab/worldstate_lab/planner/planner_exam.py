@@ -7,9 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from worldstate.ground.typing import FloatArray, IndexArray
-from worldstate.operations.metrics.alarm_rate import share_interval
-from worldstate.operations.metrics.weighted_figures import draw_weights
-from worldstate_lab.metrics.recording_draws import middle, stratified_draws
+from worldstate.operations.metrics.approach_table import share_interval
+from worldstate_lab.metrics.intervals import draw_weights, middle, stratified_draws
 
 from .believed_stream import BelievedStream
 from .closed_loop import Drives, drive_through

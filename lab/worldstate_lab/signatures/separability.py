@@ -8,8 +8,7 @@ import numpy as np
 
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 from worldstate.operations.metrics.roc import auroc, auroc_by_group
-from worldstate_lab.metrics.recording_draws import DRAWS, Interval, middle, stratified_draws
-from worldstate_lab.metrics.recording_folds import FOLDS
+from worldstate_lab.metrics.intervals import DRAWS, FOLDS, Interval, middle, stratified_draws
 
 from .clip_signatures import ClipSignatures
 from .fisher_profile import level_invariant_shape

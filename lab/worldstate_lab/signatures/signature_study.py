@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
-from worldstate_lab.metrics.recording_draws import middle
+from worldstate_lab.metrics.intervals import middle
 
 from .clip_signatures import ClipSignatures, signature_edges_hz
 from .fisher_profile import BandProfile, discriminative_range_hz, profile_of

@@ -9,8 +9,7 @@ from worldstate.abduction.signature.published_training import PublishedClassifie
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.roc import auroc
-from worldstate_lab.features.bootstrap import recording_draws
-from worldstate_lab.metrics.recording_draws import Interval, middle
+from worldstate_lab.metrics.intervals import Interval, middle, recording_draws
 
 DRAWS = 500
 

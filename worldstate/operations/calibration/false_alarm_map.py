@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.alarm_rate import poisson_interval
-from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, rising_edges
+from worldstate.operations.metrics.approach_table import SECONDS_PER_HOUR, poisson_interval, rising_edges
 
 
 @dataclass(frozen=True, slots=True)

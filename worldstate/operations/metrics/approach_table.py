@@ -26,8 +26,6 @@ from worldstate.abduction.signature.site_signature import HOP_S
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-from .alarm_rate import poisson_interval, share_interval
-
 Figures = dict[str, float | int | None]
 LONGEST_LEAD_S, AFTER_S = 5.0, 6.0
 SECONDS_PER_HOUR = 3600.0
@@ -226,3 +224,44 @@ def caution(count: int, what: str = "recordings") -> str | None:
     if count >= FEWEST_RECORDINGS:
         return None
     return f"{count} {what}: figures from fewer than {FEWEST_RECORDINGS} cannot be read"
+
+
+def poisson_interval(count: int, exposure: float, confidence: float = 0.95) -> tuple[float, float]:
+    r"""Return the exact interval of a Poisson rate, alarms an hour if the exposure is in hours.
+
+    .. math:: \left[\chi^2_{\alpha/2}(2n),\ \chi^2_{1-\alpha/2}(2n + 2)\right] / 2T
+
+    Examples
+    --------
+    >>> low, high = poisson_interval(0, exposure=0.103)
+    >>> low, round(high, 1)
+    (0.0, 35.8)
+    """
+    # F. Garwood, "Fiducial limits for the Poisson distribution", Biometrika 28, 1936. One alarm more or less
+    # moves the rate by 1 / T, so without any alarm the high end says how little the hours can tell.
+    from scipy.special import gammaincinv
+
+    whole = in_range("count", count, 0, np.inf)
+    time = in_range("exposure", exposure, 0.0, np.inf, open_low=True)
+    tail = (1.0 - in_range("confidence", confidence, 0.0, 1.0, open_low=True, open_high=True)) / 2.0
+    # A chi-square with 2 n degrees of freedom is twice a Gamma(n), whose inverse needs no scipy.stats.
+    low = float(gammaincinv(whole, tail)) if whole else 0.0
+    return low / time, float(gammaincinv(whole + 1.0, 1.0 - tail)) / time
+
+
+def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the exact interval of a share.
+
+    Examples
+    --------
+    >>> low, high = share_interval(0, of=1000)
+    >>> low, round(high, 4)
+    (0.0, 0.0037)
+    """
+    # C. Clopper and E. Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
+    from scipy.special import betaincinv
+
+    whole = in_range("count", count, 0, in_range("of", of, 1, np.inf))
+    tail = (1.0 - in_range("confidence", confidence, 0.0, 1.0, open_low=True, open_high=True)) / 2.0
+    low = float(betaincinv(whole, of - whole + 1.0, tail)) if whole else 0.0
+    return low, float(betaincinv(whole + 1.0, of - whole, 1.0 - tail)) if whole < of else 1.0

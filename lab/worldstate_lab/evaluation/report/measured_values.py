@@ -8,7 +8,6 @@ import numpy as np
 
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.operations.arrays.array_bounds import array_bounds
-from worldstate.operations.metrics.weighted_figures import ratio
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.front_end_study import FrontEndStudy
@@ -16,7 +15,7 @@ from worldstate_lab.evaluation.paper_values import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.protocols import RETRAINED, STATIC
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s
-from worldstate_lab.metrics.recording_draws import middle
+from worldstate_lab.metrics.intervals import middle, ratio
 from worldstate_lab.report.table import Value
 
 Place = tuple[str, str, str]  # Group, row and figure, as in `PAPER_VALUES`

@@ -1,0 +1,266 @@
+"""Intervals of figures: recordings dealt to folds, drawn again and again, and counted as often as drawn.
+
+Recordings are drawn with replacement, by stratum; `stratified_draws([0] * n, rng)` draws minutes or passes of
+one kind. A figure is formed on every draw, by its rows or by `draw_weights`, and `middle` is its interval:
+
+>>> values = np.array([0.4, 0.9, 0.7, 0.8])
+>>> drawn = values[stratified_draws([0] * 4, np.random.default_rng(0), draws=1000)].mean(axis=1)
+>>> [round(end, 2) for end in middle(drawn)]
+[0.53, 0.85]
+
+Exact intervals of counts and shares are in `worldstate.operations.metrics.approach_table`.
+"""
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.operations.metrics.approach_table import poisson_interval
+from worldstate.operations.training.splits import recording_labels
+
+# Twelve draws lie beyond each end of the interval.
+DRAWS = 500
+COVERAGE = 0.95
+
+# By recording, as in the paper.
+FOLDS = 5
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FigureDraws:
+    """Figures of one method on every draw of recordings; the same draws for every method.
+
+    Examples
+    --------
+    >>> ours = FigureDraws({"tpr": np.linspace(0.0, 40.0, 41)})
+    >>> low, high = ours.interval("tpr")
+    >>> round(low, 3), round(high, 3)
+    (1.0, 39.0)
+    >>> ours.gains(FigureDraws({"tpr": ours.values["tpr"] - 2.0}))
+    {'tpr': (2.0, 2.0)}
+    """
+
+    values: Mapping[str, FloatArray]  # shape (draws,): For each figure
+
+    def interval(self, figure: str) -> Interval:
+        """Return the middle 95 %."""
+        return middle(self.values[figure])
+
+    def intervals(self) -> dict[str, Interval]:
+        """Return the middle 95 % of every figure."""
+        return {figure: self.interval(figure) for figure in self.values}
+
+    def gains(self, other: "FigureDraws") -> dict[str, Interval]:
+        """Return the middle 95 % of the difference to another method on the same draws."""
+        # Both methods stumble over the same hard recordings: paired, those cancel.
+        return {figure: middle(self.values[figure] - other.values[figure]) for figure in self.values}
+
+
+def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws: int = DRAWS) -> IndexArray:
+    """Draw recordings with replacement, as many of each stratum as there are, shape (draws, n).
+
+    Place i of every draw holds a recording of the stratum of recording i.
+
+    Examples
+    --------
+    >>> stratified_draws(["left", "none", "left", "none"], np.random.default_rng(0), draws=2)
+    array([[2, 1, 2, 1],
+           [2, 1, 0, 1]])
+    """
+    members: dict[Hashable, list[int]] = {}
+    for i, stratum in enumerate(strata):
+        members.setdefault(stratum, []).append(i)
+    drawn = np.empty((draws, len(strata)), dtype=np.intp)
+    # A stratum of one recording is in every draw: its own spread cannot be known.
+    for rows in map(np.array, members.values()):
+        drawn[:, rows] = rng.choice(rows, (draws, rows.size))
+    return drawn
+
+
+def middle(values: FloatArray, coverage: float = COVERAGE) -> Interval:
+    """Return the interval that leaves equal shares of the draws below and above, NaN where there are none.
+
+    Examples
+    --------
+    >>> middle(np.array([np.nan, 0.0, 1.0, 2.0]), coverage=0.5)
+    (0.5, 1.5)
+    """
+    # A figure that a draw does not have, such as a bearing without anything in view, is left out of it.
+    known = values[~np.isnan(values)]
+    if not known.size:
+        return float("nan"), float("nan")
+    tail = (1.0 - coverage) / 2.0
+    low, high = np.quantile(known, [tail, 1.0 - tail]).tolist()
+    return low, high
+
+
+def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:
+    """Return name and figure of the worst group, the first of equals; ("", NaN) where none has a figure.
+
+    Examples
+    --------
+    >>> worst_group({"SA1": 0.9, "SB1": 0.6, "SC1": float("nan")}, worse="low")
+    ('SB1', 0.6)
+    """
+    # NaN compares as neither less nor greater, so that min and max would depend on the order.
+    known = {name: value for name, value in values.items() if not np.isnan(value)}
+    if not known:
+        return "", float("nan")
+    name = (min if worse == "low" else max)(known, key=known.__getitem__)
+    return name, known[name]
+
+
+def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = DRAWS) -> list[IndexArray]:
+    """Return the windows of recordings drawn with replacement, within each label at each junction."""
+    keys, labels = table.recording_keys, recording_labels(table)
+    rows = [np.flatnonzero(keys == key) for key in labels]
+    strata = [(key.split("/")[0], label) for key, label in labels.items()]
+    return [np.concatenate([rows[i] for i in one]) for one in stratified_draws(strata, rng, draws)]
+
+
+def poisson_upper(count: int, exposure: float, confidence: float = 0.9) -> float:
+    """Return the rate that is not exceeded with such confidence: the one-sided exact bound.
+
+    Examples
+    --------
+    >>> round(poisson_upper(0, exposure=1.0), 2)
+    2.3
+    """
+    # The upper end of a two-sided interval leaves as much beyond it on either side.
+    return poisson_interval(count, exposure, 2.0 * confidence - 1.0)[1]
+
+
+def random_detection(
+    windows_s: ArrayLike, alarms: ArrayLike, scored_s: ArrayLike, times: ArrayLike = 1.0
+) -> FloatArray:
+    r"""Return the detection rate of as many alarms at uniformly random moments; NaN without an approach.
+
+    .. math:: \sum_i t_i \left(1 - (1 - w_i / T)^N\right) / \sum_i t_i
+
+    `windows_s` (n,) holds w, the time before each T0 in which an onset counts; T is all scored time. On
+    samples of the approaches, which hold each of them `times` (D, n), `alarms` and `scored_s` are (D,).
+
+    Examples
+    --------
+    >>> float(random_detection([5.0, 2.5], alarms=2, scored_s=10.0))
+    0.59375
+    """
+    windows = finite_array("windows_s", windows_s, (None,))
+    number, total_s = (np.asarray(one, np.float64)[..., None] for one in (alarms, scored_s))
+    in_range("scored_s", float(total_s.min(initial=1.0)), 0.0, np.inf, open_low=True)
+    in_range("alarms", float(number.min(initial=0.0)), 0, np.inf)
+    share, weight = np.broadcast_arrays(windows / total_s, np.asarray(times, np.float64))
+    if ((share < 0.0) | (share > 1.0))[weight > 0.0].any():
+        got = f"{windows.min():g} to {windows.max():g} s"
+        raise InvalidArgumentError(f"windows_s: expected each within the time scored, got {got}")
+    detected = 1.0 - (1.0 - np.clip(share, 0.0, 1.0)) ** number
+    return ratio((weight * detected).sum(axis=-1), weight.sum(axis=-1))
+
+
+def draw_weights(draws: IndexArray, recordings: int) -> FloatArray:
+    """Return how often each recording is in each draw, shape (D, recordings).
+
+    Examples
+    --------
+    >>> draw_weights(np.array([[0, 0, 2]]), recordings=3)
+    array([[2., 0., 1.]])
+    """
+    return np.array([np.bincount(one, minlength=recordings) for one in draws], np.float64)
+
+
+def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
+    """Return the quotient, NaN where there is nothing to divide by.
+
+    Examples
+    --------
+    >>> ratio(np.array([1.0, 0.0]), np.array([2.0, 0.0]))
+    array([0.5, nan])
+    """
+    quotient: FloatArray = np.divide(above, below, out=np.full(below.shape, np.nan), where=below > 0.0)
+    return quotient
+
+
+def known_mean(values: FloatArray) -> FloatArray:
+    """Return the mean over the first axis of what is not NaN.
+
+    Examples
+    --------
+    >>> known_mean(np.array([[1.0, np.nan], [3.0, np.nan]]))
+    array([ 2., nan])
+    """
+    # `nanmean` warns where a column is all NaN, which here is an answer like any other.
+    known = np.isfinite(values)
+    return ratio(np.where(known, values, 0.0).sum(axis=0), known.sum(axis=0))
+
+
+def weighted_median(values: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the median of values (n,) that count times[d, i] times, NaN where none does, shape (D,).
+
+    Examples
+    --------
+    >>> weighted_median(np.array([5.0, 1.0, 2.0]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]))
+    array([2. , 3.5])
+    """
+    if not values.size:
+        return np.full(len(times), np.nan)
+    order = np.argsort(values)
+    kept = np.cumsum(times[:, order], axis=1)
+    half = kept[:, -1:] / 2.0
+    # Of an even number the mean of the two in the middle, as numpy's median of the repeated values.
+    low, high = np.argmax(kept >= half, axis=1), np.argmax(kept > half, axis=1)
+    median = (values[order][low] + values[order][high]) / 2.0
+    return np.where(half[:, 0] > 0.0, median, np.nan)
+
+
+def highest_share(values: FloatArray, times: FloatArray, share: float) -> BoolArray:
+    """Return which values stand at or above the highest threshold that keeps a share of them, shape (D, n).
+
+    Examples
+    --------
+    >>> highest_share(np.array([1.0, 3.0, 2.0]), np.ones((1, 3)), share=0.5)
+    array([[False,  True,  True]])
+    """
+    if not values.size:
+        return np.zeros(times.shape, bool)
+    order = np.argsort(-values, kind="stable")
+    kept = np.cumsum(times[:, order], axis=1)
+    # Equal values are kept together; sums of whole numbers are exact, the product with the share is not.
+    last = np.argmax(kept >= share * kept[:, -1:] - 1e-9, axis=1)
+    return np.asarray(values >= values[order][last][:, None])
+
+
+def deal_folds(
+    labels: Sequence[str], groups: Sequence[str], rng: np.random.Generator, folds: int = FOLDS
+) -> IndexArray:
+    """Deal recordings to folds so that each holds its share of every label in every group, shape (n,).
+
+    There are never more folds than recordings of the rarer kind, hazard-free or approach.
+
+    Examples
+    --------
+    >>> labels = ["none", "left"] * 4
+    >>> deal_folds(labels, ["SA1"] * 8, np.random.default_rng(0), folds=2)
+    array([0, 1, 0, 0, 1, 1, 1, 0])
+    """
+    free = np.array([label == "none" for label in labels], dtype=bool)
+    counts = int((~free).sum()), int(free.sum())
+    if min(*counts, folds) < 2:
+        raise InvalidArgumentError(
+            f"recordings: expected at least two approaches, two hazard-free ones and two folds, "
+            f"got {counts[0]} approaches, {counts[1]} hazard-free ones and {folds} folds"
+        )
+    keys = [(~free[i], labels[i], groups[i], rng.random()) for i in range(len(labels))]
+    order = sorted(range(len(labels)), key=keys.__getitem__)
+    fold_of = np.empty(len(labels), dtype=np.intp)
+    # Dealing goes on where the last stratum stopped, or the first folds would collect every remainder.
+    fold_of[order] = np.arange(len(labels)) % min(*counts, folds)
+    return fold_of
