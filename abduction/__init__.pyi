@@ -7,26 +7,19 @@ from .cueing.calibration_error import ReliabilityCurve as ReliabilityCurve
 from .cueing.calibration_error import brier_score as brier_score
 from .cueing.calibration_error import expected_calibration_error as expected_calibration_error
 from .cueing.calibration_error import reliability_curve as reliability_curve
-from .cueing.conformal import conformal_threshold as conformal_threshold
-from .cueing.conformal import recordings_needed as recordings_needed
 from .cueing.cueing_policy import CueingPolicies as CueingPolicies
 from .cueing.cueing_policy import CueingPolicy as CueingPolicy
-from .cueing.neyman_pearson import neyman_pearson_threshold as neyman_pearson_threshold
 from .cueing.risk_map import RiskMap as RiskMap
 from .cueing.risk_map import fit_risk_map as fit_risk_map
+from .cueing.thresholds import conformal_threshold as conformal_threshold
+from .cueing.thresholds import neyman_pearson_threshold as neyman_pearson_threshold
+from .cueing.thresholds import recordings_needed as recordings_needed
 from .evidence import SignatureEvidence as SignatureEvidence
 from .grounding.class_descriptors import Descriptor as Descriptor
 from .grounding.grounded_likelihood import GroundedAnswer as GroundedAnswer
+from .grounding.grounded_likelihood import GroundedObservation as GroundedObservation
 from .grounding.grounded_likelihood import GroundedSettings as GroundedSettings
 from .grounding.grounded_likelihood import ground as ground
-from .grounding.observation import GroundedObservation as GroundedObservation
-from .identifiability.information import Information as Information
-from .identifiability.information import fano_bound as fano_bound
-from .identifiability.information import information_from_posteriors as information_from_posteriors
-from .identifiability.information import (
-    nearest_neighbour_information_bits as nearest_neighbour_information_bits,
-)
-from .identifiability.information import sharp_fano_bound as sharp_fano_bound
 from .posterior import Posterior as Posterior
 from .posterior import abduce as abduce
 from .posterior import log_lambda as log_lambda

@@ -5,9 +5,8 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from worldstate.abduction.bearing_vote import with_bearing_vote
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
 from worldstate.abduction.road_users import ClassShares, RoadUserModel
 from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.signature.domain_guard import DomainGuard, DomainVerdict, Foreign, neutral

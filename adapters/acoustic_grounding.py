@@ -4,8 +4,13 @@ from dataclasses import dataclass, field
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.class_descriptors import Descriptor, car, motorcycle
-from worldstate.abduction.grounding.grounded_likelihood import GroundedAnswer, GroundedSettings, ground
-from worldstate.abduction.grounding.observation import GroundedObservation, Observable
+from worldstate.abduction.grounding.grounded_likelihood import (
+    GroundedAnswer,
+    GroundedObservation,
+    GroundedSettings,
+    Observable,
+    ground,
+)
 from worldstate.frontend.frame import AcousticFrame
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Bearing

@@ -12,8 +12,7 @@ from worldstate.abduction.sequence.sequence_reader import SequenceHistory, Seque
 from worldstate.abduction.sequence.side_patterns import SidePatterns
 from worldstate.abduction.sequence.street_hearing import StreetHearing
 from worldstate.abduction.signature.domain_guard import DomainGuard
-from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, open_sound, path_of

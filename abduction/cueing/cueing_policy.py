@@ -1,6 +1,6 @@
 """From statistic to advisory: the sustained rule and the policy that carries its numbers.
 
-The threshold of a policy is set in `neyman_pearson`, its map to risk in `risk_map`.
+The threshold of a policy is set in `thresholds`, its map to risk in `risk_map`.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-r"""How a sequence's posterior enters a Bayesian recursion without being counted twice.
+r"""A sequence's posterior in a Bayesian recursion, counted once, and Markov chains in continuous time.
 
 Hops are correlated over seconds, and q, the posterior that a sequence model reads from the last three of
 them, already holds what they said together. Multiplied at every hop, or onto the belief of some time ago, it
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
+from worldstate.ground.values import NANOSECONDS_PER_SECOND
 
 # Below it a probability is none, and the ratio of two of them says nothing.
 _SMALLEST = 1e-12
@@ -99,3 +100,26 @@ def balanced(chain: FloatArray, share: FloatArray, rounds: int = 200) -> FloatAr
 
 def _normed(values: FloatArray) -> FloatArray:
     return np.asarray(values / values.sum(axis=-1, keepdims=True))
+
+
+# At any rate above .01/s a chain is in equilibrium by then; a larger exponent of expm only costs digits.
+LONGEST_STEP_S = 1000.0
+
+
+def transitions(rates_hz: FloatArray, step_ns: int) -> FloatArray:
+    r"""Return exp(Q dt), read-only, rows sum to one; shapes (states, states).
+
+    Examples
+    --------
+    >>> transitions(np.array([[-0.1, 0.1], [0.0, 0.0]]), 10**10).round(3)
+    array([[0.368, 0.632],
+           [0.   , 1.   ]])
+    """
+    # Imported where it is needed: scipy.linalg takes as long to import as numpy.
+    from scipy.linalg import expm
+
+    step_s = min(step_ns / NANOSECONDS_PER_SECOND, LONGEST_STEP_S)
+    matrix: FloatArray = np.maximum(expm(rates_hz * step_s), 0.0)
+    matrix /= matrix.sum(axis=1, keepdims=True)
+    matrix.flags.writeable = False
+    return matrix

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.co_evidence import CoEvidence
-from worldstate.abduction.rate_matrix import transitions
+from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground.typing import FloatArray
 
 from .ratio_recursion import balanced

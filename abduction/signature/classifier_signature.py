@@ -10,8 +10,7 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
-from .pairwise_coupling import SMALLEST_PROBABILITY
-from .published_signature import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS
+from .window_classes import CLASSES, DIRECTIONS, EXPLANATION_COLUMNS, SMALLEST_PROBABILITY
 
 
 class FittedClassifier(Protocol):

@@ -25,17 +25,21 @@ from worldstate.ground.serialisation import ADDED, Layout, Via
 from worldstate.ground.typing import FloatArray
 
 from .expert import VIEWS, Expert, expert_views, log_softmax, split_reference, total
-from .mirror import SEGMENTS, mirror_features
 from .model_domain import ModelDomain
-from .pairwise_coupling import SMALLEST_PROBABILITY
-from .published_signature import (
+from .pattern_features import SEGMENTS, mirror_features
+from .published_signature import SignatureModel
+from .site_reference import KINDS, SiteReference, log_levels
+from .window_classes import (
     CLASSES,
     DIRECTIONS,
     EXPLANATION_COLUMNS,
+    SMALLEST_PROBABILITY,
+    checked_classes,
+    explained,
     explanation_ratios,
+    mirrored_classes,
+    window_evidence,
 )
-from .site_reference import KINDS, SiteReference, log_levels
-from .window_classes import checked_classes, explained, mirrored_classes, window_evidence
 
 MOST_EXPERTS = 32
 # Where the training sites do not say.
@@ -257,3 +261,11 @@ class EnsembleModel:
         # Added to each other first: the sum of two does not depend on which is the mirror image.
         pairs = both[:, 0] + both[:, 1][..., mirrored_classes(len(self.classes))]
         return log_softmax(pairs.sum(axis=0) / (2 * len(told)))
+
+
+AnySignature = SignatureModel | EnsembleModel
+
+
+def explain(signature: AnySignature, X: ArrayLike) -> FloatArray:
+    """Return the posteriors of front, left, none and right of windows, shape (n, 4), by either model."""
+    return signature.explain(X) if isinstance(signature, EnsembleModel) else signature.predict_proba(X)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,12 +14,9 @@ from worldstate.ground.typing import AnyArray, FloatArray, IndexArray, TextArray
 
 from .ensemble import PRIOR_S, EnsembleModel
 from .expert import SHAPE, SHAPE_CHANGE, Expert, expert_views, split_reference
-from .mirror import SEGMENTS, mirror_features
-from .published_signature import CLASSES, NONE
-from .published_training import checked_labels
+from .pattern_features import SEGMENTS, mirror_features
 from .site_reference import KINDS, SiteReference
-from .standardisation import standardisation
-from .window_classes import WINDOW_CLASSES, mirrored_classes
+from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, mirrored_classes
 
 # Of a simulated window beside a real one, and the part of it that says the other side. At weights from .5
 # to 3 and parts from .15 to .35 the areas of real junctions left out stay within .002 and the side within
@@ -77,6 +74,24 @@ class SimulatedWindows:
     def joined(cls, parts: Sequence["SimulatedWindows"]) -> "SimulatedWindows":
         """Return the windows of all parts."""
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
+
+
+class Classifier(Protocol):
+    """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
+
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Learn from features, class names and, where it takes notice of them, names of sites.
+
+        Shapes: X (n, features), y, groups (n,).
+        """
+        ...
+
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
+        """Return posteriors of front, left, none, right, shape (n, 4).
+
+        Shapes: X (n, features).
+        """
+        ...
 
 
 class SiteEnsembleClassifier:
@@ -184,6 +199,26 @@ class SiteEnsembleClassifier:
         return self.model_.explain(X)
 
 
+def checked_labels(y: ArrayLike, n: int) -> TextArray:
+    """Return class names as an array; the sides stand in for each other, the other classes must be there.
+
+    Shapes: y (n,).
+
+    Examples
+    --------
+    >>> checked_labels(["none", "left", "front"], 3)
+    array(['none', 'left', 'front'], dtype='<U5')
+    """
+    labels = np.asarray(y, dtype=np.str_)
+    if labels.shape != (n,):
+        raise InvalidArgumentError(f"y: expected {n} class names, got shape {labels.shape}")
+    present = set(labels.tolist())
+    hazards = {CLASSES[LEFT], CLASSES[RIGHT]}
+    if not present <= set(CLASSES) or not {CLASSES[FRONT], CLASSES[NONE]} <= present or not present & hazards:
+        raise InvalidArgumentError(f"y: expected the classes {CLASSES}, got {sorted(present)[:8]}")
+    return labels
+
+
 def _with_mirror_images(
     levels: FloatArray, reference: FloatArray, codes: IndexArray
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
@@ -249,3 +284,24 @@ def _fit_expert(recipe: Recipe, seen: FloatArray, codes: IndexArray, weights: Fl
     machine = regression(C=1.0 / (recipe.ridge * weights.sum()), max_iter=_ITERATIONS)
     machine.fit((seen - mean) / scale, codes, weights)
     return Expert(recipe.view, mean, scale, machine.coef_, machine.intercept_)
+
+
+def standardisation(inputs: FloatArray, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    r"""Return weighted mean and standard deviation of each column; 1 where a column never changes.
+
+    .. math:: \mu = \sum_i w_i x_i, \qquad \sigma^2 = \sum_i w_i (x_i - \mu)^2, \qquad \sum_i w_i = 1
+
+    Shapes: inputs (n, columns), weights (n,), returns (columns,).
+
+    Examples
+    --------
+    >>> standardisation(np.array([[1.0, 5.0], [3.0, 5.0]]))
+    (array([2., 5.]), array([1., 1.]))
+    """
+    if weights is None:
+        mean, deviation = inputs.mean(axis=0), inputs.std(axis=0)
+    else:
+        mean = np.average(inputs, axis=0, weights=weights)
+        deviation = np.sqrt(np.average((inputs - mean) ** 2, axis=0, weights=weights))
+    # A column that never changes carries nothing; leave it as it is.
+    return mean, np.where(deviation > 10 * np.finfo(float).eps, deviation, 1.0)

@@ -9,8 +9,7 @@ from worldstate.ground.checks import freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
-from .mirror import SEGMENTS
-from .pattern_features import shape_features
+from .pattern_features import SEGMENTS, shape_features
 from .site_reference import KINDS, log_levels
 
 SHAPE, SHAPE_CHANGE = "shape", "shape_change"

@@ -1,8 +1,21 @@
-"""Summary of a window's pattern over azimuth: peaks, widths, sides and changes."""
+"""The pattern of a window over azimuth: its mirror image, peaks, widths, sides and changes."""
 
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
+
+SEGMENTS = 2
+
+
+def mirror_features(X: FloatArray, segments: int = SEGMENTS) -> FloatArray:
+    r"""Return the features of the mirrored scene: azimuths reversed within each segment.
+
+    .. math:: \bar x_{s,a} = x_{s, A - 1 - a}
+
+    Shapes: X (n, segments * azimuths).
+    """
+    return X.reshape(len(X), segments, -1)[:, :, ::-1].reshape(X.shape)
+
 
 _SHARPNESS = 4.0
 

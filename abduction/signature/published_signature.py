@@ -6,27 +6,31 @@ the training set leaves likelihoods, which is what eq. (6) takes.
 """
 
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.cueing.platt import sigmoid
-from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.ground.checks import finite_array, freeze_arrays
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout
 from worldstate.ground.typing import FloatArray
 
 from .model_domain import ModelDomain
-from .pairwise_coupling import class_pairs, couple
+from .window_classes import (
+    CLASSES,
+    DIRECTIONS,
+    EXPLANATION_COLUMNS,
+    SMALLEST_PROBABILITY,
+    evidence_of,
+    explanation_ratios,
+)
 
-CLASSES = ("front", "left", "none", "right")
-DIRECTIONS = ("left", "right")
-FRONT, LEFT, NONE, RIGHT = range(4)
-# Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
-EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
-PAIRS = len(class_pairs(len(CLASSES)))
+# All pairs i < j in the order of a one-against-one machine.
+PAIRS = tuple(combinations(range(len(CLASSES)), 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,9 +84,11 @@ class SignatureModel:
     domain: ModelDomain | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        features, pairs = (np.size(self.mean),), (PAIRS,)
-        freeze_arrays(self, mean=features, scale=features, coefficients=(PAIRS, *features), intercepts=pairs)
-        freeze_arrays(self, slopes=pairs, offsets=pairs, class_prior=(len(CLASSES),))
+        features, pairs = np.size(self.mean), len(PAIRS)
+        freeze_arrays(self, mean=(features,), scale=(features,), coefficients=(pairs, features))
+        freeze_arrays(
+            self, intercepts=(pairs,), slopes=(pairs,), offsets=(pairs,), class_prior=(len(CLASSES),)
+        )
         if (self.scale <= 0).any():
             raise InvalidArgumentError("scale: expected positive numbers")
         if (self.class_prior <= 0).any() or not np.isclose(self.class_prior.sum(), 1.0, atol=1e-6):
@@ -147,7 +153,7 @@ class SignatureModel:
         References
         ----------
         J. Platt 1999 (sigmoids), T.-F. Wu, C.-J. Lin and R. C. Weng 2004 (coupling): see `platt` and
-        `pairwise`.
+        `couple`.
         """
         return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
 
@@ -191,48 +197,38 @@ class SignatureModel:
         return evidence_of(self.log_likelihoods(np.atleast_2d(feature))[0])
 
 
-def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatArray:
-    r"""Return eq. (6) at the training prior for many windows at once, shape (n,).
+def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
+    r"""Return class probabilities from probabilities of pairs, shape (n, classes), positive, of sum one.
 
-    .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
+    For classes i and j let :math:`r_{ij}` estimate :math:`P(i \mid i \text{ or } j)`. The probabilities are
 
-    Shapes: probabilities (n, 4).
+    .. math:: \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2, \qquad \sum_i p_i = 1
+
+    whose optimality conditions are linear and whose solution is never negative.
+
+    Shapes: pairwise (n, pairs), in the order of `PAIRS`.
+
+    Source: Wu, Lin, Weng, "Probability estimates for multi-class classification by pairwise coupling", 2004,
+    second method.
     """
-    posteriors = finite_array("probabilities", probabilities, (None, len(CLASSES)))
-    hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]
-    statistic: FloatArray = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
-    return statistic
+    bounded = np.clip(pairwise, SMALLEST_PROBABILITY, 1.0 - SMALLEST_PROBABILITY)
+    right_side = np.zeros((n_classes + 1, 1))
+    right_side[n_classes] = 1.0
+    solution = np.linalg.solve(_optimality_matrix(bounded, n_classes), right_side)[:, :n_classes, 0]
+    positive = np.maximum(solution, SMALLEST_PROBABILITY)
+    probabilities: FloatArray = positive / positive.sum(axis=1, keepdims=True)
+    return probabilities
 
 
-def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatArray:
-    r"""Return log-likelihoods of left, right, visible, none by window, shape (n, 4), nats.
-
-    .. math:: \log \ell_c = \log P_c - \log \pi_c
-
-    Shapes: posteriors (n, 4), class_prior (4,).
-
-    References
-    ----------
-    Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
-
-    Examples
-    --------
-    >>> explanation_ratios(np.array([[0.1, 0.4, 0.4, 0.1]]), [0.25, 0.25, 0.25, 0.25]).round(2)
-    array([[ 0.47, -0.92, -0.92,  0.47]])
-    """
-    ratios = np.log(posteriors) - np.log(class_prior)
-    return np.asarray(ratios[:, EXPLANATION_COLUMNS])
-
-
-def evidence_of(log_likelihoods: FloatArray, sides: SideEvidence | None = None) -> SignatureEvidence:
-    """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
-
-    Shapes: log_likelihoods (4,).
-
-    Examples
-    --------
-    >>> evidence_of(np.array([0.5, -1.0, -0.9, 0.4])).hidden
-    (0.5, -1.0)
-    """
-    left, right, visible, none = log_likelihoods.tolist()
-    return SignatureEvidence(DIRECTIONS, (left, right), visible, none, sides)
+def _optimality_matrix(pairwise: FloatArray, n_classes: int) -> FloatArray:
+    """Bordered quadratic form [[Q, 1], [1', 0]], shape (n, classes + 1, classes + 1)."""
+    matrix = np.zeros((len(pairwise), n_classes + 1, n_classes + 1))
+    matrix[:, :n_classes, n_classes] = matrix[:, n_classes, :n_classes] = 1.0
+    for column, (i, j) in enumerate(combinations(range(n_classes), 2)):
+        first = pairwise[:, column]
+        second = 1.0 - first
+        matrix[:, i, i] += second**2
+        matrix[:, j, j] += first**2
+        matrix[:, i, j] -= first * second
+        matrix[:, j, i] -= first * second
+    return matrix

@@ -4,7 +4,7 @@ scikit-learn's own ``SVC(probability=True)`` is deprecated, and it couples proba
 they cannot be taken out as plain numbers. The recipe is repeated here on top of the machine itself.
 """
 
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,33 +13,14 @@ from sklearn.svm import SVC
 
 from worldstate.abduction.cueing.platt import fit_sigmoid
 from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 
-from .mirror import mirror_features as mirror_features
-from .pairwise_coupling import class_pairs
-from .published_signature import CLASSES, FRONT, LEFT, NONE, RIGHT, SignatureModel
-from .standardisation import standardisation
+from .ensemble_training import checked_labels, standardisation
+from .pattern_features import mirror_features
+from .published_signature import PAIRS, SignatureModel
+from .window_classes import CLASSES, LEFT, RIGHT
 
 PLATT_FOLDS = 5
-
-
-class Classifier(Protocol):
-    """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
-
-    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Learn from features, class names and, where it takes notice of them, names of sites.
-
-        Shapes: X (n, features), y, groups (n,).
-        """
-        ...
-
-    def predict_proba(self, X: ArrayLike) -> FloatArray:
-        """Return posteriors of front, left, none, right, shape (n, 4).
-
-        Shapes: X (n, features).
-        """
-        ...
 
 
 class PublishedClassifier:
@@ -136,7 +117,7 @@ class PublishedClassifier:
 
     def _fit_sigmoids(self, standard: FloatArray, codes: IndexArray) -> tuple[FloatArray, FloatArray]:
         fits = []
-        for first, second in class_pairs(len(CLASSES)):
+        for first, second in PAIRS:
             chosen = (codes == first) | (codes == second)
             is_first = codes[chosen] == first
             fits.append(fit_sigmoid(self._held_out_decisions(standard[chosen], is_first), is_first))
@@ -170,23 +151,3 @@ def mirror_hazards(X: FloatArray, y: TextArray) -> tuple[FloatArray, TextArray]:
     hazard = np.isin(y, (CLASSES[LEFT], CLASSES[RIGHT]))
     swapped = np.where(y[hazard] == CLASSES[LEFT], CLASSES[RIGHT], CLASSES[LEFT])
     return np.concatenate([X, mirror_features(X[hazard])]), np.concatenate([y, swapped])
-
-
-def checked_labels(y: ArrayLike, n: int) -> TextArray:
-    """Return class names as an array; the sides stand in for each other, the other classes must be there.
-
-    Shapes: y (n,).
-
-    Examples
-    --------
-    >>> checked_labels(["none", "left", "front"], 3)
-    array(['none', 'left', 'front'], dtype='<U5')
-    """
-    labels = np.asarray(y, dtype=np.str_)
-    if labels.shape != (n,):
-        raise InvalidArgumentError(f"y: expected {n} class names, got shape {labels.shape}")
-    present = set(labels.tolist())
-    hazards = {CLASSES[LEFT], CLASSES[RIGHT]}
-    if not present <= set(CLASSES) or not {CLASSES[FRONT], CLASSES[NONE]} <= present or not present & hazards:
-        raise InvalidArgumentError(f"y: expected the classes {CLASSES}, got {sorted(present)[:8]}")
-    return labels

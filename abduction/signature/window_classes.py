@@ -1,4 +1,4 @@
-r"""Classes of a window beyond the four of the released data, and what they say of the explanations.
+r"""Classes of a window: the four of the released data, two more, and evidence for the explanations.
 
 A window may hold a hidden vehicle on *both* sides, or a *direct* sound: one plane wave, from a source in the
 open. The first belongs to either side by a half, the second is as likely under every explanation,
@@ -6,32 +6,79 @@ open. The first belongs to either side by a half, the second is as likely under 
 .. math:: P'_{left} = P_{left} + \tfrac{1}{2} P_{both} + P_{direct}\, \frac{\pi'_{left}}{\sum_k \pi'_k},
           \qquad \pi'_{left} = \pi_{left} + \tfrac{1}{2} \pi_{both},
 
-so that a direct sound moves no explanation against another: which side it is on, its bearing says.
+so that a direct sound moves no explanation against another: its side is that of its bearing.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
+from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
-from .published_signature import (
-    CLASSES,
-    DIRECTIONS,
-    FRONT,
-    LEFT,
-    NONE,
-    RIGHT,
-    evidence_of,
-    explanation_ratios,
-)
+CLASSES = ("front", "left", "none", "right")
+DIRECTIONS = ("left", "right")
+FRONT, LEFT, NONE, RIGHT = range(4)
+# Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
+EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
+
+# As in libsvm: no pair is ever certain, and so no log-likelihood is ever infinite.
+SMALLEST_PROBABILITY = 1e-7
 
 BOTH, DIRECT = "both", "direct"
 WINDOW_CLASSES = (*CLASSES, BOTH, DIRECT)
 _MIRRORED = {LEFT: RIGHT, RIGHT: LEFT}
 _IS_SIDE = np.isin(range(len(CLASSES)), (LEFT, RIGHT)).astype(float)
+
+
+def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatArray:
+    r"""Return eq. (6) at the training prior for many windows at once, shape (n,).
+
+    .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
+
+    Shapes: probabilities (n, 4).
+    """
+    posteriors = finite_array("probabilities", probabilities, (None, len(CLASSES)))
+    hazard = posteriors[:, LEFT] + posteriors[:, RIGHT]
+    statistic: FloatArray = hazard / (hazard + miss_rate * posteriors[:, FRONT] + posteriors[:, NONE])
+    return statistic
+
+
+def explanation_ratios(posteriors: FloatArray, class_prior: ArrayLike) -> FloatArray:
+    r"""Return log-likelihoods of left, right, visible, none by window, shape (n, 4), nats.
+
+    .. math:: \log \ell_c = \log P_c - \log \pi_c
+
+    Shapes: posteriors (n, 4), class_prior (4,).
+
+    References
+    ----------
+    Bayes' rule; H. Bourlard and N. Morgan, *Connectionist Speech Recognition*, 1994 (scaled likelihoods).
+
+    Examples
+    --------
+    >>> explanation_ratios(np.array([[0.1, 0.4, 0.4, 0.1]]), [0.25, 0.25, 0.25, 0.25]).round(2)
+    array([[ 0.47, -0.92, -0.92,  0.47]])
+    """
+    ratios = np.log(posteriors) - np.log(class_prior)
+    return np.asarray(ratios[:, EXPLANATION_COLUMNS])
+
+
+def evidence_of(log_likelihoods: FloatArray, sides: SideEvidence | None = None) -> SignatureEvidence:
+    """Return the log-likelihoods of one window, in the order of `explanation_ratios`, as evidence.
+
+    Shapes: log_likelihoods (4,).
+
+    Examples
+    --------
+    >>> evidence_of(np.array([0.5, -1.0, -0.9, 0.4])).hidden
+    (0.5, -1.0)
+    """
+    left, right, visible, none = log_likelihoods.tolist()
+    return SignatureEvidence(DIRECTIONS, (left, right), visible, none, sides)
 
 
 def checked_classes(classes: tuple[str, ...]) -> tuple[str, ...]:

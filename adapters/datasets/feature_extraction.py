@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.csv_rows import number, read_rows

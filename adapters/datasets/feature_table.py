@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.files.atomic import atomic_path, write_text
 from worldstate.adapters.files.csv_rows import number, read_rows
 from worldstate.adapters.files.json_file import read_record

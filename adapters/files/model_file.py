@@ -12,8 +12,8 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPoli
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.domain_guard import DomainGuard
+from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.abduction.signature.signature_io import AnySignature
 from worldstate.ground.serialisation import ADDED, Layout, Via, decode, encode
 
 from .atomic import write_text

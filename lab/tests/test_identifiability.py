@@ -11,14 +11,14 @@ from scipy import stats
 from sklearn.feature_selection import mutual_info_classif
 from sklearn.linear_model import LogisticRegression
 from worldstate_lab.paper.identifiability import reach_of_array, reach_on_data
-
-from worldstate.abduction.identifiability.information import (
+from worldstate_lab.paper.information import (
     entropy_bits,
     fano_bound,
     information_from_posteriors,
     nearest_neighbour_information_bits,
     sharp_fano_bound,
 )
+
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.ground.errors import InvalidArgumentError
 

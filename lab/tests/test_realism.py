@@ -27,7 +27,7 @@ from worldstate_lab.streets.simulated_windows import (
 from worldstate_lab.streets.transfer import published_transfer
 from worldstate_lab.streets.two_sample import measure_areas, two_sample_areas
 
-from worldstate.abduction.signature.mirror import mirror_features
+from worldstate.abduction.signature.pattern_features import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.cli.main import main
 from worldstate.frontend.array.ovad_array import ovad_array

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from worldstate.abduction.bearing_vote import with_bearing_vote
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.evidence import SignatureEvidence, with_bearing_vote
 from worldstate.frontend.direction.bearing import direct_probability
 from worldstate.frontend.direction.peaks import Peak
 

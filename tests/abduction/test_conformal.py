@@ -10,10 +10,14 @@ from mapie.risk_control.methods import find_best_predict_param, get_r_hat_plus
 from scipy import stats
 from scipy.signal import lfilter
 
-from worldstate.abduction.cueing.conformal import conformal_threshold, recordings_needed, risk_controlling
 from worldstate.abduction.cueing.cueing_policy import sustained_statistic
-from worldstate.abduction.cueing.effective_windows import correlation_time_hops
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.risk_map import correlation_time_hops
+from worldstate.abduction.cueing.thresholds import (
+    conformal_threshold,
+    neyman_pearson_threshold,
+    recordings_needed,
+    risk_controlling,
+)
 from worldstate.ground.errors import InvalidArgumentError
 
 WINDOWS, PHI = 91, 0.9

@@ -12,8 +12,8 @@ from worldstate.abduction.cueing.cueing_policy import (
     sustained_alarm,
     sustained_statistic,
 )
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 

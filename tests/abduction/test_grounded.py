@@ -23,10 +23,11 @@ from worldstate.abduction.grounding.grounded_likelihood import (
     BACKGROUNDS,
     AzimuthPrior,
     Background,
+    GroundedObservation,
     GroundedSettings,
+    Observable,
     ground,
 )
-from worldstate.abduction.grounding.observation import GroundedObservation, Observable
 from worldstate.abduction.signature.classifier_signature import ClassifierSignature
 from worldstate.ground.errors import InvalidArgumentError
 

@@ -9,8 +9,11 @@ import pytest
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.class_descriptors import car
-from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
-from worldstate.abduction.grounding.observation import GroundedObservation, Observable
+from worldstate.abduction.grounding.grounded_likelihood import (
+    GroundedObservation,
+    GroundedSettings,
+    Observable,
+)
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.acoustic_grounding import LINE_SPACING, Grounding, observe
 from worldstate.adapters.listen import ListenSettings, measure_steps, open_source

@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.files.model_file import (
     Model,
     load_model,

@@ -12,13 +12,10 @@ from sklearn.svm import SVC
 
 from worldstate.abduction.co_evidence import Absent, Unqueried
 from worldstate.abduction.posterior import abduce, statistic
-from worldstate.abduction.signature.pairwise_coupling import class_pairs, couple
-from worldstate.abduction.signature.published_signature import CLASSES, SignatureModel, hazard_statistic
-from worldstate.abduction.signature.published_training import (
-    PublishedClassifier,
-    mirror_features,
-    mirror_hazards,
-)
+from worldstate.abduction.signature.pattern_features import mirror_features
+from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel, couple
+from worldstate.abduction.signature.published_training import PublishedClassifier, mirror_hazards
+from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
@@ -85,7 +82,7 @@ weights = st.lists(st.floats(1e-3, 1), min_size=4, max_size=4)
 @given(weights)
 def test_consistent_pairs_give_back_their_probabilities(values):
     p = np.array(values) / np.sum(values)
-    pairs = np.array([[p[i] / (p[i] + p[j]) for i, j in class_pairs(4)]])
+    pairs = np.array([[p[i] / (p[i] + p[j]) for i, j in PAIRS]])
     np.testing.assert_allclose(couple(pairs, 4)[0], p, atol=1e-6)
 
 
@@ -101,7 +98,7 @@ def test_coupling_minimises_what_it_says(seed):
     pairs = np.random.default_rng(seed).uniform(0.02, 0.98, 6)
 
     def disagreement(p):
-        return sum((p[i] * (1 - r) - p[j] * r) ** 2 for r, (i, j) in zip(pairs, class_pairs(4), strict=True))
+        return sum((p[i] * (1 - r) - p[j] * r) ** 2 for r, (i, j) in zip(pairs, PAIRS, strict=True))
 
     oracle = minimize(
         disagreement,

@@ -18,11 +18,9 @@ from worldstate.abduction.signature.ensemble_training import (
     SiteEnsembleClassifier,
 )
 from worldstate.abduction.signature.expert import VIEWS, expert_views
-from worldstate.abduction.signature.mirror import mirror_features
-from worldstate.abduction.signature.pattern_features import shape_features
-from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.pattern_features import mirror_features, shape_features
 from worldstate.abduction.signature.site_reference import SiteReference, log_levels, site_reference
-from worldstate.abduction.signature.window_classes import WINDOW_CLASSES, mirrored_classes
+from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode

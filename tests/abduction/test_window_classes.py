@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.window_classes import (
+    CLASSES,
     WINDOW_CLASSES,
     checked_classes,
     explained,

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Absent
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.posterior import statistic
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
-from worldstate.abduction.signature.published_signature import hazard_statistic
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import site_reference
 from worldstate.abduction.signature.site_signature import SiteSignature
+from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
 from worldstate.adapters.listen import ListenSettings, listen_steps, measure_steps, open_source

@@ -17,7 +17,7 @@ import numpy as np
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import Posterior, posterior_of
-from worldstate.abduction.rate_matrix import transitions
+from worldstate.abduction.sequence.ratio_recursion import transitions
 from worldstate.ground.serialisation import Via
 from worldstate.ground.typing import FloatArray
 

@@ -14,9 +14,8 @@ from worldstate.abduction.sequence.sequence_model import SequenceModel, Sequence
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.abduction.signature.published_signature import CLASSES
 from worldstate.abduction.signature.site_reference import KINDS
-from worldstate.abduction.signature.window_classes import side_ratios, visible_ratios
+from worldstate.abduction.signature.window_classes import CLASSES, side_ratios, visible_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, domain_of
 from worldstate.adapters.files.model_file import Model

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from worldstate.abduction.road_users import UNKNOWN, RoadUserModel
-from worldstate.abduction.signature.standardisation import standardisation
+from worldstate.abduction.signature.ensemble_training import standardisation
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
-from worldstate.abduction.cueing.conformal import risk_controlling
+from worldstate.abduction.cueing.thresholds import risk_controlling
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import (
     HORIZONS_S,

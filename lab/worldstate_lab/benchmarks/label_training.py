@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.commissioning.heard_stream import HeardStream

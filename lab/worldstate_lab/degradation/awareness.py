@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError

@@ -12,7 +12,7 @@ from worldstate.abduction.cueing.calibration_error import (
     calibration_error_sampling,
     expected_calibration_error,
 )
-from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.typing import BoolArray

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.signature_io import explain
+from worldstate.abduction.signature.ensemble import EnsembleModel, explain
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model

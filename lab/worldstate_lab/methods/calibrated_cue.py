@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import fit_isotonic
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic

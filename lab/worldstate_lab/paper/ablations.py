@@ -11,8 +11,8 @@ from worldstate.abduction.cueing.calibration_error import (
     expected_calibration_error,
 )
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import fit_isotonic
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray

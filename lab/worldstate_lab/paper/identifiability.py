@@ -6,14 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from worldstate.abduction.identifiability.information import (
-    fano_bound,
-    information_from_posteriors,
-    nearest_neighbour_information_bits,
-    sharp_fano_bound,
-    state_entropy_bits,
-)
-from worldstate.abduction.signature.published_signature import CLASSES
+from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_information
@@ -24,6 +17,13 @@ from worldstate.operations.training.feature_evaluation import out_of_fold
 from worldstate.operations.training.methods import method_of
 from worldstate.operations.training.splits import folds_by_recording
 from worldstate.operations.training.training import TrainingMethod
+from worldstate_lab.paper.information import (
+    fano_bound,
+    information_from_posteriors,
+    nearest_neighbour_information_bits,
+    sharp_fano_bound,
+    state_entropy_bits,
+)
 
 # A kNN estimate in more dimensions than this is far below the truth at a few hundred windows.
 _COMPONENTS = 3

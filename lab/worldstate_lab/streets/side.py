@@ -3,8 +3,8 @@
 import numpy as np
 from sklearn.svm import SVC
 
-from worldstate.abduction.signature.mirror import mirror_features
-from worldstate.abduction.signature.standardisation import standardisation
+from worldstate.abduction.signature.ensemble_training import standardisation
+from worldstate.abduction.signature.pattern_features import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import BoolArray, FloatArray
 

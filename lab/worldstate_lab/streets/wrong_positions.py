@@ -5,8 +5,8 @@ A classifier that ranks as well with permuted positions takes the level for the 
 
 import numpy as np
 
-from worldstate.abduction.signature.published_signature import hazard_statistic
-from worldstate.abduction.signature.signature_io import explain
+from worldstate.abduction.signature.ensemble import explain
+from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.typing import FloatArray

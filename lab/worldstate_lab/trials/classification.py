@@ -6,8 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.sample_windows import FRONT, FRONT_LATER_S

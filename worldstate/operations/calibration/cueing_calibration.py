@@ -7,11 +7,13 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveBudget
-from worldstate.abduction.cueing.conformal import conformal_threshold, recordings_needed
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, sustained_statistic
-from worldstate.abduction.cueing.effective_windows import correlation_time_hops
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
-from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_map
+from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, correlation_time_hops, fit_risk_map
+from worldstate.abduction.cueing.thresholds import (
+    conformal_threshold,
+    neyman_pearson_threshold,
+    recordings_needed,
+)
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray

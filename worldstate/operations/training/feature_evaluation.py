@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.abduction.cueing.risk_map import fit_isotonic
-from worldstate.abduction.signature.published_signature import CLASSES, hazard_statistic
-from worldstate.abduction.signature.published_training import Classifier
+from worldstate.abduction.signature.ensemble_training import Classifier
+from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray

@@ -5,8 +5,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.signature.published_signature import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.abduction.signature.site_reference import log_levels
+from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.ground.typing import FloatArray
 
 

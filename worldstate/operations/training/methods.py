@@ -8,8 +8,13 @@ from typing import cast
 import numpy as np
 
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
-from worldstate.abduction.signature.ensemble_training import Recipe, SimulatedWindows, SiteEnsembleClassifier
-from worldstate.abduction.signature.published_training import Classifier, PublishedClassifier
+from worldstate.abduction.signature.ensemble_training import (
+    Classifier,
+    Recipe,
+    SimulatedWindows,
+    SiteEnsembleClassifier,
+)
+from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.ground.typing import BoolArray, FloatArray
 

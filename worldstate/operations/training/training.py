@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.signature.ensemble import AnySignature
 from worldstate.abduction.signature.ensemble_training import RECIPES, SimulatedWindows, SiteEnsembleClassifier
 from worldstate.abduction.signature.model_domain import ModelDomain
-from worldstate.abduction.signature.published_signature import CLASSES, hazard_statistic
 from worldstate.abduction.signature.published_training import PublishedClassifier
-from worldstate.abduction.signature.signature_io import AnySignature
+from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable, Group
 from worldstate.adapters.files.acoustic_domain import ego_motion_of
 from worldstate.adapters.files.model_file import Model, Provenance

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logit
 
-from worldstate.abduction.cueing.neyman_pearson import neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import RiskMap, fit_isotonic
-from worldstate.abduction.signature.published_signature import hazard_statistic
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 

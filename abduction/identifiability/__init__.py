@@ -1,1 +1,0 @@
-"""What any detector could reach: information and Fisher bounds, "Evidence of Absence", section VI."""
