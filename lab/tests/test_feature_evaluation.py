@@ -2,20 +2,21 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
+from worldstate_lab.cli.main import main as lab
+from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate
 
 from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
 from worldstate.adapters.files.model_file import load_model, read_model
-from worldstate.cli.main import execute
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.operations.training.feature_evaluation import cross_validate
-from worldstate.operations.training.splits import folds_by_recording, junction_folds, recording_labels
+from worldstate.cli.main import main
+from worldstate.operations.training.folds import N_FOLDS, folds_by_recording, recording_labels
 
 JUNCTIONS = ("SA1", "SB1", "SB2")
 KEYS = {
@@ -55,19 +56,26 @@ def csv_path(tmp_path_factory):
 
 
 def command(*words):
-    return execute([str(word) for word in words])
+    run, given = (main, ["model", "fit"]) if words[0] == "fit" else (lab, words[:1])
+    return run([str(word) for word in (*given, *words[1:])])
 
 
-@given(st.integers(0, 1000), st.integers(12, 60), st.integers(2, 5))
-def test_folds_never_part_a_recording_and_share_out_every_stratum(seed, recordings, n_folds):
+def refused(capsys, problem, *words):
+    capsys.readouterr()
+    assert command(*words) == 2
+    assert re.search(problem, capsys.readouterr().err)
+
+
+@given(st.integers(0, 1000), st.integers(12, 60))
+def test_folds_never_part_a_recording_and_share_out_every_stratum(seed, recordings):
     table = made_up_table(recordings=recordings)
-    folds = folds_by_recording(table, np.random.default_rng(seed), n_folds)
+    folds = folds_by_recording(table, np.random.default_rng(seed))
     keys, labels = table.recording_keys, recording_labels(table)
     fold_of = dict(zip(keys.tolist(), folds.tolist(), strict=True))
     assert all(fold_of[key] == fold for key, fold in zip(keys.tolist(), folds.tolist(), strict=True))
     for stratum in {(key.split("/")[0], label) for key, label in labels.items()}:
         members = [fold_of[k] for k, label in labels.items() if (k.split("/")[0], label) == stratum]
-        counts = [members.count(str(fold)) for fold in range(n_folds)]
+        counts = [members.count(str(fold)) for fold in range(N_FOLDS)]
         assert max(counts) - min(counts) <= 1
 
 
@@ -87,10 +95,10 @@ class Spy(PublishedClassifier):
         return super().predict_proba(X)
 
 
-@pytest.mark.parametrize("split", [folds_by_recording, junction_folds])
-def test_nothing_is_predicted_by_what_it_was_trained_on(split):
+@pytest.mark.parametrize("protocol", ["cv", "lojo"])
+def test_nothing_is_predicted_by_what_it_was_trained_on(protocol):
     table = made_up_table(recordings=60)
-    passes = cross_validate(table, split, Spy, np.random.default_rng(0), alpha=0.1)
+    passes = cross_validate(table, protocol, WindowMethod(Spy), np.random.default_rng(0), alpha=0.1)
     assert set(passes) == {0.0, 1.0}
     for predictions in passes.values():
         np.testing.assert_allclose(predictions.probabilities.sum(axis=1), 1.0)
@@ -105,7 +113,7 @@ def most_probable(row):
 def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path, capsys, protocol):
     out = tmp_path / "p.csv"
     words = ("--method", "baseline", "--protocol", protocol, "--seeds", 2, "--json", "--predictions", out)
-    assert command("evaluate-features", csv_path, *words) == 0
+    assert command("windows", csv_path, *words) == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures) >= KEYS
     rows = list(csv.DictReader(out.open()))
@@ -131,7 +139,7 @@ def test_every_figure_can_be_recomputed_from_the_predictions(csv_path, tmp_path,
 def test_the_same_command_prints_the_same(csv_path, capsys):
     outputs = []
     for _ in range(2):
-        command("evaluate-features", csv_path, "--method", "baseline", "--seeds", 1, "--json")
+        command("windows", csv_path, "--method", "baseline", "--seeds", 1, "--json")
         outputs.append(capsys.readouterr().out)
     assert outputs[0] == outputs[1]
 
@@ -140,54 +148,54 @@ def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_
     ids = tmp_path / "ids.csv"
     ids.write_text("ID\n" + "\n".join(f"none_{n}" for n in (1, 3, 5, 7)) + "\nleft_0\nright_6\n")
     model = tmp_path / "m"
-    words = ("--method", "baseline", "--exclude", ids, "--out", model, "--json")
-    assert command("train", csv_path, *words) == 0
+    words = ("--exclude", ids, "--out", model, "--json")
+    assert command("fit", csv_path, *words) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["n_recordings"] == 66
     assert summary["n_excluded_windows"] == 8
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ids.csv", "m"]
-    with pytest.raises(InvalidArgumentError, match=r"trained on 66 of these 72 recordings.*--exclude"):
-        command("evaluate-features", csv_path, "--model", model)
-    assert command("evaluate-features", csv_path, "--model", model, "--only", ids, "--json") == 0
+    refused(capsys, r"trained on 66 of these 72 recordings.*--exclude", "windows", csv_path, "--model", model)
+    assert command("windows", csv_path, "--model", model, "--only", ids, "--reference", "cold", "--json") == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["n_windows"] == 8
     assert set(figures) >= KEYS
 
 
 def test_what_ships_is_what_train_makes_if_nothing_else_is_asked_for(csv_path, tmp_path):
-    assert command("train", csv_path, "--out", tmp_path / "m") == 0
+    assert command("fit", csv_path, "--out", tmp_path / "m") == 0
     assert type(load_model(tmp_path / "m")[0]) is type(load_model(None)[0])
 
 
 def test_simulated_windows_are_learned_too_and_the_card_says_so(tmp_path):
     table = made_up_table(recordings=30)
     real, more = (write_csv(tmp_path / name, table) for name in ("real.csv", "more.csv"))
-    assert command("train", real, "--simulated", more, more, "--out", tmp_path / "m") == 0
+    assert command("fit", real, "--simulated", more, more, "--out", tmp_path / "m") == 0
     assert f"{2 * len(table)} simulated" in read_model(tmp_path / "m").provenance.classifier
 
 
-def test_a_site_with_one_recording_is_told_what_else_to_use(csv_path, tmp_path):
+def test_a_site_with_one_recording_is_refused(csv_path, tmp_path, capsys):
     table = made_up_table()
     lonely = table.select((table.environments != "SA1") | (table.recordings == table.recordings[0]))
-    with pytest.raises(InvalidArgumentError, match=r"another recording of its junction.*baseline"):
-        command("train", write_csv(tmp_path / "lonely.csv", lonely), "--out", tmp_path / "m")
+    refused(
+        capsys,
+        r"another recording of its junction",
+        "fit",
+        write_csv(tmp_path / "lonely.csv", lonely),
+        "--out",
+        tmp_path / "m",
+    )
 
 
 def test_figures_for_people_show_every_junction(csv_path, capsys):
-    assert command("evaluate-features", csv_path, "--method", "baseline", "--seeds", 1) == 0
+    assert command("windows", csv_path, "--method", "baseline", "--seeds", 1) == 0
     printed = capsys.readouterr().out
     assert all(junction in printed for junction in JUNCTIONS)
 
 
-def test_bad_requests_are_refused(csv_path, tmp_path):
-    with pytest.raises(InvalidArgumentError, match="dynamic"):
-        command("evaluate-features", csv_path, "--group", "dynamic")
-    with pytest.raises(InvalidArgumentError, match="seeds"):
-        command("evaluate-features", csv_path, "--seeds", 0)
-    with pytest.raises(InvalidArgumentError, match="alpha"):
-        command("evaluate-features", csv_path, "--alpha", 1.5, "--seeds", 1)
-    with pytest.raises(InputFileError, match="nowhere"):
-        command("train", csv_path, "--out", tmp_path / "nowhere" / "m")
+def test_bad_requests_are_refused(csv_path, tmp_path, capsys):
+    refused(capsys, "dynamic", "windows", csv_path, "--group", "dynamic")
+    refused(capsys, "seeds", "windows", csv_path, "--seeds", 0)
+    refused(capsys, "alpha", "windows", csv_path, "--alpha", 1.5, "--seeds", 1)
+    refused(capsys, "nowhere", "fit", csv_path, "--out", tmp_path / "nowhere" / "m")
     one = made_up_table().select(made_up_table().environments == "SA1")
-    with pytest.raises(InvalidArgumentError, match="two junctions"):
-        command("evaluate-features", write_csv(tmp_path / "one.csv", one), "--protocol", "lojo")
+    refused(capsys, "two junctions", "windows", write_csv(tmp_path / "one.csv", one), "--protocol", "lojo")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from released_data import FOLDER, TABLE, needs_released_windows
+from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate
 from worldstate_lab.features.feature_report import report
 from worldstate_lab.features.held_out import check_unseen, predict_held_out
 
@@ -10,8 +11,6 @@ from worldstate.abduction.signature.published_training import PublishedClassifie
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.training.feature_evaluation import cross_validate
-from worldstate.operations.training.splits import split_for
 
 LISTS = ("timeHorizonStaticTestset.csv", "timeHorizonDynamicTestset.csv")
 
@@ -21,14 +20,9 @@ pytestmark = needs_released_windows
 
 def evaluated(group, protocol, seeds):
     table = read_features(FOLDER / TABLE).group(group)
-    split = split_for(protocol)
-    return report(
-        table,
-        [
-            cross_validate(table, split, PublishedClassifier, np.random.default_rng(seed), alpha=0.02)
-            for seed in range(seeds)
-        ],
-    )
+    published = WindowMethod(PublishedClassifier)
+    generators = map(np.random.default_rng, range(seeds))
+    return report(table, [cross_validate(table, protocol, published, rng, alpha=0.02) for rng in generators])
 
 
 def test_the_table_is_what_was_counted():

@@ -40,7 +40,7 @@ def made_up_table(seed=0, recordings=60):
 
 @pytest.fixture(scope="module")
 def model():
-    chosen = TrainingSettings(repeats=1, method="worldstate")
+    chosen = TrainingSettings(repeats=1)
     return train_model(made_up_table(), chosen, dataset="made up", group="static")
 
 

@@ -20,10 +20,9 @@ from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.operations.training.feature_evaluation import out_of_fold
-from worldstate.operations.training.methods import site_ensemble
+from worldstate.operations.training.folds import folds_by_recording, out_of_fold
 from worldstate.operations.training.site_references import with_site_references
-from worldstate.operations.training.splits import folds_by_recording
+from worldstate.operations.training.training import fit_ensemble
 
 SETTINGS = SiteEstimateSettings()
 
@@ -125,8 +124,8 @@ def stream_of(table, here, rng, hops=600):
 def rates(table, prepared, train, here, rng):
     """Decisions on a stream, site learned and not, at a threshold from windows out of fold; and labels."""
     known = prepared.select(train)
-    model = SiteEnsembleClassifier().fit(known.features, known.labels, known.environments).model_
-    inner = out_of_fold(known, folds_by_recording(known, rng), site_ensemble, rng)
+    model, folds = fit_ensemble(known), folds_by_recording(known, rng)
+    inner = out_of_fold(known, folds, fit_ensemble, lambda one, rows: one.explain(known.features[rows]))
     gamma = neyman_pearson_threshold(list(hazard_statistic(inner, 0.0)[known.hazard_free][:, None]), 0.02)
     estimate, decisions = SiteEstimate.start(60), []
     rows = stream_of(table, here, rng)

@@ -304,7 +304,7 @@ def test_a_table_and_the_model_trained_on_it_say_what_they_were_made_with(
     read = read_features(tmp_path / "t.csv")
     assert read.domain is not None and read.domain.array == "eight"
     assert np.array_equal(read.domain.positions_m, own.positions_m)
-    train = ["train", str(tmp_path / "t.csv"), "--method", "baseline", "--out", str(tmp_path / "m.json")]
+    train = ["train", str(tmp_path / "t.csv"), "--out", str(tmp_path / "m.json")]
     assert main(train) == 0
     domain = read_model(tmp_path / "m.json").domain
     assert domain is not None and (len(domain.positions_m), domain.ego_motion) == (8, "standing")

@@ -9,7 +9,7 @@ from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES, side_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.model_file import read_model
-from worldstate.cli.main import execute
+from worldstate.cli.main import main
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.open_field import (
     OpenSource,
@@ -109,8 +109,16 @@ def test_the_command_learns_streams_and_the_card_counts_their_classes(tmp_path):
         tmp_path / "real.csv",
         FeatureTable(rng.uniform(0.05, 0.9, (n, 60)), names, keys, sites, keys, (None,) * n),
     )
-    words = ["train", tmp_path / "real.csv", "--streams", tmp_path / "heard.npz", "--out", tmp_path / "m"]
-    assert execute([*map(str, words), "--method", "worldstate"]) == 0
+    words = [
+        "model",
+        "fit",
+        tmp_path / "real.csv",
+        "--streams",
+        tmp_path / "heard.npz",
+        "--out",
+        tmp_path / "m",
+    ]
+    assert main([*map(str, words)]) == 0
     model = read_model(tmp_path / "m")
     assert model.signature.classes == WINDOW_CLASSES
     assert "180 direct" in model.provenance.classifier and " both" in model.provenance.classifier

@@ -182,7 +182,7 @@ def test_train_learns_what_was_labelled(recording, tmp_path, capsys):
     ids, sites = np.arange(60).astype(str), np.repeat(["SA1", "SB1"], 30)
     write_features(table, FeatureTable(features, labels, ids, sites, ids, (None,) * 60))
     capsys.readouterr()
-    given = ["train", str(table), "--method", "baseline", "--labels", str(windows), "--out", str(model)]
+    given = ["train", str(table), "--labels", str(windows), "--out", str(model)]
     assert main([*given, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["n_windows"] == 60 + told["n_labelled"] == 60 + len(read_labels(windows, tmp_path))

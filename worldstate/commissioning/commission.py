@@ -180,7 +180,7 @@ def commission(
     windows, beside = _table_and_beside(real, open_field, domain, streams)
     model = train_model(
         windows,
-        TrainingSettings(seed=settings.seed, repeats=1, method="worldstate"),
+        TrainingSettings(seed=settings.seed, repeats=1),
         dataset=SIMULATED if real is None else f"{source}; {SIMULATED}",
         group="dynamic" if settings.moving_ego else "static",
         excluded_lists=(*excluded_lists, *settings.leave_out),

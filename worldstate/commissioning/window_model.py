@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.ensemble_training import SimulatedWindows, SiteEnsembleClassifier
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels
 from worldstate.abduction.signature.site_signature import HOP_S
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.training.site_references import simulated_beside, with_site_references
+from worldstate.operations.training.training import fit_ensemble
 
 from .heard_stream import HeardStream
 from .stream_windows import stream_windows
@@ -31,10 +32,7 @@ def window_model(
 ) -> EnsembleModel:
     """Fit a window model without the real and the simulated windows of some sites."""
     rest = table.select(~np.isin(table.environments, list(leave_out)))
-    inputs = with_site_references(rest)
-    classifier = SiteEnsembleClassifier(simulated=beside)
-    model = classifier.fit(inputs.features, inputs.labels, inputs.environments).model_
-    return replace(model, domain=table.domain)
+    return replace(fit_ensemble(with_site_references(rest), beside), domain=table.domain)
 
 
 def posteriors_along(

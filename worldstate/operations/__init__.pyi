@@ -13,6 +13,5 @@ from .recordings.recording_report import RecordingReport as RecordingReport
 from .recordings.recording_report import run_recording as run_recording
 from .recordings.timeline import Timeline as Timeline
 from .recordings.timeline import write_timeline as write_timeline
-from .training.feature_evaluation import cross_validate as cross_validate
 from .training.training import TrainingSettings as TrainingSettings
 from .training.training import train_model as train_model

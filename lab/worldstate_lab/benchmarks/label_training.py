@@ -26,9 +26,9 @@ from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.label_files import window_rows
 from worldstate.operations.labelling.pass_labels import label_passes
 from worldstate.operations.metrics.roc import auroc, auroc_by_group
-from worldstate.operations.training.methods import method_of
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate.smoothing.smoothed_track import FirstSight
+from worldstate_lab.features.methods import method_of
 from worldstate_lab.metrics.intervals import middle, recording_draws
 from worldstate_lab.paper.identifiability import reach_on_table
 from worldstate_lab.passes.stream_camera import stream_detections

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate.cli.common.array_options import add_array_options, given_array
-from worldstate.cli.common.feature_options import add_which_windows
+from worldstate.cli.common.command import add_choice
+from worldstate.cli.common.feature_options import add_group
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import track
@@ -44,7 +45,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_array_options(parser, "the 56-microphone roof array")
     add("--features", type=Path, metavar="CSV", help="labelled feature windows")
-    add_which_windows(parser, "of them")
+    add_group(parser, "of them")
+    add_choice(parser, "--method", "", "worldstate", "baseline")
     add("--recordings", type=Path, metavar="DATASET", help="labelled recordings")
     add("--band", type=float, nargs=2, default=[300.0, 1800.0], metavar="HZ", help="(default: 300 1800)")
     add("--snr-db", type=float, default=-10.0, metavar="DB", help="in each bin (default: %(default)g)")

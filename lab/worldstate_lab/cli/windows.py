@@ -38,8 +38,8 @@ from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
     from worldstate.adapters.datasets.feature_table import FeatureTable
-    from worldstate.operations.training.feature_evaluation import Predictions
-    from worldstate.operations.training.methods import Passes
+    from worldstate_lab.features.feature_evaluation import Predictions
+    from worldstate_lab.features.methods import Passes
 
 Figures = dict[str, Any]
 # What fits a line of the table; the JSON object has the gains of all figures.
@@ -55,6 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add_table_options(parser)
+    add_choice(parser, "--method", "", "worldstate", "baseline")
     add_choice(parser, "--protocol", "who is held out", "cv", "lojo", "transfer")
     add_choice(parser, "--reference", "what windows are compared with", "run", "cold", "curated")
     add("--model", type=Path, help="evaluate this model file; no cross-validation")
@@ -86,9 +87,9 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _evaluate_method(
     arguments: argparse.Namespace, whole: "FeatureTable", table: "FeatureTable"
 ) -> tuple[Figures, "list[Predictions]"]:
-    from worldstate.operations.training.methods import row_of
     from worldstate_lab.features.comparison import comparison, row_predictions
     from worldstate_lab.features.feature_report import report
+    from worldstate_lab.features.methods import row_of
 
     row = row_of(arguments.method, arguments.protocol, arguments.reference)
     passes = _passes(arguments, whole, table, row)
@@ -103,8 +104,8 @@ def _passes(
 ) -> "dict[str, Passes]":
     """Run every seed of the method and of those that it is compared with."""
     from worldstate.ground.checks import in_range
-    from worldstate.operations.training.methods import ROWS, rows_beside
     from worldstate_lab.features.comparison import run_passes
+    from worldstate_lab.features.methods import ROWS, rows_beside
 
     in_range("--seeds", arguments.seeds, 1, 10_000)
     in_range("--jobs", arguments.jobs, 1, 256)

@@ -13,13 +13,12 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import IndexArray
 from worldstate.operations.metrics.roc import auroc, worst_rate
-from worldstate.operations.training.feature_evaluation import Predictions
-from worldstate.operations.training.methods import ROWS, Passes, evaluate_pass, methods
-from worldstate.operations.training.splits import Protocol
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate_lab.metrics.intervals import DRAWS, FigureDraws, recording_draws
 
+from .feature_evaluation import Predictions, Protocol, evaluate_pass
 from .feature_report import count_windows, mean_figures, report_groups, window_figures
+from .methods import ROWS, Passes, methods
 
 # The same samples for every method and run: the differences between methods are paired.
 BOOTSTRAP_SEED = 0

@@ -17,7 +17,8 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.typing import BoolArray
 from worldstate.operations.metrics.roc import auroc, auroc_by_group, macro, rate, worst_rate
-from worldstate.operations.training.feature_evaluation import Predictions
+
+from .feature_evaluation import Predictions
 
 # The floor belongs to the risks: another seed in every run would only add noise to it.
 FLOOR_SEED = 0

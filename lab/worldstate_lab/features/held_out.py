@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from worldstate.abduction.signature.ensemble import EnsembleModel, explain
+from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.training.feature_evaluation import Predictions, predict_with
-from worldstate.operations.training.site_references import Reference, inputs_under
 from worldstate.operations.training.window_calibration import MISS_RATES, WindowCalibration
+
+from .feature_evaluation import Predictions, Reference, asked_under
 
 
 def predict_held_out(
@@ -20,15 +20,16 @@ def predict_held_out(
         # A table that does not say, as the released one, is OVAD's.
         check_tables(model.domain, table.domain or ovad_domain(table.environments.tolist()))
     check_unseen(model, table)
-    signature, inputs = model.signature, table.features
-    if isinstance(signature, EnsembleModel):
-        inputs = inputs_under(reference, table, rng)(signature, np.ones(len(table), dtype=np.bool_))
-    probabilities = explain(signature, inputs)
+    if isinstance(model.signature, EnsembleModel):
+        ask = asked_under(reference, table, rng)
+        probabilities = ask(model.signature, np.ones(len(table), dtype=np.bool_))
+    else:
+        probabilities = model.signature.predict_proba(table.features)
     predictions = {}
     for miss_rate in MISS_RATES:
         policy = model.policies.for_alpha(alpha, miss_rate)
         calibration = WindowCalibration(miss_rate, policy.gamma, policy.risk_map)
-        predictions[miss_rate] = predict_with(table, probabilities, calibration)
+        predictions[miss_rate] = Predictions.of_model(probabilities, calibration)
     return predictions
 
 

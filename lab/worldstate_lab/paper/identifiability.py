@@ -1,7 +1,7 @@
 """What could any detector reach here? Asked of an array, and of a data set."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,7 @@ from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_info
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
-from worldstate.operations.training.feature_evaluation import out_of_fold
-from worldstate.operations.training.methods import method_of
-from worldstate.operations.training.splits import folds_by_recording
-from worldstate.operations.training.training import TrainingMethod
+from worldstate_lab.features.methods import method_of
 from worldstate_lab.paper.information import (
     fano_bound,
     information_from_posteriors,
@@ -120,11 +117,11 @@ def reach_on_data(
     )
 
 
-def reach_on_table(table: FeatureTable, method: TrainingMethod, rng: np.random.Generator) -> ReachOnData:
+def reach_on_table(table: FeatureTable, method: str, rng: np.random.Generator) -> ReachOnData:
     """Bound the error of any classifier of the windows of a table, beside that of a method out of fold."""
+    # Asked as prepared: about windows compared with curated ones.
     chosen = method_of(method)
-    inputs = chosen.prepare(table)
-    posteriors = out_of_fold(inputs, folds_by_recording(inputs, rng), chosen.make, rng)
+    posteriors = replace(chosen, reference=None).posteriors(chosen.prepare(table), rng)
     states = np.array([CLASSES.index(label) for label in table.labels.tolist()])
     features = np.log(table.features)
     return reach_on_data(posteriors, states, rng, features=features, groups=table.recording_keys)

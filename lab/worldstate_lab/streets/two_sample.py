@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.training.splits import folds_by_recording
+from worldstate.operations.training.folds import folds_by_recording
 
 from .measures import CLASS_GROUPS, DESCRIPTORS, MEASURES, describe_windows, of_class
 from .set_figures import FigureKey

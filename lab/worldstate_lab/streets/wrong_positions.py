@@ -10,7 +10,7 @@ from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.training.splits import folds_by_recording
+from worldstate.operations.training.folds import folds_by_recording
 
 from .set_figures import FigureKey
 from .transfer import area_of, trained_score

@@ -7,19 +7,17 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
+from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.sample_windows import FRONT, FRONT_LATER_S
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.training.methods import method_of
-from worldstate.operations.training.training import TrainingMethod, fit_signature
+from worldstate.operations.training.site_references import with_site_references
+from worldstate.operations.training.training import fit_ensemble
 
 from .trial import Trial
 
-# By the name of their evidence: the classifier of the paper, and the ensemble that this library ships, both
-# trained on the same windows.
-TRAINED: dict[str, TrainingMethod] = {"published": "baseline", "ensemble": "worldstate"}
 # Hidden left and hidden right among the explanations.
 SIDE_COLUMNS = slice(0, 2)
 # All of the windows; those of other junctions than the tested one; or, where nothing but the tested
@@ -67,9 +65,12 @@ class Classifiers:
         key = self._key(kind, calibration, tested, seed)
         if key not in self._trained:
             table = self._table(kind, calibration, tested)
+            # By the name of their evidence: the classifier of the paper, and the ensemble that this library
+            # ships, both trained on the same windows.
+            published = PublishedClassifier(np.random.default_rng(seed))
             self._trained[key] = {
-                name: fit_signature(method_of(method).prepare(table), method, np.random.default_rng(seed))
-                for name, method in TRAINED.items()
+                "published": published.fit(table.features, table.labels).model_,
+                "ensemble": fit_ensemble(with_site_references(table)),
             }
         done = []
         for trial in trials:

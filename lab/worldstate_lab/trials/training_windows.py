@@ -99,7 +99,7 @@ def model_from_windows(windows: FeatureTable, folder: Path, seed: int) -> Path:
     marks: list[object] = [VERSION, seed, sorted(table.recording_keys.tolist()), float(table.features.sum())]
     path = folder / f"trained-{origin_of(marks)[:8]}.json"
     if not path.is_file():
-        settings = TrainingSettings(seed=seed, repeats=1, method="worldstate")
+        settings = TrainingSettings(seed=seed, repeats=1)
         save_model(path, train_model(table, settings, dataset="training windows", group="static"))
     return path
 

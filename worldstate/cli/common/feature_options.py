@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def add_table_options(parser: argparse.ArgumentParser) -> None:
     """Declare the table, which part of it counts and what is made of it."""
     parser.add_argument("table", type=Path, metavar="CSV", help="windows: feat0..feat59, Class, ID, ...")
-    add_which_windows(parser, "standing ego, moving ego or both")
+    add_group(parser, "standing ego, moving ego or both")
     simulated = "simulated windows of the same sites, learned too: what `realism --out` writes"
     parser.add_argument("--simulated", type=Path, nargs="+", metavar="CSV", help=simulated)
     streams = "simulated streams that were listened to: windows of them, and of sources in the open, too"
@@ -49,7 +49,6 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
     return learned_beside(streams, in_the_open, tables).beside(table.environments)
 
 
-def add_which_windows(parser: argparse.ArgumentParser, of: str) -> None:
-    """Declare --group and --method."""
+def add_group(parser: argparse.ArgumentParser, of: str) -> None:
+    """Declare --group."""
     add_choice(parser, "--group", of, "static", "dynamic", "all")
-    add_choice(parser, "--method", "", "worldstate", "baseline")

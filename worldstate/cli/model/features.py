@@ -27,7 +27,7 @@ EXAMPLE = """\
 examples:
   worldstate sim make --out sim --static 40 && worldstate model features sim --out features.csv
   worldstate model features recordings --labels labels.csv --array mics.xml --out features.csv
-  worldstate model fit features.csv --method worldstate --out model.json"""
+  worldstate model fit features.csv --out model.json"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -5,11 +5,9 @@ scores of windows that it was not trained on. The model file is JSON: coefficien
 what the windows were made with: array, sample rate, band, ego's motion. A table that does not say, as the
 released one, counts as OVAD's unless --array and --sample-rate say otherwise.
 
-  --method baseline    as published: standardise, linear SVC, left/right mirroring; 5 folds by recording
-  --method worldstate  mirror-symmetric ensemble on windows compared with their site, for unseen junctions;
-                       thresholds half-way between recordings left out and junctions left out;
-                       with --simulated it learns simulated windows too, with --streams the classes both and
-                       direct as well: for a standing ego
+The classifier is a mirror-symmetric ensemble on windows compared with their site, for unseen junctions, its
+thresholds half-way between recordings left out and junctions left out. With --simulated it learns simulated
+windows too, with --streams the classes both and direct as well: for a standing ego.
 """
 
 import argparse
@@ -62,9 +60,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     for one in labelled:
         table = table.joined(one.group(arguments.group))
     kept = table.without([name for path in arguments.exclude for name in read_ids(path)])
-    settings = TrainingSettings(
-        seed=arguments.seed, sustain_hops=arguments.sustain_hops, method=arguments.method
-    )
+    settings = TrainingSettings(seed=arguments.seed, sustain_hops=arguments.sustain_hops)
     with progress_bar("training", settings.steps) as bar:
         model = train_model(
             kept,

@@ -1,8 +1,7 @@
-"""What windows are compared with: curated windows of their site, a stream heard before, or nothing."""
+"""What windows are compared with: curated windows of their site, or a stream heard before."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -10,19 +9,14 @@ from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import OTHER_SIDE, SIMULATED_WEIGHT, SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
-from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-Reference = Literal["run", "cold", "curated"]
-REFERENCES: tuple[Reference, ...] = ("run", "cold", "curated")
-# What a car has heard of a street when its first ten seconds are over: nearly always nobody comes.
+# What a vehicle has heard of a street after its first ten seconds: nearly always an empty street.
 STREAM_WINDOWS = 10
 STREAM_HAZARDS = 0.05
 _WINDOW_S = 1.0
-
-# From a trained model and the rows that are asked for to windows with a reference behind them, or without.
-Inputs = Callable[[EnsembleModel, BoolArray], FloatArray]
 
 
 def with_site_references(table: FeatureTable) -> FeatureTable:
@@ -54,24 +48,21 @@ def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
     )
 
 
-def inputs_under(reference: Reference, table: FeatureTable, rng: np.random.Generator) -> Inputs:
-    """Return what a model is asked under a reference.
+def asked_while_listening(
+    table: FeatureTable, rng: np.random.Generator
+) -> Callable[[EnsembleModel, BoolArray], FloatArray]:
+    """Return posteriors of rows by a model that compares them with what `run` has learned before them.
 
-    Shapes: table (n, 60).
+    Shapes: table (n, 60 or more): what is behind the first 60 features of a window is not looked at.
     """
-    if reference == "cold":
-        return lambda model, rows: table.features[rows]
-    if reference == "curated":
-        curated = with_site_references(table).features
-        return lambda model, rows: curated[rows]
-    learned = learned_while_listening(table, rng)
-    settings = SiteEstimateSettings()
+    windows, settings = table.features[:, :N_FEATURES], SiteEstimateSettings()
+    learned = learned_while_listening(replace(table, features=windows), rng)
 
-    def behind(model: EnsembleModel, rows: BoolArray) -> FloatArray:
+    def posteriors(model: EnsembleModel, rows: BoolArray) -> FloatArray:
         references = [learned[row].reference(model, settings).row for row in np.flatnonzero(rows)]
-        return np.hstack([table.features[rows], references])
+        return model.explain(np.hstack([windows[rows], references]))
 
-    return behind
+    return posteriors
 
 
 def learned_while_listening(table: FeatureTable, rng: np.random.Generator) -> list[SiteEstimate]:
@@ -114,8 +105,7 @@ def _recordings(table: FeatureTable) -> list[tuple[BoolArray, BoolArray]]:
         others = (table.environments == table.environments[mine][0]) & ~mine
         if not others.any():
             raise InvalidArgumentError(
-                f"recording {key}: expected another recording of its junction, to compare it with; "
-                "method baseline compares with none"
+                f"recording {key}: expected another recording of its junction, to compare it with"
             )
         parts.append((mine, others))
     return parts

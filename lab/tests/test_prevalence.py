@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit, logit
+from worldstate_lab.features.feature_evaluation import matched_risk
 
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.training.prevalence import matched_risk
 
 
 def table(recordings, sites):

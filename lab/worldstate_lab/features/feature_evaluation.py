@@ -1,0 +1,295 @@
+"""Evaluation of a signature classifier and its cueing on labelled feature windows.
+
+Everything that is scored was predicted by a classifier, a threshold and a risk map that saw no window of the
+recording (protocol ``cv``), junction (``lojo``) or kind of driving (``transfer``): threshold and map come
+from inner out-of-fold scores of the training windows.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+from scipy.special import expit, logit
+
+from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
+from worldstate.abduction.signature.ensemble import EnsembleModel
+from worldstate.abduction.signature.ensemble_training import Classifier, SiteEnsembleClassifier
+from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
+from worldstate.adapters.datasets.feature_table import FeatureTable
+from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.typing import BoolArray, FloatArray, TextArray
+from worldstate.operations.training.folds import folds_by_recording, junction_folds, out_of_fold
+from worldstate.operations.training.site_references import asked_while_listening, with_site_references
+from worldstate.operations.training.window_calibration import (
+    MISS_RATES,
+    WindowCalibration,
+    between,
+    calibrate_windows,
+)
+
+Protocol = Literal["cv", "lojo", "transfer"]
+Reference = Literal["run", "cold", "curated"]
+# Posteriors of the chosen rows of the table that is evaluated, shape (rows, 4).
+Ask = Callable[[Classifier, BoolArray], FloatArray]
+
+SMALLEST_RISK = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class WindowMethod:
+    """One way from windows to risk."""
+
+    make: Callable[[np.random.Generator], Classifier]  # Makes an untrained classifier
+    # What the scored windows are compared with, None where the method compares with nothing. Training has the
+    # curated windows in any case, as in `model fit`.
+    reference: Reference | None = None
+    # Whether it is made for sites unlike those of training: threshold and map come from folds like the outer
+    # ones alone, and under `transfer` risks are shifted until hazards are as frequent as in training. Else
+    # the threshold of an ensemble stands between junctions left out and recordings left out.
+    afar: bool = False
+
+    def prepare(self, table: FeatureTable) -> FeatureTable:
+        """Return the table that the classifier sees, of the table as read."""
+        return table if self.reference is None else with_site_references(table)
+
+    def trained(self, table: FeatureTable, rng: np.random.Generator) -> Classifier:
+        """Return a classifier trained on a prepared table."""
+        return self.make(rng).fit(table.features, table.labels, table.environments)
+
+    def posteriors(self, table: FeatureTable, rng: np.random.Generator, inner: Protocol = "cv") -> FloatArray:
+        """Return posteriors of each window of a prepared table out of fold, shape (n, 4)."""
+        folds, ask = folds_of(inner, table, rng), _asked_plainly(table)
+        # An ensemble's threshold is of windows compared as under `run`, as in `model fit`. A generator of its
+        # own: what is drawn to ask moves no fold.
+        if self.reference is not None and not self.afar:
+            ask = _of_ensemble(asked_while_listening(table, rng.spawn(1)[0]))
+        return out_of_fold(table, folds, lambda part: self.trained(part, rng), ask)
+
+    def calibrations(
+        self, train: FeatureTable, protocol: Protocol, rng: np.random.Generator, alpha: float
+    ) -> dict[float, tuple[WindowCalibration, float]]:
+        """Return threshold, risk map and the mean risk of the training windows, for each beta."""
+        like_outer: Protocol = "cv" if protocol == "cv" else "lojo"
+        # From the most careful to the boldest.
+        both = self.reference is not None and not self.afar and like_outer == "lojo"
+        inner: tuple[Protocol, ...] = ("lojo", "cv") if both else (like_outer,)
+        scores = [self.posteriors(train, rng, one) for one in inner]
+        fit_map = fit_isotonic if self.reference is None else fit_platt
+        found = {}
+        for beta in MISS_RATES:
+            levels = [
+                calibrate_windows(
+                    one, train.hazards, train.hazard_free, alpha=alpha, miss_rate=beta, fit_map=fit_map
+                )
+                for one in scores
+            ]
+            learned = between(levels)
+            mean_risk = float(learned.risk_map(hazard_statistic(scores[-1], beta)).mean())
+            found[beta] = learned, mean_risk
+        return found
+
+
+def folds_of(protocol: Protocol, table: FeatureTable, rng: np.random.Generator) -> TextArray:
+    """Return the folds of a protocol; ``transfer`` splits its training set by junction."""
+    return folds_by_recording(table, rng) if protocol == "cv" else junction_folds(table)
+
+
+def _asked_plainly(table: FeatureTable) -> Ask:
+    """Ask for rows as the table holds them."""
+    return lambda classifier, rows: classifier.predict_proba(table.features[rows])
+
+
+def _of_ensemble(ask: Callable[[EnsembleModel, BoolArray], FloatArray]) -> Ask:
+    return lambda classifier, rows: ask(cast(SiteEnsembleClassifier, classifier).model_, rows)
+
+
+def asked_under(
+    reference: Reference, table: FeatureTable, rng: np.random.Generator
+) -> Callable[[EnsembleModel, BoolArray], FloatArray]:
+    """Return what gives the posteriors of rows by a model, compared with a reference.
+
+    Shapes: table (n, 60).
+    """
+    if reference == "run":
+        return asked_while_listening(table, rng)
+    features = (table if reference == "cold" else with_site_references(table)).features
+    return lambda model, rows: model.explain(features[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predictions:
+    """What was predicted of every window of one table, each once."""
+
+    folds: TextArray  # shape (n,): Fold in which each window was held out
+    probabilities: FloatArray  # shape (n, 4): Posteriors of front, left, none, right
+    score: FloatArray  # shape (n,): Statistic and calibrated risk
+    risk: FloatArray
+    decision: BoolArray  # shape (n,): Whether the statistic reached the threshold
+
+    @classmethod
+    def blank(cls, folds: TextArray) -> "Predictions":
+        """Return arrays to be filled in, fold by fold."""
+        n = len(folds)
+        return cls(folds, np.empty((n, len(CLASSES))), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_))
+
+    def fill(self, rows: BoolArray, probabilities: FloatArray, calibration: WindowCalibration) -> None:
+        """Write what a calibration makes of the posteriors of some rows."""
+        self.probabilities[rows] = probabilities
+        self.score[rows], self.risk[rows], self.decision[rows] = calibration.apply(probabilities)
+
+    @classmethod
+    def of_model(
+        cls, probabilities: FloatArray, calibration: WindowCalibration, fold: str = "model"
+    ) -> "Predictions":
+        """Return the predictions of a finished model, as one fold.
+
+        Shapes: probabilities (n, 4).
+        """
+        predictions = cls.blank(np.full(len(probabilities), fold))
+        predictions.fill(np.ones(len(probabilities), dtype=np.bool_), probabilities, calibration)
+        return predictions
+
+    @property
+    def classes(self) -> TextArray:
+        """Most probable class of each window: the published rule."""
+        most_probable: TextArray = np.array(CLASSES)[self.probabilities.argmax(axis=1)]
+        return most_probable
+
+
+def evaluate_pass(
+    method: WindowMethod,
+    table: FeatureTable,
+    protocol: Protocol,
+    *,
+    seed: int,
+    alpha: float,
+    train: FeatureTable | None = None,
+) -> dict[float, Predictions]:
+    """Run one seed of one method; `train` is what ``transfer`` learns on."""
+    rng, inputs = np.random.default_rng(seed), method.prepare(table)
+    ask = _asked_plainly(inputs)
+    if method.reference is not None:
+        # A generator of its own: the folds of a seed are the same under every reference.
+        ask = _of_ensemble(asked_under(method.reference, table, np.random.default_rng([seed, 1])))
+    if train is None:
+        return cross_validate(inputs, protocol, method, rng, alpha=alpha, ask=ask)
+    return transfer(method.prepare(train), inputs, method, rng, alpha=alpha, ask=ask)
+
+
+def cross_validate(
+    table: FeatureTable,
+    protocol: Protocol,
+    method: WindowMethod,
+    rng: np.random.Generator,
+    *,
+    alpha: float,
+    ask: Ask | None = None,
+) -> dict[float, Predictions]:
+    """Predict every window once, by classifier, threshold and map that never saw its fold.
+
+    Parameters
+    ----------
+    table : FeatureTable
+        Windows, prepared for the method.
+    protocol : {"cv", "lojo"}
+        Folds of the table, and of each training set, from which threshold and map are learned.
+    method : WindowMethod
+        Makes the classifiers.
+    rng : numpy.random.Generator
+        Draws folds and whatever the classifier draws.
+    alpha : float
+        Budget of the threshold.
+    ask : callable, optional
+        Asks the classifier about held-out rows, where they are asked otherwise than the table holds them:
+        with another reference.
+
+    Returns
+    -------
+    dict of float to Predictions
+        For each beta: 1, the published statistic, and 0, with the visible explanation removed.
+
+    Examples
+    --------
+    >>> from worldstate.abduction.signature.published_training import PublishedClassifier
+    >>> rng = np.random.default_rng(0)
+    >>> labels = np.repeat(["left", "none", "right", "front"], 20)
+    >>> keys = np.array([str(i) for i in range(80)])
+    >>> loud = np.where(labels == "none", 0.1, 0.2)[:, None]
+    >>> features = loud * rng.lognormal(0.0, 0.2, (80, 60))
+    >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
+    >>> found = cross_validate(table, "cv", WindowMethod(PublishedClassifier), rng, alpha=0.1)
+    >>> alarms = found[0.0].decision
+    >>> bool(alarms[table.hazards].mean() > alarms[table.hazard_free].mean())
+    True
+    """
+    folds, ask = folds_of(protocol, table, rng), ask or _asked_plainly(table)
+    predictions = {beta: Predictions.blank(folds) for beta in MISS_RATES}
+    for fold in np.unique(folds):
+        held_out = folds == fold
+        train = table.select(~held_out)
+        probabilities = ask(method.trained(train, rng), held_out)
+        for beta, (learned, _) in method.calibrations(train, protocol, rng, alpha).items():
+            predictions[beta].fill(held_out, probabilities, learned)
+    return predictions
+
+
+def transfer(
+    train: FeatureTable,
+    test: FeatureTable,
+    method: WindowMethod,
+    rng: np.random.Generator,
+    *,
+    alpha: float,
+    ask: Ask,
+) -> dict[float, Predictions]:
+    """Predict every window of one table by what was learned on another."""
+    shared = np.intersect1d(train.recording_keys, test.recording_keys)
+    if shared.size:
+        raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")
+    calibrations = method.calibrations(train, "transfer", rng, alpha)
+    probabilities = ask(method.trained(train, rng), np.ones(len(test), dtype=np.bool_))
+    predictions = {}
+    for beta, (learned, mean_risk) in calibrations.items():
+        one = Predictions.of_model(probabilities, learned, "transfer")
+        if method.afar:
+            one = replace(one, risk=matched_risk(one.risk, test, mean_risk))
+        predictions[beta] = one
+    return predictions
+
+
+def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> FloatArray:
+    r"""Return the risks, those of each junction shifted in log-odds, shape (n,).
+
+    .. math:: r' = \sigma(\mathrm{logit}\, r + b), \qquad
+              \tfrac{1}{n} \sum_i \sigma(\mathrm{logit}\, r_i + b) = \bar r,
+
+    with the mean over the junction's other recordings. No label is looked at, but the share of hazards among
+    the windows is taken to be what it was in training: true of a curated set, false of a street by the hour.
+
+    Shapes: risk (n,).
+    """
+    values = finite_array("risk", risk, (len(table),))
+    mean = in_range("mean_risk", mean_risk, 0.0, 1.0, open_low=True, open_high=True)
+    if (values < 0).any() or (values > 1).any():
+        raise InvalidArgumentError("risk: expected numbers in [0, 1]")
+    log_odds = logit(np.clip(values, SMALLEST_RISK, 1.0 - SMALLEST_RISK))
+    keys, matched = table.recording_keys, np.empty(len(table))
+    for key in np.unique(keys):
+        mine = keys == key
+        others = (table.environments == table.environments[mine][0]) & ~mine
+        if not others.any():
+            raise InvalidArgumentError(f"recording {key}: expected another recording of its junction")
+        matched[mine] = expit(log_odds[mine] + _shift(log_odds[others], mean))
+    return matched
+
+
+def _shift(log_odds: FloatArray, mean: float) -> float:
+    def surplus(shift: float) -> float:
+        return float(expit(log_odds + shift).mean()) - mean
+
+    farthest = float(np.abs(log_odds).max() + abs(logit(mean)) + 1.0)
+    return float(brentq(surplus, -farthest, farthest))

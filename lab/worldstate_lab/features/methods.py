@@ -1,0 +1,116 @@
+"""Methods and baselines of an evaluation on feature windows."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.signature.ensemble_training import (
+    Classifier,
+    Recipe,
+    SimulatedWindows,
+    SiteEnsembleClassifier,
+)
+from worldstate.abduction.signature.published_training import PublishedClassifier
+from worldstate.abduction.signature.site_reference import log_levels
+from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
+from worldstate.ground.typing import FloatArray
+from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE
+
+from .feature_evaluation import Predictions, Protocol, Reference, WindowMethod
+
+Passes = list[dict[float, Predictions]]
+REFERENCES: tuple[Reference, ...] = ("run", "cold", "curated")
+
+
+class LoudestDirection:
+    """Hazard odds equal to the highest level of the spatial spectrum; learns nothing.
+
+    Examples
+    --------
+    >>> LoudestDirection().fit([[0.1]], ["none"]).predict_proba([[0.25, 1.0]])
+    array([[0.  , 0.25, 0.5 , 0.25]])
+    """
+
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Do nothing."""
+        return self
+
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
+        """Return posteriors of front, left, none, right, shape (n, 4): no side is preferred."""
+        odds = np.exp(log_levels(X).max(axis=1))
+        posteriors = np.zeros((len(odds), len(CLASSES)))
+        posteriors[:, NONE] = 1.0 / (1.0 + odds)
+        posteriors[:, LEFT] = posteriors[:, RIGHT] = odds / (1.0 + odds) / 2.0
+        posteriors[:, FRONT] = 0.0
+        return posteriors
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row of the comparison: a method and the statistic that is read from it."""
+
+    method: str  # Name in `methods`
+    miss_rate: float  # beta of the statistic
+
+
+def _loudest_direction(rng: np.random.Generator) -> Classifier:
+    return LoudestDirection()
+
+
+def _site_ensemble(rng: np.random.Generator, simulated: SimulatedWindows | None) -> Classifier:
+    return SiteEnsembleClassifier(simulated=simulated)
+
+
+def _distant_site(rng: np.random.Generator) -> Classifier:
+    # The quiet reference alone, hardly held back. Level, which the ridge favours, is what a moving ego's own
+    # noise covers; the pattern above the quietest windows is left. Chosen among some thirty for each moving
+    # junction on the other two: thrice the same.
+    return SiteEnsembleClassifier((Recipe("quiet", 1e-5),))
+
+
+def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod]:
+    """Return the methods by name, the ensembles of them trained on simulated windows too."""
+    ensemble = WindowMethod(partial(_site_ensemble, simulated=simulated))
+    # The pattern alone, for a moving ego: streets of a standing one cost it (docs/signature.md).
+    distant = WindowMethod(_distant_site, afar=True)
+    return {
+        "baseline": WindowMethod(PublishedClassifier),
+        "loudest_direction": WindowMethod(_loudest_direction),
+        **{f"ensemble_{one}": replace(ensemble, reference=one) for one in REFERENCES},
+        **{f"distant_site_{one}": replace(distant, reference=one) for one in REFERENCES},
+    }
+
+
+# What is read from each method, by the name of its row.
+ROWS = {
+    "baseline": Row("baseline", PUBLISHED_MISS_RATE),
+    "baseline_absent": Row("baseline", ABSENT_MISS_RATE),
+    **{name: Row(name, ABSENT_MISS_RATE) for name in methods() if name != "baseline"},
+}
+
+# What `worldstate` is: the ensemble where the ego drives as it did in training, one expert where it does not.
+# The ego's motion is known, and nothing else decides.
+OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "distant_site"}
+
+
+def row_of(method: str, protocol: Protocol, reference: Reference) -> str:
+    """Return the name in `ROWS` of what a method is under a protocol and a reference."""
+    return f"{OURS[protocol]}_{reference}" if method == "worldstate" else method
+
+
+def rows_beside(row: str, protocol: Protocol, reference: Reference) -> tuple[str, ...]:
+    """Return the rows beside one: those to beat, and itself under the other references."""
+    if row == "baseline":
+        return ()
+    others = tuple(row_of("worldstate", protocol, other) for other in REFERENCES if other != reference)
+    # Where the ego drives and did not in training, the ensemble is one of those to beat.
+    afar = (f"ensemble_{reference}",) if protocol == "transfer" else ()
+    return ("baseline", "baseline_absent", "loudest_direction", *others, *afar)
+
+
+def method_of(method: str) -> WindowMethod:
+    """Return what a method is in training: compared with curated windows."""
+    return methods()[row_of(method, "cv", "curated")]
