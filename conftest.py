@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from worldstate_lab.cli.main import main as study
 
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.demo import simulate_approach
-from worldstate.cli.main import main
 from worldstate.frontend.array.ovad_array import ovad_array
 
 # Two processes on two cores beside other work: how long an example takes says nothing of the code.
@@ -69,5 +69,5 @@ def smoke(tmp_path_factory):
     """The folder of a smoke evaluation, and its report."""
     out = tmp_path_factory.mktemp("evaluation")
     # Five pools would import the library in two processes each: the second run in test_evaluate has pools.
-    assert main(["evaluate", "--smoke", "--jobs", "1", "--out", str(out)]) == 0
+    assert study(["table", "--smoke", "--jobs", "1", "--out", str(out)]) == 0
     return out, json.loads((out / "evaluation.json").read_text())

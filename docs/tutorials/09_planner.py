@@ -12,7 +12,7 @@ from worldstate.operations.figure_style import BLUE, GREEN, RED, figure_file
 from worldstate.simulation import DatasetSettings, write_dataset
 
 EGO, HOP_S, BEGINS_M = EgoVehicle(), 0.1, 20.0
-# Chance from which on a vehicle is assumed; .01 is a choice: `evaluate-planner` sets it on streams.
+# Chance from which on a vehicle is assumed; .01 is a choice: `worldstate-lab planner` sets it on streams.
 THRESHOLDS = {"no knowledge": (np.inf, RED), "phantom": (0.0, BLUE), "chance": (0.01, GREEN)}
 
 

@@ -15,7 +15,7 @@ from worldstate.adapters.camera.static_boxes import ParkedRule, count_boxes
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.listen import listen, open_source
 from worldstate.cli.common.camera_options import given_detections
-from worldstate.cli.main import build_parser, main
+from worldstate.cli.main import PROGRAM, main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 SIZE = {"width_px": 1000, "height_px": 600}
@@ -119,12 +119,12 @@ def test_images_that_carry_no_stamp_come_at_the_rate_that_is_said(tmp_path, caps
     rows = [{"image_id": 45, "category_id": 3, "bbox": [10, 20, 200, 150], "score": 0.9}]
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps(rows))
-    words = ["run", "a.wav", "--detections", str(boxes)]
-    parser = build_parser()
+    words = ["a.wav", "--detections", str(boxes)]
+    parser = PROGRAM.parser("run")
     at_30 = given_detections(parser.parse_args([*words, "--image-rate", "30"]), None)
     assert at_30.stamps_ns[45] == 1_500_000_000
     assert given_detections(parser.parse_args(words), None) == boxes
     assert main(["run", "a.wav", "--image-rate", "30"]) == 2
     assert "--image-rate: expected --detections with it" in capsys.readouterr().err
-    assert main([*words, "--image-rate", "0"]) == 2
+    assert main(["run", *words, "--image-rate", "0"]) == 2
     assert "frame_rate_hz" in capsys.readouterr().err

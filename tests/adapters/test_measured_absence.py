@@ -315,7 +315,7 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys):
     out, figure = tmp_path / "beta.json", tmp_path / "beta.png"
     video = write_video(tmp_path / "street.mp4", street(14, speed_px=16.0))
     boxes = write_reference(tmp_path / "boxes.json", reference(14, 16.0))
-    arguments = ["measure-absence", str(video), "--reference", str(boxes), "--out", str(out)]
+    arguments = ["model", "detector", str(video), "--reference", str(boxes), "--out", str(out)]
     assert main([*arguments, "--figure", str(figure), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     rates = load_miss_rates(out)
@@ -329,10 +329,12 @@ def test_bad_input_of_the_command_is_one_line(tmp_path, capsys):
     text = tmp_path / "text.mp4"
     text.write_text("no video")
     for path in (tmp_path / "missing.mp4", text, tmp_path):
-        assert main(["measure-absence", str(path), "--out", str(tmp_path / "beta.json")]) == 2
+        assert main(["model", "detector", str(path), "--out", str(tmp_path / "beta.json")]) == 2
         captured = capsys.readouterr()
         assert str(path.name) in captured.err
-    assert main(["measure-absence", str(text), "--detector", "onnx", "--out", str(tmp_path / "b.json")]) == 2
+    assert (
+        main(["model", "detector", str(text), "--detector", "onnx", "--out", str(tmp_path / "b.json")]) == 2
+    )
     assert "--onnx-model" in capsys.readouterr().err
     assert not (tmp_path / "beta.json").exists()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from worldstate_lab.cli.main import main as study
 
 from conftest import Approach
 from worldstate.adapters.acoustic import AcousticAdapter
@@ -133,7 +134,9 @@ def test_the_command_refuses_in_one_line_unless_told_to_go_on(
     assert "\n" not in line
     for said in ("mics.xml", "OVAD", "56 microphones", "mm elsewhere", "looks mirrored", "--uncalibrated"):
         assert said in line
-    assert main(["calibrate", str(alone), "--array", str(mics), "--out", str(tmp_path / "m.json")]) == 2
+    assert (
+        main(["model", "threshold", str(alone), "--array", str(mics), "--out", str(tmp_path / "m.json")]) == 2
+    )
     assert not (tmp_path / "m.json").exists()
 
 
@@ -252,7 +255,7 @@ def test_a_recordings_own_array_gives_the_bearings_of_the_same_one_passed(
     tracks = []
     for number, words in enumerate(([str(approach.folder)], [str(approach.folder), *given], [str(bare)])):
         out = tmp_path / f"{number}.csv"
-        assert main(["bearings", *words, "--out", str(out)]) == 0
+        assert main(["array", "bearings", *words, "--out", str(out)]) == 0
         tracks.append(np.genfromtxt(out, delimiter=",", names=True)["azimuth_deg"])
     assert len(tracks[0]) > 50 and np.isfinite(tracks[0]).any()
     for track in tracks[1:]:
@@ -265,7 +268,7 @@ def test_a_data_set_is_read_with_its_own_array(tmp_path: Path, approach: Approac
     assert np.array_equal(own, open_source(approach.audio_path).array.positions_m)
     mics = tmp_path / "mics.xml"
     write_array_xml(mics, roof_array_56())
-    words = ["simulate", "--out", str(tmp_path / "sim"), "--static", "1", "--duration", "1.2"]
+    words = ["sim", "make", "--out", str(tmp_path / "sim"), "--static", "1", "--duration", "1.2"]
     assert main([*words, "--array", str(mics)]) == 0
     folder = tmp_path / "sim" / "SA1" / "left" / "1_00_0000"
     found = choose_array(tmp_path / "sim").positions_m
@@ -274,7 +277,7 @@ def test_a_data_set_is_read_with_its_own_array(tmp_path: Path, approach: Approac
     assert main(["run", str(folder)]) == 2  # the model that ships was not made for it
     assert main(words) == 2  # one data set, one array
     table = tmp_path / "features.csv"
-    assert main(["extract-features", str(tmp_path / "sim"), "--out", str(table)]) in (0, 2)
+    assert main(["model", "features", str(tmp_path / "sim"), "--out", str(table)]) in (0, 2)
 
 
 def test_a_sound_file_alone_takes_the_models_array_if_it_fits(
@@ -304,7 +307,7 @@ def test_a_table_and_the_model_trained_on_it_say_what_they_were_made_with(
     read = read_features(tmp_path / "t.csv")
     assert read.domain is not None and read.domain.array == "eight"
     assert np.array_equal(read.domain.positions_m, own.positions_m)
-    train = ["train", str(tmp_path / "t.csv"), "--out", str(tmp_path / "m.json")]
+    train = ["model", "fit", str(tmp_path / "t.csv"), "--out", str(tmp_path / "m.json")]
     assert main(train) == 0
     domain = read_model(tmp_path / "m.json").domain
     assert domain is not None and (len(domain.positions_m), domain.ego_motion) == (8, "standing")
@@ -335,11 +338,11 @@ def test_evaluating_a_table_of_another_array_is_refused(
     shipped = read_model()
     unseen = replace(shipped.provenance, training_recordings=())
     save_model(model, replace(shipped, provenance=unseen))
-    assert main(["evaluate-features", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 2
+    assert study(["windows", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 2
     assert "eight: not the array of the model" in capsys.readouterr().err
     # A table that names none is OVAD's, as the released one.
     write_features(tmp_path / "t.csv", replace(windows(), environments=np.array(["SA1"] * 60)))
-    assert main(["evaluate-features", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 0
+    assert study(["windows", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 0
 
 
 def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
@@ -354,15 +357,15 @@ def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
     soundfile.write(quiet, 0.01 * RNG.standard_normal((RATE * 2, 56)), RATE, subtype="FLOAT")
     out, streams = tmp_path / "out.json", tmp_path / "s.npz"
     words = ["--alpha", "0.2", "--method", "plain", "--out", str(out)]
-    assert main(["calibrate", str(quiet), "--array", str(mics), *words]) == 2
+    assert main(["model", "threshold", str(quiet), "--array", str(mics), *words]) == 2
     assert "looks mirrored" in capsys.readouterr().err and not out.exists()
     heard = ["--array", str(mics), "--model", str(tmp_path / "own.json"), "--save-streams", str(streams)]
-    assert main(["calibrate", str(quiet), *heard, *words]) == 0
+    assert main(["model", "threshold", str(quiet), *heard, *words]) == 0
     written = read_model(out).domain
     assert written is not None and written.array == "mirrored"
-    assert main(["calibrate", str(streams), "--model", str(tmp_path / "own.json"), *words]) == 0
+    assert main(["model", "threshold", str(streams), "--model", str(tmp_path / "own.json"), *words]) == 0
     out.unlink()
-    assert main(["calibrate", str(streams), *words]) == 2
+    assert main(["model", "threshold", str(streams), *words]) == 2
     assert "heard with another model's signature" in capsys.readouterr().err and not out.exists()
 
 
@@ -372,7 +375,7 @@ def test_evaluate_refuses_a_model_of_another_array(
     shipped = read_model()
     roof = domain_of(roof_array_56(), [RATE], ["SA1"])
     save_model(tmp_path / "roof.json", replace(shipped, signature=replace(shipped.signature, domain=roof)))
-    assert main(["evaluate", "--out", str(tmp_path / "e"), "--model", str(tmp_path / "roof.json")]) == 2
+    assert study(["table", "--out", str(tmp_path / "e"), "--model", str(tmp_path / "roof.json")]) == 2
     assert "not the array of the model" in capsys.readouterr().err
     assert not (tmp_path / "e" / "streets").exists()
 

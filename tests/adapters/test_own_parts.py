@@ -53,7 +53,7 @@ def log(tmp_path):
 
 
 def test_an_exporter_gets_every_state(own_parts, log, tmp_path):
-    assert main(["replay", str(log), "--export", f"table={tmp_path / 'risk.csv'}"]) == 0
+    assert main(["log", "replay", str(log), "--export", f"table={tmp_path / 'risk.csv'}"]) == 0
     with (tmp_path / "risk.csv").open() as file:
         rows = list(csv.DictReader(file))
     cues = [(state, cue) for state in scripted_states() for cue in state.cues]
@@ -127,7 +127,7 @@ def test_array_and_signature_of_ones_own_measure(own_parts, tmp_path):
 def test_nothing_is_imported_that_was_not_named(package, log, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(package)
     monkeypatch.delitem(sys.modules, "own_parts", raising=False)
-    assert main(["replay", str(log), "--autoware", str(tmp_path / "a.jsonl")]) == 0
+    assert main(["log", "replay", str(log), "--autoware", str(tmp_path / "a.jsonl")]) == 0
     assert "own_parts" not in sys.modules
     assert installed("worldstate.exporters") == ["table"]
 
@@ -135,7 +135,7 @@ def test_nothing_is_imported_that_was_not_named(package, log, tmp_path, monkeypa
 def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
     own_parts, log, approach, tmp_path, capsys
 ):
-    replay, run = ["replay", str(log)], ["run", str(approach.folder)]
+    replay, run = ["log", "replay", str(log)], ["run", str(approach.folder)]
     for options, said in (
         ([*replay, "--export", "sheet=a.csv"], "worldstate.exporters (table), got 'sheet'"),
         ([*replay, "--export", "table"], "--export: expected NAME=TARGET, got 'table'"),
@@ -156,5 +156,5 @@ def test_a_part_that_cannot_be_used_is_told_from_one_that_is_not_there(log, tmp_
         (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{name} = {name}:export\n")
     monkeypatch.syspath_prepend(tmp_path)
     for name, said in (("broken", "(RuntimeError: no licence)"), ("number", "to be callable, got 7")):
-        assert main(["replay", str(log), "--export", f"{name}=x"]) == 2
+        assert main(["log", "replay", str(log), "--export", f"{name}=x"]) == 2
         assert said in capsys.readouterr().err

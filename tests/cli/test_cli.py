@@ -11,24 +11,71 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.cli.main import COMMANDS, build_parser, main
+from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.cli.main import FORMER, PROGRAM, STUDIES, main
 from worldstate.state import snapshot_schema
 
 
-def help_of(command: str, capsys) -> str:
+def help_of(words: str, capsys) -> str:
     with pytest.raises(SystemExit) as stop:
-        build_parser().parse_args([command, "--help"])
+        main(words.split())
     assert stop.value.code == 0
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself_with_an_example(name, capsys):
-    command = name.rpartition(".")[2].replace("_", "-")
-    text = help_of(command, capsys)
+@pytest.mark.parametrize("command", PROGRAM.commands)
+def test_every_command_explains_itself_with_an_example(command, capsys):
+    text = help_of(f"{command} --help", capsys)
     assert "example" in text
     assert f"worldstate {command}" in text
     assert "--json" in text
+
+
+def test_all_commands_stand_on_one_screen_with_their_words(capsys):
+    assert main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 50
+    assert max(map(len, lines)) <= 80
+    shown = {line[:18].strip() for line in lines if line.startswith("  ")} - {""}
+    assert shown == {*PROGRAM.commands} - {"completion"}
+    assert main(["array", "--help"]) == 0
+    assert "array bounds" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("former", FORMER)
+def test_a_former_command_names_its_successor_and_goes_on(former, capsys):
+    assert FORMER[former] in PROGRAM.commands
+    with pytest.raises(SystemExit):
+        main([former, "--help"])
+    captured = capsys.readouterr()
+    assert captured.err == f"worldstate: `{former}` is now `{FORMER[former]}`\n"
+    assert f"usage: worldstate {FORMER[former]}" in captured.out
+
+
+@pytest.mark.parametrize("former", STUDIES)
+def test_a_study_names_the_command_of_the_laboratory(former, capsys):
+    assert main([former, "--json"]) == 2
+    assert f"worldstate-lab {STUDIES[former]}" in one_line_of(capsys)
+
+
+def test_a_former_command_leaves_standard_output_to_json(tmp_path, capsys):
+    assert main(["bounds", "--snr-db", "0", "--json"]) == 0
+    assert "horizontal_moment_m2" in json.loads(capsys.readouterr().out)
+
+
+def test_a_card_needs_no_further_word(tmp_path, capsys):
+    save_model(tmp_path / "mine.json", read_model())
+    cards = []
+    for words in (["model"], ["model", "show"], ["model", str(tmp_path / "mine.json")]):
+        assert main(words) == 0
+        cards.append(capsys.readouterr().out)
+    assert len({card.partition("threshold")[2] for card in cards}) == 1
+
+
+@pytest.mark.parametrize("words", [["nothing"], ["array", "nothing"], ["array"], []])
+def test_a_word_that_is_no_command_is_one_line(words, capsys):
+    assert main(words) == 2
+    assert "expected one of" in one_line_of(capsys)
 
 
 def one_line_of(capsys) -> str:
@@ -96,21 +143,20 @@ def test_own_array_and_sound_give_the_same_as_the_folder(approach, tmp_path, cap
 
 
 def test_the_help_names_every_exit_code(capsys):
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    text = capsys.readouterr().out.partition("exit codes:")[2]
+    main(["--help"])
+    text = capsys.readouterr().out.partition("exit codes:")[2].replace("\n", " ")
     page = (Path(__file__).resolve().parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
     for code in ("0", "1", "2", "130", "143"):
         assert f" {code} " in text
         assert re.search(rf"^\|.*\b{code}\b.*\|", page, flags=re.MULTILINE)
 
 
-def test_bearings_and_doctor_say_how_far_they_are(approach, tmp_path, monkeypatch):
+def test_bearings_and_check_say_how_far_they_are(approach, tmp_path, monkeypatch):
     from worldstate.cli.common import progress
 
     steps = []
     monkeypatch.setattr(progress.Bar, "advance", lambda bar, amount=1.0: steps.append(amount))
-    main(["bearings", str(approach.folder), "--out", str(tmp_path / "b.csv")])
+    main(["array", "bearings", str(approach.folder), "--out", str(tmp_path / "b.csv")])
     heard_s = len(steps)
-    main(["doctor", str(approach.folder)])
+    main(["array", "check", str(approach.folder)])
     assert heard_s == len(steps) - heard_s == 10

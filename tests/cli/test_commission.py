@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from worldstate_lab.cli.main import main as study
 
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
@@ -19,7 +20,7 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
 ) -> None:
     (tmp_path / "mics.csv").write_text(ARRAY)
     out, figure, report = tmp_path / "model.json", tmp_path / "exam.png", tmp_path / "exam.json"
-    command = ["commission", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
+    command = ["model", "make", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
     more = ["--figure", str(figure), "--report", str(report), "--mounting-errors"]
     assert main([*command, *more]) == 0
     assert "unfit for use" in capsys.readouterr().out
@@ -31,8 +32,8 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
     assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}
     assert told["mounting"]["as mounted"]["detected"] == told["detected"]
-    follow = ["evaluate-streams", *map(str, (tmp_path / "model.streams").glob("*-200*.npz"))]
-    assert main([*follow, "--model", str(out), "--report", str(tmp_path / "passes.json")]) == 0
+    follow = ["streams", *map(str, (tmp_path / "model.streams").glob("*-200*.npz"))]
+    assert study([*follow, "--model", str(out), "--report", str(tmp_path / "passes.json")]) == 0
     passes = json.loads((tmp_path / "passes.json").read_text())["junctions"]
     assert passes["all"]["approaches"] >= 1 and 0.0 < passes["all"]["hazard_free_hours"] < 0.1
     heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}
@@ -55,7 +56,16 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
 def test_an_ego_that_drives_gets_a_sequence_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "mics.csv").write_text(ARRAY)
     out = tmp_path / "model.json"
-    command = ["commission", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick", "--no-exam"]
+    command = [
+        "model",
+        "make",
+        "--array",
+        str(tmp_path / "mics.csv"),
+        "--out",
+        str(out),
+        "--quick",
+        "--no-exam",
+    ]
     assert main([*command, "--ego", "moving"]) == 0
     model = read_model(out)
     assert model.domain is not None and model.domain.ego_motion == "moving"

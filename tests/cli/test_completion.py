@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from worldstate.cli.completion import bash_script
-from worldstate.cli.main import COMMANDS, build_parser, main
+from worldstate.cli.main import PROGRAM, main
 
 BASH = shutil.which("bash")
 ASK = """
@@ -17,7 +17,7 @@ _worldstate; printf '%s\\n' "${{COMPREPLY[@]}}"
 
 @pytest.fixture(scope="module")
 def script():
-    return bash_script(build_parser())
+    return bash_script(PROGRAM)
 
 
 def complete(script: str, *words: str) -> list[str]:
@@ -31,7 +31,10 @@ def complete(script: str, *words: str) -> list[str]:
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (["worldstate", "evaluate-s"], ["evaluate-signatures", "evaluate-streams"]),
+        (["worldstate", "l"], ["live", "log"]),
+        (["worldstate", "array", "b"], ["bounds", "bearings"]),
+        (["worldstate", "sim", "make", "--traffic", "b"], ["busy"]),
+        (["worldstate", "array", "check", "some.wav", "--dur"], ["--duration", "--duration-error"]),
         (["worldstate", "run", "a.wav", "--uncal"], ["--uncalibrated"]),
         (["worldstate", "run", "--format", "s"], ["s16", "s24", "s32"]),
         (["worldstate", "completion", ""], ["bash"]),
@@ -47,8 +50,10 @@ def test_bash_completes(script, words, found):
 
 @pytest.mark.skipif(BASH is None, reason="there is no bash here")
 def test_every_command_is_completed(script):
-    names = {name.split(".")[-1].replace("_", "-") for name in COMMANDS}
-    assert set(complete(script, "worldstate", "")) == names | {"--help", "--version"}
+    first = set(complete(script, "worldstate", ""))
+    assert first == {name.split()[0] for name in PROGRAM.commands} | {"--help", "--version"}
+    for group in PROGRAM.groups:
+        assert complete(script, "worldstate", group, "") == PROGRAM.members(group)
 
 
 def test_it_is_printed_alone_so_that_a_shell_can_read_it(script, capsys):

@@ -87,23 +87,19 @@ def files(tmp_path, monkeypatch) -> Path:
         ("run a.wav --gating a.wav", "expected a figure name"),
         ("run a.wav --figure folder.png", "found a folder"),
         ("run a.wav --figure f.png --gating f.png", "--gating than for --figure"),
-        ("bearings a.wav --out a.wav", "a.wav: expected another file"),
-        ("identifiability --array mics.xml --figure mics.xml", "expected a figure name"),
-        ("doctor a.wav --figure a.wav", "expected a figure name"),
-        ("calibrate a.wav m.json --out m.json", "m.json"),
-        ("calibrate a.wav --out m2.json --save-streams m2.json", "save_streams"),
-        (f"calibrate set --out {RECORDING}/out_multi.wav", "expected another file"),
-        ("train t.csv --out t.csv", "t.csv"),
-        ("train t.csv --exclude ids.csv --out ids.csv", "ids.csv"),
-        ("extract-features set --labels t.csv --out t.csv", "t.csv"),
-        ("evaluate-features t.csv --predictions t.csv", "t.csv"),
-        ("measure-absence v.mp4 --out v.mp4", "v.mp4"),
-        ("measure-absence v.mp4 --out b.json --figure b.bmp", "b.bmp"),
-        ("bounds --out a.wav", "a.wav"),
+        ("array bearings a.wav --out a.wav", "a.wav: expected another file"),
+        ("array check a.wav --figure a.wav", "expected a figure name"),
+        ("model threshold a.wav m.json --out m.json", "m.json"),
+        ("model threshold a.wav --out m2.json --save-streams m2.json", "save_streams"),
+        (f"model threshold set --out {RECORDING}/out_multi.wav", "expected another file"),
+        ("model fit t.csv --out t.csv", "t.csv"),
+        ("model fit t.csv --exclude ids.csv --out ids.csv", "ids.csv"),
+        ("model features set --labels t.csv --out t.csv", "t.csv"),
+        ("model detector v.mp4 --out v.mp4", "v.mp4"),
+        ("model detector v.mp4 --out b.json --figure b.bmp", "b.bmp"),
+        ("array bounds --out a.wav", "a.wav"),
         ("demo --out a.wav/demo", "a.wav"),
-        ("simulate --out a.wav", "a.wav"),
-        ("evaluate --out a.wav", "a.wav"),
-        ("realism t.csv --out a.wav", "a.wav"),
+        ("sim make --out a.wav", "a.wav"),
     ],
 )
 def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files, capsys):
@@ -148,12 +144,12 @@ def test_no_permission_is_said_before_the_work(files, capsys):
 
 
 @pytest.mark.parametrize("suffix", [".raw", ".au", ".ogg", ".mp3", ".wav", ".npz", ""])
-@pytest.mark.parametrize("command", ["run", "doctor", "calibrate"])
+@pytest.mark.parametrize("command", ["run", "array check", "model threshold"])
 def test_bytes_that_are_no_sound_are_one_line(command, suffix, tmp_path, capsys):
     sound = tmp_path / f"f{suffix}"
     sound.write_bytes(np.random.default_rng(1).bytes(5000))
-    out = ["--out", str(tmp_path / "m.json")] if command == "calibrate" else []
-    assert str(sound) in refusal([command, str(sound), *out], tmp_path, capsys)
+    out = ["--out", str(tmp_path / "m.json")] if command == "model threshold" else []
+    assert str(sound) in refusal([*command.split(), str(sound), *out], tmp_path, capsys)
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
@@ -201,18 +197,18 @@ def whole(tmp_path_factory) -> Path:
 
 
 READERS = {
-    "sound.wav": "doctor {} --array {whole}/array.xml",
-    "array.xml": "bounds --array {}",
-    "array.csv": "bounds --array {}",
-    "array.json": "bounds --array {}",
+    "sound.wav": "array check {} --array {whole}/array.xml",
+    "array.xml": "array bounds --array {}",
+    "array.csv": "array bounds --array {}",
+    "array.json": "array bounds --array {}",
     "model.json": "model {}",
-    "streams.npz": "calibrate {} --out {new}",
-    "table.csv": "train {} --out {new}",
-    "ids.csv": "train {whole}/table.csv --exclude {} --out {new}",
+    "streams.npz": "model threshold {} --out {new}",
+    "table.csv": "model fit {} --out {new}",
+    "ids.csv": "model fit {whole}/table.csv --exclude {} --out {new}",
     "boxes.json": "run {whole}/array.xml --detections {}",
     "coco.json": "run {whole}/array.xml --detections {}",
     "states.jsonl": "explain {} --time 0.2",
-    "DataLog.csv": "extract-features {folder} --out {new}",
+    "DataLog.csv": "model features {folder} --out {new}",
 }
 
 
@@ -258,13 +254,13 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
 
 
 def test_a_full_disk_leaves_no_recording(tmp_path):
-    done = on_small_disk(["simulate", "--out", str(tmp_path), "--static", "1", "--duration", "0.5"])
+    done = on_small_disk(["sim", "make", "--out", str(tmp_path), "--static", "1", "--duration", "0.5"])
     assert "expected to write" in one_line(done)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_full_disk_leaves_no_figure(tmp_path):
-    done = on_small_disk(["bounds", "--out", str(tmp_path), "--trials", "2", "--snr-db", "0"])
+    done = on_small_disk(["array", "bounds", "--out", str(tmp_path), "--trials", "2", "--snr-db", "0"])
     assert "File too large" in one_line(done)
     assert list(tmp_path.iterdir()) == []
 
@@ -272,7 +268,7 @@ def test_a_full_disk_leaves_no_figure(tmp_path):
 def test_a_full_standard_output_is_one_line():
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [*COMMAND, "bounds"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            [*COMMAND, "array", "bounds"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     assert "No space left" in one_line(done)
 
@@ -290,7 +286,14 @@ def test_a_reader_that_has_seen_enough_is_no_error():
 
 def interrupted(words: list[str], begun, number: int) -> int:
     """Start a command, signal it (all its processes, as a terminal does on Ctrl-C) once `begun`."""
-    running = subprocess.Popen([*COMMAND, *words], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    # What a shell ignores in the background (`nohup`) is inherited: a terminal's Ctrl-C is not.
+    running = subprocess.Popen(
+        [*COMMAND, *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 60.0
     while not begun() and running.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -330,7 +333,7 @@ def test_a_signal_waits_for_files_that_belong_together(number, code):
 
 @pytest.mark.parametrize(("number", "code"), CODES)
 def test_an_interrupted_simulation_lists_what_it_leaves(number, code, tmp_path):
-    words = ["simulate", "--out", str(tmp_path), "--static", "400", "--duration", "0.5", "--jobs", "2"]
+    words = ["sim", "make", "--out", str(tmp_path), "--static", "400", "--duration", "0.5", "--jobs", "2"]
     words += ["--bandwidth", "2000"]
     assert interrupted(words, (tmp_path / "DataLog.csv").exists, number) == code
     listed = {recording.path for recording in OvadDataset(tmp_path).recordings}
@@ -351,7 +354,7 @@ def test_an_interrupted_run_leaves_nothing(number, code, tmp_path):
 def test_another_simulation_keeps_what_the_log_lists(tmp_path):
     write_log(tmp_path, [LogRow("3_01_0007", "SA2", "right", 70)])
     (tmp_path / "SA2/right/3_01_0007").mkdir(parents=True)
-    words = ["simulate", "--out", str(tmp_path), "--duration", "0.5", "--static", "1"]
+    words = ["sim", "make", "--out", str(tmp_path), "--duration", "0.5", "--static", "1"]
     assert main([*words, "--bandwidth", "2000"]) == 0
     listed = [recording.recording_id for recording in OvadDataset(tmp_path).recordings]
     assert listed == ["3_01_0007", "1_00_0000"]

@@ -56,10 +56,10 @@ def messages(path):
 
 def test_replay_gives_the_same_bytes_back(logged, tmp_path, capsys):
     log, states = logged
-    assert main(["replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
+    assert main(["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
     assert (tmp_path / "again.jsonl").read_bytes() == states.read_bytes()
-    assert main(["replay", str(states), "--mcap", str(tmp_path / "again.mcap")]) == 0
-    assert main(["replay", str(tmp_path / "again.mcap"), "--json"]) == 0
+    assert main(["log", "replay", str(states), "--mcap", str(tmp_path / "again.mcap")]) == 0
+    assert main(["log", "replay", str(tmp_path / "again.mcap"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["states"] == 6
 
 
@@ -173,13 +173,13 @@ def test_the_layout_shows_topics_that_are_written(logged):
 def test_a_damaged_log_is_refused_in_one_line(logged, tmp_path, capsys):
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(logged[0].read_bytes()[:5000])
-    assert main(["replay", str(broken)]) == 2
+    assert main(["log", "replay", str(broken)]) == 2
     assert "broken.mcap: expected an MCAP file" in capsys.readouterr().err
     (tmp_path / "empty.jsonl").write_text("")
-    assert main(["replay", str(tmp_path / "empty.jsonl")]) == 2
+    assert main(["log", "replay", str(tmp_path / "empty.jsonl")]) == 2
 
 
 def test_without_the_package_the_extra_is_named(logged, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "mcap", None)
-    assert main(["replay", str(logged[0])]) == 2
+    assert main(["log", "replay", str(logged[0])]) == 2
     assert "worldstate[mcap]" in capsys.readouterr().err

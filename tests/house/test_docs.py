@@ -4,11 +4,13 @@ import doctest
 import importlib
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
+from worldstate_lab.cli.main import PROGRAM as LABORATORY
 
-from worldstate.cli.main import build_parser
+from worldstate.cli.main import PROGRAM, current_words
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "docs" / "_ext"))
@@ -48,15 +50,23 @@ def test_objects_that_a_page_links_are_exported(page):
     assert missing == []
 
 
+PROGRAMS = {one.name: one for one in (PROGRAM, LABORATORY)}
+CALL = r"(?:`|^    |&& )(worldstate(?:-lab)?) ([a-z][^`\n&]*)"
+
+
+@cache
+def options_of(program: str, called: str) -> set[str]:
+    return {*PROGRAMS[program].parser(called)._option_string_actions, "--results"}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_of_a_page_exist_with_their_options(page):
-    commands = build_parser()._subparsers._group_actions[0].choices
-    text = page.read_text(encoding="utf-8")
-    for words in re.findall(r"(?:`|^    |&& )worldstate ([a-z][^`\n&]*)", text, flags=re.MULTILINE):
-        command, *rest = words.split("#")[0].split()
-        assert command in commands, words
-        for option in (word for word in rest if word.startswith("--")):
-            assert option in commands[command]._option_string_actions, words
+    for program, words in re.findall(CALL, page.read_text(encoding="utf-8"), flags=re.MULTILINE):
+        said = current_words(words.split("#")[0].split()) if program == "worldstate" else words.split()
+        called = PROGRAMS[program].called(said)
+        assert called is not None, words
+        options = {word.partition("=")[0] for word in said if word.startswith("--")}
+        assert options <= options_of(program, called), words
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

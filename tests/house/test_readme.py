@@ -3,7 +3,9 @@
 import re
 from pathlib import Path
 
-from worldstate.cli.main import COMMANDS
+from worldstate_lab.cli.main import PROGRAM as LABORATORY
+
+from worldstate.cli.main import PROGRAM
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -24,6 +26,8 @@ def test_the_first_program_warns_of_the_recording_that_the_demo_leaves(
     assert f"hidden vehicle on the {approach.folder.parent.name}" in capsys.readouterr().out
 
 
-def test_the_table_of_commands_is_complete():
-    listed = set(re.findall(r"^\| `worldstate ([a-z-]+)", README, flags=re.MULTILINE))
-    assert listed == {name.split(".")[-1].replace("_", "-") for name in COMMANDS}
+def test_the_tables_of_commands_are_complete():
+    section = README.partition("\n## Commands\n")[2].partition("\n## ")[0]
+    for name, program in (("worldstate", PROGRAM), ("worldstate-lab", LABORATORY)):
+        rows = re.findall(rf"^\| `{name} ([^`]+)`", section, flags=re.MULTILINE)
+        assert {program.called(words.split()) for words in rows} == {*program.commands} - {*program.hidden}

@@ -210,7 +210,17 @@ def test_damaged_streams_are_a_typed_error(streams_file, tmp_path):
 
 def test_the_command_replaces_the_policies_and_keeps_the_signature(streams_file, tmp_path, capsys):
     out = tmp_path / "model.json"
-    arguments = ["calibrate", str(streams_file), "--alpha", "0.01", "0.1", "--out", str(out), "--json"]
+    arguments = [
+        "model",
+        "threshold",
+        str(streams_file),
+        "--alpha",
+        "0.01",
+        "0.1",
+        "--out",
+        str(out),
+        "--json",
+    ]
     assert main(arguments) == 0
     captured = capsys.readouterr()
     summary = json.loads(captured.out)
@@ -230,7 +240,7 @@ def test_the_command_listens_to_a_sound_file(tmp_path, capsys):
     soundfile.write(sound, np.random.default_rng(0).normal(0, 0.01, (120_000, 56)), 48_000)
     out, streams = tmp_path / "model.json", tmp_path / "s.npz"
     extra = ["--method", "plain", "--alpha", "0.2", "--save-streams", str(streams), "--json"]
-    assert main(["calibrate", str(sound), "--out", str(out), *extra]) == 0
+    assert main(["model", "threshold", str(sound), "--out", str(out), *extra]) == 0
     assert json.loads(capsys.readouterr().out)["windows"] == 16
     (heard,) = load_streams(streams)
     assert heard.hazard_free
@@ -242,7 +252,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(name, tmp_path, capsys):
     path = tmp_path / name
     if not name.startswith("missing"):
         path.write_text("no sound")
-    assert main(["calibrate", str(path), "--out", str(tmp_path / "model.json")]) == 2
+    assert main(["model", "threshold", str(path), "--out", str(tmp_path / "model.json")]) == 2
     captured = capsys.readouterr()
     assert name in captured.err
     assert not (tmp_path / "model.json").exists()

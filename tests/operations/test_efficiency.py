@@ -71,13 +71,13 @@ def test_bad_settings_are_refused() -> None:
 
 
 def test_the_command_knows_the_papers_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bounds", "--json"]) == 0
+    assert main(["array", "bounds", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["horizontal_moment_m2"] == pytest.approx(3.03, abs=0.005)
     assert found["sigma_deg"]["0"] == pytest.approx(1.80, abs=0.01)
     assert found["sigma_deg"]["60"] == pytest.approx(2 * found["sigma_deg"]["0"])
     assert found["alias_hz"] == pytest.approx(1.9e3, rel=0.03)
-    assert main(["bounds", "--snr-db", "0"]) == 0
+    assert main(["array", "bounds", "--snr-db", "0"]) == 0
     assert "S_xx               3.03 m^2" in capsys.readouterr().out
 
 
@@ -85,7 +85,7 @@ def test_figures_and_numbers_of_an_array_that_faces_left(tmp_path, capsys) -> No
     turned = MicrophoneArray(ROOF.positions_m[::3][:, [1, 0, 2]])
     write_array_xml(tmp_path / "mics.xml", turned)
     words = ["--array", tmp_path / "mics.xml", "--snr-db", "20", "--trials", "40", "--out", tmp_path / "b"]
-    command = ["bounds", "--json", *map(str, words)]
+    command = ["array", "bounds", "--json", *map(str, words)]
     assert main(command) == 0
     first = json.loads(capsys.readouterr().out)
     assert first["broadside_deg"] == pytest.approx(90.0)
@@ -101,5 +101,5 @@ def test_figures_and_numbers_of_an_array_that_faces_left(tmp_path, capsys) -> No
 
 def test_an_upright_line_has_no_bearing(tmp_path, capsys) -> None:
     write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0, 0], [0, 0, 0.1]]))
-    assert main(["bounds", "--array", str(tmp_path / "mics.xml")]) == 2
+    assert main(["array", "bounds", "--array", str(tmp_path / "mics.xml")]) == 2
     assert "horizontal extent" in capsys.readouterr().err

@@ -102,12 +102,12 @@ def test_no_command_refuses_a_right_array(number: int, name: str, tmp_path: Path
     soundfile.write(tmp_path / "a.wav", wave(array, broadside), RATE)
     given = ["--array", str(file)]
     out = tmp_path / "b.csv"
-    assert main(["bearings", str(tmp_path / "a.wav"), *given, "--out", str(out), "--sources"]) == 0
+    assert main(["array", "bearings", str(tmp_path / "a.wav"), *given, "--out", str(out), "--sources"]) == 0
     rows = rows_of(out)
     assert len(rows) == 4
     assert np.abs(np.abs(rows[:, 1]) - broadside).max() < 8.0
-    assert main(["bounds", *given, "--json"]) == 0
-    assert main(["doctor", str(tmp_path / "a.wav"), *given]) in (0, 1)
+    assert main(["array", "bounds", *given, "--json"]) == 0
+    assert main(["array", "check", str(tmp_path / "a.wav"), *given]) in (0, 1)
 
 
 def test_all_round_with_a_ring(tmp_path: Path) -> None:
@@ -115,7 +115,10 @@ def test_all_round_with_a_ring(tmp_path: Path) -> None:
     file = write_array(tmp_path / "ring.csv", ring(8, 0.2))
     soundfile.write(tmp_path / "a.wav", wave(array, 150.0), RATE)
     options = ["--array", str(file), "--azimuth-span", "360", "--out", str(tmp_path / "b.csv")]
-    assert main(["bearings", str(tmp_path / "a.wav"), *options, "--figure", str(tmp_path / "b.png")]) == 0
+    assert (
+        main(["array", "bearings", str(tmp_path / "a.wav"), *options, "--figure", str(tmp_path / "b.png")])
+        == 0
+    )
     np.testing.assert_allclose(rows_of(tmp_path / "b.csv")[:, 1], 150.0, atol=1.0)
     assert (tmp_path / "b.png").is_file()
 
@@ -127,7 +130,7 @@ def test_two_sources_are_counted(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "a.wav", sound, RATE)
     file = write_array(tmp_path / "m.json", OWN["sixteen on a board"])
     options = ["--array", str(file), "--sources", "--out", str(tmp_path / "b.csv")]
-    assert main(["bearings", str(tmp_path / "a.wav"), *options]) == 0
+    assert main(["array", "bearings", str(tmp_path / "a.wav"), *options]) == 0
     assert rows_of(tmp_path / "b.csv")[0, 4] == 2
 
 
@@ -155,12 +158,12 @@ def test_raw_samples_on_standard_input(
     raw = (tmp_path / "a.raw").read_bytes()
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(raw)))
     said = ["--rate", str(RATE), "--channels", "4", "--format", encoding]
-    assert main(["bearings", "-", *said, "--array", str(file), "--out", str(out)]) == 0
+    assert main(["array", "bearings", "-", *said, "--array", str(file), "--out", str(out)]) == 0
     by_pipe = out.read_text()
-    assert main(["bearings", str(tmp_path / "a.wav"), "--array", str(file), "--out", str(out)]) == 0
+    assert main(["array", "bearings", str(tmp_path / "a.wav"), "--array", str(file), "--out", str(out)]) == 0
     assert by_pipe == out.read_text()
     capsys.readouterr()
-    assert main(["bearings", "-", "--array", str(file), "--out", str(out)]) == 2
+    assert main(["array", "bearings", "-", "--array", str(file), "--out", str(out)]) == 2
     assert "--rate" in capsys.readouterr().err
 
 
@@ -189,13 +192,13 @@ def test_a_file_a_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         soundfile.write(name, channel, RATE)
     soundfile.write(tmp_path / "a.wav", sound, RATE)
     options = ["--array", str(file), "--out", str(out)]
-    assert main(["bearings", *map(str, names), *options]) == 0
+    assert main(["array", "bearings", *map(str, names), *options]) == 0
     together = out.read_text()
-    assert main(["bearings", str(tmp_path / "a.wav"), *options]) == 0
+    assert main(["array", "bearings", str(tmp_path / "a.wav"), *options]) == 0
     assert together == out.read_text()
     soundfile.write(names[2], sound[:-1, 2], RATE)
-    assert main(["bearings", *map(str, names), *options]) == 2
+    assert main(["array", "bearings", *map(str, names), *options]) == 2
     assert "mic2.wav: expected 10400 samples at 8000 Hz as in mic0.wav" in capsys.readouterr().err
     soundfile.write(names[2], sound[:, :2], RATE)
-    assert main(["bearings", *map(str, names), *options]) == 2
+    assert main(["array", "bearings", *map(str, names), *options]) == 2
     assert "expected 1 channels" in capsys.readouterr().err

@@ -156,7 +156,7 @@ def recording(tmp_path):
     boxes.write_text(json.dumps({"detections_per_frame": rows}))
     camera.write_text(json.dumps({"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75}))
     soundfile.write(sound, rng.uniform(-0.01, 0.01, (4000 * 25, 56)), 4000)
-    return ["label", str(sound), "--detections", str(boxes), "--camera", str(camera)]
+    return ["street", "label", str(sound), "--detections", str(boxes), "--camera", str(camera)]
 
 
 def test_the_command_labels_a_recording(recording, tmp_path, capsys):
@@ -182,7 +182,7 @@ def test_train_learns_what_was_labelled(recording, tmp_path, capsys):
     ids, sites = np.arange(60).astype(str), np.repeat(["SA1", "SB1"], 30)
     write_features(table, FeatureTable(features, labels, ids, sites, ids, (None,) * 60))
     capsys.readouterr()
-    given = ["train", str(table), "--labels", str(windows), "--out", str(model)]
+    given = ["model", "fit", str(table), "--labels", str(windows), "--out", str(model)]
     assert main([*given, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["n_windows"] == 60 + told["n_labelled"] == 60 + len(read_labels(windows, tmp_path))

@@ -103,7 +103,7 @@ def test_a_street_with_other_bins_is_refused(street, tmp_path):
 
 def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys):
     out, figure = tmp_path / "street.json", tmp_path / "street.png"
-    told = ["learn-street", str(approach.folder), "--out", str(out)]
+    told = ["street", "learn", str(approach.folder), "--out", str(out)]
     assert main([*told, "--site", "here", "--figure", str(figure), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["n_passes"] == sum(arm["arrivals"] for arm in found["arms"].values())
@@ -125,7 +125,7 @@ def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys)
 
 def test_boxes_are_of_one_recording(approach, capsys):
     inputs = [str(approach.folder)] * 2
-    assert main(["learn-street", *inputs, "--detections", "a.json", "--out", "b.json"]) == 2
+    assert main(["street", "learn", *inputs, "--detections", "a.json", "--out", "b.json"]) == 2
     assert "--detections" in capsys.readouterr().err
 
 

@@ -33,7 +33,7 @@ def reddish(image):
 
 
 def test_the_figure_over_time_names_its_panels(log, tmp_path):
-    assert main(["plot", str(log), "--out", str(tmp_path / "states.svg")]) == 0
+    assert main(["log", "plot", str(log), "--out", str(tmp_path / "states.svg")]) == 0
     text = (tmp_path / "states.svg").read_text()
     for said in ("advisory left", "camera (blue: found)", "somebody hidden, left", "risk, right"):
         assert f"<!-- {said} -->" in text
@@ -58,7 +58,10 @@ def test_the_snapshot_nearest_to_the_time_is_drawn(log, states, tmp_path, capsys
     stamps_s = [state.stamp_ns / 1e9 for state in states]
     assert all(a < b for a, b in pairwise(stamps_s))
     above = str(tmp_path / "above.png")
-    assert main(["plot", str(log), "--birds-eye", above, "--time", f"{stamps_s[2] + 0.03}", "--json"]) == 0
+    assert (
+        main(["log", "plot", str(log), "--birds-eye", above, "--time", f"{stamps_s[2] + 0.03}", "--json"])
+        == 0
+    )
     assert f'"birds_eye_s": {stamps_s[2]}' in capsys.readouterr().out
 
 
@@ -73,5 +76,5 @@ def test_the_snapshot_nearest_to_the_time_is_drawn(log, states, tmp_path, capsys
 )
 def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch, capsys, options, said):
     monkeypatch.chdir(tmp_path)
-    assert main(["plot", str(log), *options]) == 2
+    assert main(["log", "plot", str(log), *options]) == 2
     assert said in capsys.readouterr().err

@@ -133,11 +133,11 @@ def test_markers_draw_the_scene_and_nothing_of_the_one_before(written):
 def test_replay_gives_back_what_was_written_from_the_folder_and_from_its_file(written, tmp_path, capsys):
     (storage,) = (file for file in written.iterdir() if file.suffix != ".yaml")
     for log in (written, storage):
-        assert main(["replay", str(log), "--out", str(tmp_path / "states.jsonl")]) == 0
+        assert main(["log", "replay", str(log), "--out", str(tmp_path / "states.jsonl")]) == 0
         assert (tmp_path / "states.jsonl").read_text().splitlines() == [state.to_json() for state in STATES]
     write_blocks(tmp_path / "sound", sound_of(RATE_HZ))
     capsys.readouterr()
-    assert main(["replay", str(tmp_path / "sound")]) == 2
+    assert main(["log", "replay", str(tmp_path / "sound")]) == 2
     assert "expected snapshots, got none" in capsys.readouterr().err
 
 
@@ -167,7 +167,7 @@ def test_a_message_is_laid_out_as_cdr_says(tmp_path):
 @pytest.fixture(scope="module")
 def bag_of_approach(approach, tmp_path_factory):
     path = tmp_path_factory.mktemp("approach") / "street"
-    assert main(["to-bag", str(approach.folder), str(path), "--start", "1700000000"]) == 0
+    assert main(["sim", "to-bag", str(approach.folder), str(path), "--start", "1700000000"]) == 0
     return path
 
 
@@ -188,12 +188,12 @@ def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach,
         assert [one["status"] for one in one["entities"]] == [one["status"] for one in other["entities"]]
     assert len(read_by_others(tmp_path / "c")) == 4 * len(of_bag)
     replayed = tmp_path / "d.jsonl"
-    assert main(["replay", str(tmp_path / "c"), "--out", str(replayed)]) == 0
+    assert main(["log", "replay", str(tmp_path / "c"), "--out", str(replayed)]) == 0
     assert replayed.read_bytes() == again.read_bytes()
 
 
 def test_other_commands_hear_a_bag_by_its_own_array(bag_of_approach, tmp_path, capsys):
-    assert main(["bearings", str(bag_of_approach), "--out", str(tmp_path / "b.csv"), "--json"]) == 0
+    assert main(["array", "bearings", str(bag_of_approach), "--out", str(tmp_path / "b.csv"), "--json"]) == 0
     assert "56 microphones" in capsys.readouterr().out
     assert len((tmp_path / "b.csv").read_text().splitlines()) > 50
 
@@ -347,11 +347,11 @@ def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
     noise = np.random.default_rng(0).uniform(-0.1, 0.1, (RATE_HZ, 56))
     soundfile.write(folder / "out_multi.wav", noise, RATE_HZ)
     bag = [str(folder), str(tmp_path / "unknown")]
-    assert main(["to-bag", *bag, "--json"]) == 0
+    assert main(["sim", "to-bag", *bag, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["odometry"] is False, "OVAD says that it moves, not how fast"
     assert read_bag(tmp_path / "unknown").ego is None
     (folder / "truth.json").write_text(json.dumps({"ego": {"speed_mps": [4.0] * 5 + [2.0] * 6}}))
-    assert main(["to-bag", str(folder), str(tmp_path / "driven"), "--start", "3"]) == 0
+    assert main(["sim", "to-bag", str(folder), str(tmp_path / "driven"), "--start", "3"]) == 0
     ego = read_bag(tmp_path / "driven").ego
     assert [(one.stamp_ns, one.speed_mps) for one in ego.told] == [
         (3_000_000_000 + k * 100_000_000, 4.0 if k < 5 else 2.0) for k in range(11)
@@ -361,7 +361,7 @@ def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
 def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
     states, log = tmp_path / "states.jsonl", tmp_path / "out.mcap"
     states.write_text("".join(state.to_json() + "\n" for state in STATES))
-    assert main(["replay", str(states), "--mcap", str(log)]) == 0
+    assert main(["log", "replay", str(states), "--mcap", str(log)]) == 0
     capsys.readouterr()
     assert main(["run", str(log)]) == 2
     assert "`worldstate log replay` reads" in capsys.readouterr().err
@@ -407,7 +407,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
     states = tmp_path / "states.jsonl"
     states.write_text("".join(state.to_json() + "\n" for state in STATES))
-    assert main(["replay", str(states), "--ros-bag", str(tmp_path / "out")]) == 2
+    assert main(["log", "replay", str(states), "--ros-bag", str(tmp_path / "out")]) == 2
     assert "worldstate[ros]" in capsys.readouterr().err
     shutil.copy(states, tmp_path / "a.mcap")
     assert main(["run", str(tmp_path / "a.mcap")]) == 2

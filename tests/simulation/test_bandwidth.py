@@ -133,13 +133,13 @@ def test_lines_of_an_engine_above_half_the_rate_are_left_out_and_not_folded() ->
 
 
 def test_recordings_up_to_two_kilohertz_are_heard_by_the_model_that_ships(tmp_path: Path) -> None:
-    words = "simulate --static 2 --bandwidth 2000 --duration 1.6 --seed 3"
+    words = "sim make --static 2 --bandwidth 2000 --duration 1.6 --seed 3"
     assert main([*words.split(), "--out", str(tmp_path)]) == 0
     (folder,) = (tmp_path / "SA1" / "left").iterdir()
     source = open_source(folder)
     steps = list(measure_steps(source))
     assert (soundfile.info(source.audio_path).samplerate, len(steps)) == (6000, 7)
-    assert main(["extract-features", str(tmp_path), "--out", str(tmp_path / "table.csv")]) == 0
+    assert main(["model", "features", str(tmp_path), "--out", str(tmp_path / "table.csv")]) == 0
     # A model of such windows hears full-rate sound as well: what counts is how long a frame lasts.
     domain = read_features(tmp_path / "table.csv").domain
     shipped = load_model()[0].domain

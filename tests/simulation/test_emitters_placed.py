@@ -11,7 +11,7 @@ from scipy.signal import coherence, stft
 
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
-from worldstate.cli.sim import simulate as cli
+from worldstate.cli.sim import make as cli
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
@@ -266,7 +266,8 @@ def test_wrong_sounds_are_refused_by_name(wrong, told):
 def test_the_command_adds_sounds_and_tells_them(tmp_path, capsys):
     write_array_xml(tmp_path / "pair.xml", PAIR)
     arguments = [
-        "simulate",
+        "sim",
+        "make",
         "--static",
         "1",
         "--scene",

@@ -95,7 +95,7 @@ def test_the_level_is_that_of_the_place_whatever_the_array():
 
 def test_the_data_set_keeps_the_array_with_its_heights(tmp_path, capsys):
     (tmp_path / "cube.json").write_text(json.dumps(np.array(ARRAYS["cube"]).tolist()))
-    arguments = ["simulate", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
+    arguments = ["sim", "make", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
     arguments += ["--scene", "parked-van"]
     assert main([*arguments, "--array", str(tmp_path / "cube.json")]) == 0
     (folder,) = json.loads(capsys.readouterr().out)["folders"]

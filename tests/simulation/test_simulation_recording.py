@@ -14,7 +14,7 @@ from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.cli.main import main
-from worldstate.cli.sim import simulate as cli
+from worldstate.cli.sim import make as cli
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
@@ -288,13 +288,13 @@ def test_settings_out_of_range_are_named(change, named):
 
 
 def test_the_command_writes_and_reports(tmp_path, capsys):
-    arguments = ["simulate", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
+    arguments = ["sim", "make", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
     assert main([*arguments, "--scene", "merge", "--kind", "electric"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert (summary["approaches"], summary["folders"]) == (1, ["SM1/left/1_12_0000"])
     truth = json.loads((tmp_path / "d" / summary["folders"][0] / "truth.json").read_text())
     assert (truth["settings"]["kind"], truth["settings"]["site"]["name"]) == ("electric", "SM1")
-    assert main(["simulate", "--out", str(tmp_path / "e"), "--static", "0"]) == 2
+    assert main(["sim", "make", "--out", str(tmp_path / "e"), "--static", "0"]) == 2
     assert "n_static" in capsys.readouterr().err
 
 
@@ -308,7 +308,7 @@ def test_the_command_offers_what_the_simulation_has():
 def test_a_calm_street_is_another_sound_of_the_same_drive(tmp_path, capsys):
     truths = {}
     for name in PRESETS:
-        arguments = ["simulate", "--out", str(tmp_path / name), "--static", "1", "--duration", "0.5"]
+        arguments = ["sim", "make", "--out", str(tmp_path / name), "--static", "1", "--duration", "0.5"]
         assert main([*arguments, "--preset", name, "--bandwidth", "2000"]) == 0
         truth = json.loads((tmp_path / name / "SA1/left/1_00_0000/truth.json").read_text())
         assert truth["settings"]["preset"]["name"] == name

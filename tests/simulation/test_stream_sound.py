@@ -166,7 +166,7 @@ def test_a_stream_on_disk_is_read_like_a_recording(
 ) -> None:
     positions = tmp_path / "pair.json"
     positions.write_text(json.dumps(PAIR.positions_m.tolist()))
-    command = "simulate --minutes 0.25 --site SB1 --seed 33 --traffic busy --bandwidth 700 --json"
+    command = "sim make --minutes 0.25 --site SB1 --seed 33 --traffic busy --bandwidth 700 --json"
     assert main([*command.split(), "--array", str(positions), "--out", str(tmp_path)]) == 0
     told = json.loads(capsys.readouterr().out)
     folder = tmp_path / "SB1-busy-33"
@@ -212,11 +212,11 @@ def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
         "--minutes 1 --bandwidth 3": "--bandwidth",
     }
     for words, problem in refused.items():
-        assert main(["simulate", "--out", str(tmp_path), *words.split()]) == 2
+        assert main(["sim", "make", "--out", str(tmp_path), *words.split()]) == 2
         assert problem in capsys.readouterr().err
     (tmp_path / "SB1-empty-1").mkdir()
     words = ["--minutes", "1", "--site", "SB1", "--traffic", "empty"]
-    assert main(["simulate", "--out", str(tmp_path), *words]) == 2
+    assert main(["sim", "make", "--out", str(tmp_path), *words]) == 2
     assert "something else" in capsys.readouterr().err
 
 

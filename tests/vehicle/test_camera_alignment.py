@@ -98,7 +98,17 @@ def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monke
         "worldstate.operations.alignment.heard_passes.heard_passes", lambda source, margin_s: [next(seen)]
     )
     out = tmp_path / "aligned.json"
-    words = ["align", *map(str, sounds), "--car", str(car), "--camera-name", "left", "--out", str(out)]
+    words = [
+        "array",
+        "align",
+        *map(str, sounds),
+        "--car",
+        str(car),
+        "--camera-name",
+        "left",
+        "--out",
+        str(out),
+    ]
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["recordings"], found["passes"]) == (10, 10)
@@ -121,11 +131,11 @@ def test_the_array_of_a_car_is_found_from_the_new_file_or_it_is_refused(tmp_path
 
 
 def test_what_cannot_be_aligned(car, tmp_path, capsys):
-    assert main(["align", "nowhere"]) == 2
+    assert main(["array", "align", "nowhere"]) == 2
     assert "nowhere: expected a data set" in capsys.readouterr().err
-    assert main(["align", str(tmp_path), "--out", str(tmp_path / "new.json")]) == 2
+    assert main(["array", "align", str(tmp_path), "--out", str(tmp_path / "new.json")]) == 2
     assert "--out: expected --car with it" in capsys.readouterr().err
-    words = ["align", str(car), str(car), "--car", str(car), "--detections", str(car)]
+    words = ["array", "align", str(car), str(car), "--car", str(car), "--detections", str(car)]
     assert main(words) == 2
     assert "--detections: expected one recording with it" in capsys.readouterr().err
 
@@ -142,7 +152,7 @@ def test_a_recording_without_a_camera_has_no_passes(tmp_path):
 def test_rendered_streets_give_the_offset_and_the_yaw_that_were_put_in(tmp_path):
     for site, seed in (("SA1", 3), ("SB2", 3)):
         words = ["--minutes", "4", "--site", site, "--traffic", "approaches", "--bandwidth", "2000"]
-        assert main(["simulate", "--out", str(tmp_path), *words, "--seed", str(seed)]) == 0
+        assert main(["sim", "make", "--out", str(tmp_path), *words, "--seed", str(seed)]) == 0
     sources = [
         open_source(folder, settings=ListenSettings(uncalibrated=True)) for folder in tmp_path.iterdir()
     ]

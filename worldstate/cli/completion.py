@@ -7,6 +7,7 @@ completes as files do.
 import argparse
 from collections.abc import Iterator
 
+from worldstate.cli.common.command import Program
 from worldstate.cli.common.output import CommandResult
 
 EXAMPLE = """\
@@ -14,17 +15,24 @@ examples:
   source <(worldstate completion bash)
   worldstate completion bash > ~/.local/share/bash-completion/completions/worldstate"""
 
-# Written once and not asked of the command at every key: to build the parser takes a third of a second.
+# Written once: to ask the command at every key would take a third of a second each time.
 _SCRIPT = """\
 _worldstate() {{
-    local current="${{COMP_WORDS[COMP_CWORD]}}" words=""
+    local current="${{COMP_WORDS[COMP_CWORD]}}" called="${{COMP_WORDS[1]}}" words="" first=2
+    case "$called" in
+    {groups}) called="$called ${{COMP_WORDS[2]}}"; first=3 ;;
+    esac
     if [ "$COMP_CWORD" -eq 1 ]; then
-        words="{commands}"
+        words="{commands} --help --version"
+    elif [ "$COMP_CWORD" -lt "$first" ]; then
+        case "${{COMP_WORDS[1]}}" in
+{members}
+        esac
     else
-        case "${{COMP_WORDS[1]}} ${{COMP_WORDS[COMP_CWORD-1]}}" in
+        case "$called ${{COMP_WORDS[COMP_CWORD-1]}}" in
 {choices}
         *) if [ "${{current:0:1}}" = "-" ]; then
-            case "${{COMP_WORDS[1]}}" in
+            case "$called" in
 {options}
             esac
         fi ;;
@@ -42,32 +50,31 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return the script."""
-    from .main import build_parser
+    from .main import PROGRAM
 
-    script = bash_script(build_parser())
+    script = bash_script(PROGRAM)
     return CommandResult({"shell": arguments.shell, "script": script}, table={}, lines=[script])
 
 
-def bash_script(parser: argparse.ArgumentParser) -> str:
-    """Return the script for the commands of a parser."""
-    commands = _commands(parser)
+def bash_script(program: Program) -> str:
+    """Return the script for the commands of a program."""
+    parsers = {name: program.parser(name) for name in program.commands}
     return _SCRIPT.format(
-        commands=" ".join([*commands, "--help", "--version"]),
-        choices="\n".join(line for name, one in commands.items() for line in _choices(name, one)),
-        options="\n".join(
-            f'            {name}) words="{_options(one)}" ;;' for name, one in commands.items()
-        ),
+        groups="|".join(program.groups),
+        commands=" ".join([*program.members(""), *program.groups, *program.hidden]),
+        members=_cases({group: program.members(group) for group in program.groups}),
+        choices="\n".join(line for name, one in parsers.items() for line in _choices(name, one)),
+        options=_cases({name: _options(one) for name, one in parsers.items()}),
     )
 
 
-def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    # argparse has no public way to what it was told.
-    (found,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
-    return dict(found.choices)
+def _cases(words: dict[str, list[str]]) -> str:
+    return "\n".join(f'        "{name}") words="{" ".join(some)}" ;;' for name, some in words.items())
 
 
-def _options(command: argparse.ArgumentParser) -> str:
-    return " ".join(option for one in command._actions for option in one.option_strings)
+def _options(command: argparse.ArgumentParser) -> list[str]:
+    # argparse has no public way to the options that it was given.
+    return [option for one in command._actions for option in one.option_strings]
 
 
 def _choices(name: str, command: argparse.ArgumentParser) -> Iterator[str]:
@@ -76,5 +83,5 @@ def _choices(name: str, command: argparse.ArgumentParser) -> Iterator[str]:
         if one.choices is None or not all(isinstance(word, str) for word in one.choices):
             continue
         words = " ".join(one.choices)
-        for asked in one.option_strings or [name]:
-            yield f'        "{name} {asked}") words="{words}" ;;'
+        for before in one.option_strings or [name.split()[-1]]:
+            yield f'        "{name} {before}") words="{words}" ;;'

@@ -1,33 +1,21 @@
 """Entry point: one module per command, each with `EXAMPLE`, `add_options` and `run`."""
 
-import argparse
 import sys
 from collections.abc import Sequence
 
-from worldstate.cli.common import entry
+from worldstate.cli.common.command import Program, run_program
 from worldstate.ground.errors import InvalidArgumentError
 
 # A group is a folder, a command is a module in it; each keeps its heavy imports inside `run`.
-COMMANDS = {
-    **{name: name for name in ("demo", "run", "live", "explain")},
-    "array check": "array.check",
-    "array bounds": "array.bounds",
-    "array bearings": "array.bearings",
-    "array align": "array.align",
-    "model make": "model.make",
-    "model fit": "model.fit",
-    "model threshold": "model.threshold",
-    "model features": "model.features",
-    "model detector": "model.detector",
-    "model show": "model.show",
-    "street learn": "street.learn",
-    "street label": "street.label",
-    "log plot": "log.plot",
-    "log replay": "log.replay",
-    "sim make": "sim.make",
-    "sim to-bag": "sim.to_bag",
-    "completion": "completion",
-}
+COMMANDS = (
+    *("demo", "run", "live", "explain"),
+    *("array check", "array bounds", "array bearings", "array align"),
+    *("model make", "model fit", "model threshold", "model features", "model detector", "model show"),
+    *("street learn", "street label"),
+    *("log plot", "log replay"),
+    *("sim make", "sim to-bag"),
+    "completion",
+)
 GROUPS = {
     "array": "an array of microphones: its health, what it allows, where it points",
     "model": "a model for an array: made, fitted, set to a budget, shown",
@@ -73,14 +61,19 @@ DESCRIPTION = "Keep a structured world-state alive from sound when vision fails.
 EPILOG = """\
 example: worldstate demo --out out/demo
 
-exit codes: 0 done, 1 `array check` found a fault, 2 bad input (one line on standard error says what came
-and what was expected), 130 after Ctrl-C, 143 after SIGTERM; unfinished files are removed in each case"""
+exit codes: 0 done, 1 `array check` found a fault, 2 bad input (one line on
+standard error says what came and what was expected), 130 after Ctrl-C, 143
+after SIGTERM; unfinished files are removed in each case"""
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
-    modules = {words: f"worldstate.cli.{module}" for words, module in COMMANDS.items()}
-    return entry.build_parser("worldstate", DESCRIPTION, EPILOG, modules, GROUPS)
+PROGRAM = Program(
+    "worldstate",
+    DESCRIPTION,
+    EPILOG,
+    {words: "worldstate.cli." + words.replace(" ", ".").replace("-", "_") for words in COMMANDS},
+    GROUPS,
+    hidden=("completion",),
+)
 
 
 def current_words(words: Sequence[str]) -> list[str]:
@@ -93,19 +86,15 @@ def current_words(words: Sequence[str]) -> list[str]:
     if first in FORMER:
         print(f"worldstate: `{first}` is now `{FORMER[first]}`", file=sys.stderr)
         return [*FORMER[first].split(), *rest]
-    # `model FILE` shows a card, as it always did.
-    if first == "model" and rest and f"model {rest[0]}" not in COMMANDS and rest[0] not in ("-h", "--help"):
+    # `model FILE` shows a card, as it did before there were groups; `model` that of the model that ships.
+    if first == "model" and not {*rest[:1]} & {*PROGRAM.members("model"), "-h", "--help"}:
         return ["model", "show", *rest]
     return list(words)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code: 0, or 2 and one line on standard error for bad input."""
-    try:
-        words = current_words(sys.argv[1:] if argv is None else argv)
-    except InvalidArgumentError as error:
-        return entry.refused(str(error))
-    return entry.run_command(build_parser, words)
+    return run_program(PROGRAM, sys.argv[1:] if argv is None else argv, current=current_words)
 
 
 if __name__ == "__main__":

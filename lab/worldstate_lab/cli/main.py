@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from worldstate.cli.common.entry import build_parser, run_command
+from worldstate.cli.common.command import CommandParser, Program, run_program
 from worldstate.cli.common.output import CommandResult
 from worldstate_lab.report.results import keep_results, read_results
 
@@ -29,7 +29,7 @@ COMMANDS = {
 }
 DESCRIPTION = "The evaluation of the paper, and studies of our own."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
-
+PROGRAM = Program("worldstate-lab", DESCRIPTION, EPILOG, COMMANDS)
 
 Run = Callable[[argparse.Namespace], CommandResult]
 
@@ -37,17 +37,13 @@ Run = Callable[[argparse.Namespace], CommandResult]
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one study; return its exit code: 0, or 2 and one line on standard error for bad input."""
     words = sys.argv[1:] if argv is None else argv
-    return run_command(lambda: _parser(words), words)
+    return run_program(PROGRAM, words, prepare=partial(_keep_figures, words))
 
 
-def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser, in which every study can keep its figures in a results file."""
-    parser = build_parser("worldstate-lab", DESCRIPTION, EPILOG, COMMANDS)
-    (studies,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
-    for study in studies.choices.values():
-        study.add_argument("--results", type=Path, metavar="FILE", help="merge the figures into this file")
-        study.set_defaults(run=partial(_run, study.get_default("run"), words))
-    return parser
+def _keep_figures(words: Sequence[str], study: CommandParser) -> None:
+    """Let a study keep its figures in a results file."""
+    study.add_argument("--results", type=Path, metavar="FILE", help="merge the figures into this file")
+    study.set_defaults(run=partial(_run, study.get_default("run"), words))
 
 
 def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> CommandResult:

@@ -101,7 +101,7 @@ def test_a_model_trained_without_ego_noise_hears_none_and_no_other_model_does(
     tables = []
     for name, options in (("raw", []), ("cleaned", ["--ego-noise"])):
         words = [str(tmp_path), "--labels", str(labels), "--array", str(tmp_path / "few.xml")]
-        assert main(["extract-features", *words, "--out", str(tmp_path / f"{name}.csv"), *options]) == 0
+        assert main(["model", "features", *words, "--out", str(tmp_path / f"{name}.csv"), *options]) == 0
         tables.append(read_features(tmp_path / f"{name}.csv"))
     raw, cleaned = tables
     with pytest.raises(OutOfDomainError, match="ego-noise whitened"):

@@ -36,7 +36,7 @@ def write(tmp_path: Path) -> Callable[[np.ndarray], Path]:
 
 
 def doctor(path: Path, *options: str) -> int:
-    return main(["doctor", str(path), "--array", str(path.with_name("mics.xml")), *options])
+    return main(["array", "check", str(path), "--array", str(path.with_name("mics.xml")), *options])
 
 
 def test_a_healthy_recording(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,7 +91,7 @@ def test_a_wrong_sample_rate(street: np.ndarray, write: Callable, capsys: pytest
 
 
 def test_bad_input(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "nothing.wav"]) == 2
+    assert main(["array", "check", "nothing.wav"]) == 2
     assert "nothing.wav: no such file" in capsys.readouterr().err
     path = write(street[:, :55])
     assert doctor(path) == 2

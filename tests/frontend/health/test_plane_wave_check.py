@@ -138,7 +138,7 @@ def test_doctor_says_which_card_is_late_by_how_much(
     offset(sound, 8, np.random.default_rng(0))
     soundfile.write(tmp_path / "some.wav", 0.1 * sound, RATE, subtype="FLOAT")
     write_array_xml(tmp_path / "mics.xml", ARRAYS[8])
-    assert main(["doctor", str(tmp_path / "some.wav"), "--array", str(tmp_path / "mics.xml")]) == 1
+    assert main(["array", "check", str(tmp_path / "some.wav"), "--array", str(tmp_path / "mics.xml")]) == 1
     lines = capsys.readouterr().out.splitlines()
     (row,) = (line for line in lines if "delayed" in line and "%" in line)
     assert row.split()[:2] == ["5-8", "delayed"]

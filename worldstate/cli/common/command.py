@@ -1,33 +1,209 @@
-"""Declare a command: what all of them have in common."""
+"""A program of commands: it finds the one that is called, imports its module alone, and runs it."""
 
 import argparse
+import os
+import signal
+import sys
+import textwrap
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
 from types import ModuleType
 
-Subparsers = argparse._SubParsersAction  # argparse gives it no public name
+from worldstate.ground.errors import InvalidArgumentError, WorldstateError
+from worldstate.ground.extras import check_extra
+from worldstate.ground.version import __version__
+
+from .output import CommandResult, print_result
+
+_WIDTH = 80  # of the overview, characters
+_HELP = "-h", "--help"
 
 
-def add_command(subparsers: "Subparsers[argparse.ArgumentParser]", module: ModuleType) -> None:
-    """Declare the command of a module, with --json.
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A program and its commands.
 
-    Its documentation is "`worldstate [GROUP] NAME`: summary.", an empty line, and the description; it has
-    `EXAMPLE`, `add_options` and `run`, and `NEEDS`, the optional modules without which it does nothing.
+    The documentation of a command's module is "`PROGRAM [GROUP] NAME`: summary.", an empty line, and the
+    description; the module has `EXAMPLE`, `add_options` and `run`, and `NEEDS`, the optional modules without
+    which it does nothing. Where it has `FIRST_OPTIONS`, `--help` shows those and the first paragraph only,
+    and `--help-all` everything.
     """
+
+    name: str
+    description: str
+    epilog: str
+    commands: Mapping[str, str]  # The words of a command to its module
+    groups: Mapping[str, str] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()  # Left out of the overview
+
+    def called(self, words: Sequence[str]) -> str | None:
+        """Return the words of the command that a call names, None where it names none."""
+        return next((name for n in (2, 1) if (name := " ".join(words[:n])) in self.commands), None)
+
+    def members(self, group: str) -> list[str]:
+        """Return the names of the commands of a group that are not hidden; of "" those that stand alone."""
+        split = (words.rpartition(" ") for words in self.commands if words not in self.hidden)
+        return [name for home, _, name in split if home == group]
+
+    def parser(self, called: str) -> "CommandParser":
+        """Return the parser of one command, the only one whose module is imported."""
+        return CommandParser(f"{self.name} {called}", import_module(self.commands[called]))
+
+    def overview(self, group: str | None = None) -> str:
+        """Return the commands, or those of a group, in one line each."""
+        if group is not None:
+            return f"usage: {self.name} {group} COMMAND ...\n\n{self._listed(group)}"
+        lists = [self._listed(home) for home in ("", *self.groups)]
+        usage = f"usage: {self.name} COMMAND ..., {self.name} COMMAND --help, {self.name} --version"
+        return "\n".join([usage, "", self.description, "", *lists, "", self.epilog])
+
+    def _listed(self, group: str) -> str:
+        lines = [f"{group}: {self.groups[group]}"] if group else ["commands:"]
+        for name in self.members(group):
+            words = f"{group} {name}".strip()
+            summary, _ = _documentation(import_module(self.commands[words]))
+            lines += textwrap.wrap(f"  {words:<16} {summary}", _WIDTH, subsequent_indent=" " * 19)
+        return "\n".join(lines)
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Parser of one command, with --json."""
+
+    def __init__(self, program: str, module: ModuleType) -> None:
+        _, description = _documentation(module)
+        super().__init__(
+            program,
+            description=description,
+            epilog=module.EXAMPLE,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        self.first: tuple[str, ...] = getattr(module, "FIRST_OPTIONS", ())
+        self.add_argument("--json", action="store_true", help="print the result as one JSON object")
+        if self.first:
+            self.add_argument("--help-all", action=_HelpAll, nargs=0, help="show every option and exit")
+        self.set_defaults(run=module.run, needs=getattr(module, "NEEDS", ()))
+        module.add_options(self)
+
+    def format_help(self) -> str:
+        """Return the help; only the first options and the first paragraph where there are many."""
+        if not self.first:
+            return super().format_help()
+        shown = {*self.first, *_HELP, "--json", "--help-all"}
+        hidden = [one for one in self._actions if one.option_strings and not shown & {*one.option_strings}]
+        told, description = [one.help for one in hidden], self.description or ""
+        self.description = description.partition("\n\n")[0]
+        for one in hidden:
+            one.help = argparse.SUPPRESS
+        try:
+            return super().format_help()
+        finally:
+            self.description = description
+            for one, text in zip(hidden, told, strict=True):
+                one.help = text
+
+
+class _HelpAll(argparse.Action):
+    """Prints the help of every option."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *rest: object) -> None:
+        print(argparse.ArgumentParser.format_help(parser), end="")
+        parser.exit()
+
+
+def _documentation(module: ModuleType) -> tuple[str, str]:
+    """Return the summary and the description of a command."""
     head, _, description = (module.__doc__ or "").partition("\n\n")
-    called, _, summary = head.removeprefix("`").partition("`: ")
-    name = called.split()[-1]
-    parser = subparsers.add_parser(
-        name,
-        help=summary.removesuffix("."),
-        description=description.strip(),
-        epilog=module.EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    parser.set_defaults(run=module.run, needs=getattr(module, "NEEDS", ()))
-    module.add_options(parser)
+    return head.partition("`: ")[2].removesuffix("."), description.strip()
 
 
 def add_choice(parser: argparse.ArgumentParser, option: str, help_text: str, *choices: str) -> None:
     """Declare an option that takes one of several words; the first is the default, which the help names."""
     told = f"{help_text} (default: {choices[0]})".strip()
     parser.add_argument(option, choices=choices, default=choices[0], help=told)
+
+
+def run_program(
+    program: Program,
+    words: Sequence[str],
+    *,
+    current: Callable[[Sequence[str]], Sequence[str]] = tuple,
+    prepare: Callable[[CommandParser], None] = lambda parser: None,
+) -> int:
+    """Run one command; return its exit code: 0, or 2 and one line on standard error for bad input.
+
+    `current` replaces former words of a call, `prepare` adds options to the parser of every command.
+    """
+    try:
+        with _orderly_termination():
+            code = _execute(program, current(words), prepare)
+            sys.stdout.flush()
+            return code
+    except WorldstateError as error:
+        return _refused(str(error))
+    except BrokenPipeError:
+        # Else the interpreter writes what is left to the closed pipe once more, and complains.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _refused(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except MemoryError:
+        return _refused("expected more memory than this machine has left")
+    except KeyboardInterrupt:
+        return 130
+
+
+def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandParser], None]) -> int:
+    """Run the command that is called and print what it found; return its exit code."""
+    called = program.called(words)
+    if called is None:
+        return _without_command(program, [*words, ""])
+    parser = program.parser(called)
+    prepare(parser)
+    arguments = parser.parse_args(words[len(called.split()) :])
+    check_extra(*arguments.needs)
+    result: CommandResult = arguments.run(arguments)
+    print_result(result, as_json=arguments.json)
+    return result.code
+
+
+def _without_command(program: Program, words: Sequence[str]) -> int:
+    """Print the version or the overview; refuse a word that is no command."""
+    first, second = words[:2] if len(words) > 1 else (words[0], "")
+    group = first if first in program.groups else None
+    if first in _HELP or (group and second in _HELP):
+        print(program.overview(group))
+        return 0
+    if first == "--version":
+        print(program.name, __version__)
+        return 0
+    named = program.members(group) if group else [*program.members(""), *program.groups]
+    got = f", got {second if group else first}" if (second if group else first) else ""
+    raise InvalidArgumentError(f"{group or 'command'}: expected one of {', '.join(named)}{got}")
+
+
+@contextmanager
+def _orderly_termination() -> Iterator[None]:
+    """Turn SIGTERM into an exception, so that unfinished files are removed on the way out; exit code 143."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise SystemExit(128 + number)
+
+
+def _refused(problem: str) -> int:
+    """Print one line on standard error; return exit code 2."""
+    line = " ".join(problem.split())
+    print(f"worldstate: {line}", file=sys.stderr)
+    return 2
