@@ -274,7 +274,7 @@ def test_a_full_standard_output_is_one_line():
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():
-    line = " ".join([*COMMAND, "bounds", "--json"])
+    line = " ".join([*COMMAND, "array", "bounds", "--json"])
     done = subprocess.run(
         ["bash", "-c", f"{line} | true; exit ${{PIPESTATUS[0]}}"], capture_output=True, check=False
     )
