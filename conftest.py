@@ -67,6 +67,7 @@ def approach(tmp_path_factory) -> Approach:
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory):
     """The folder of a smoke evaluation, and its report."""
+
     out = tmp_path_factory.mktemp("evaluation")
     # Five pools would import the library in two processes each: the second run in test_evaluate has pools.
     assert study(["table", "--smoke", "--jobs", "1", "--out", str(out)]) == 0

@@ -12,7 +12,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from worldstate_lab.degradation.beta_curves import absence_counts, counts_table
 from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, Condition, all_conditions
-from worldstate_lab.degradation.degradation_report import degradation_lines, degradation_record
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate_lab.degradation.looks import (
     READINGS,
@@ -28,8 +27,12 @@ from worldstate_lab.degradation.stream_sweep import (
     STATES,
     missed,
     staged_advisories,
-    stream_lines,
     stream_sweep,
+)
+from worldstate_lab.evaluation.report.degradation_section import (
+    degradation_record,
+    stream_table,
+    sweep_tables,
 )
 from worldstate_lab.trials.engine import Engine
 from worldstate_lab.trials.pass_cache import PassCache
@@ -284,7 +287,7 @@ def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
     assert by_name["off"].onsets == 0 and by_name["off"].upper_90 == pytest.approx(np.log(10.0) / 0.5)
     assert any(
         line.startswith("lens 1") and "2.00 [2.00, 2.00]" in " ".join(line.split())
-        for line in stream_lines(sweep)
+        for line in stream_table(sweep).lines()
     )
 
 
@@ -407,5 +410,5 @@ def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recor
     values = json.loads(json.dumps(degradation_record(first), allow_nan=False))
     assert values["detectors"]["mog2"]["rows"][0]["awareness"] == list(sweep.awareness.rows[0].awareness)
     assert values["skipped"].keys() == {broken.recording_id}
-    assert any(line.startswith("noise 0.75") for line in degradation_lines(first))
+    assert any(line.startswith("noise 0.75") for table in sweep_tables(first) for line in table.lines())
     assert sweep.least_vision.vision.value <= 0.05 < 0.5 < sweep.awareness.row(CLEAN).vision.value

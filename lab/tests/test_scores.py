@@ -358,16 +358,6 @@ def test_sites_stand_beside_the_worst_of_them():
     assert score.worst_sites()["false_alarms_per_hour"] == ("SC1", 0.0)
 
 
-def test_strata_keep_the_degraded_recordings_apart():
-    clean, dirty = made_up("a", "left"), made_up("b", "left", degraded=True)
-    answers = [alarmed(clean, [(4.0, 4.2)]), alarmed(dirty, [])]
-    strata = Score.of([clean, dirty], [answers]).strata()
-    assert strata["occluded"]["detection"] == 0.5
-    assert strata["vision-degraded"]["detection"] == 0.0
-    assert strata["clear"]["hazard_awareness"] == 1.0
-    assert "detection" not in strata["clear"]
-
-
 def test_what_a_method_does_not_state_is_not_there():
     trials = [made_up("a", "left"), made_up("c")]
     score = Score.of(trials, [[alarmed(one, []) for one in trials]])

@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 import soundfile
+from worldstate_lab.cli.main import main
 
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.simulation.dataset.dataset import write_dataset
@@ -61,7 +61,7 @@ def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, cap
     broken[0].write_bytes(broken[0].read_bytes()[:-1000])
     write_array_xml(tmp_path / "array.xml", ovad_array())
     more = ["--hazard-free", *map(str, broken), "--against", str(out)]
-    assert main(["evaluate", "--smoke", "--jobs", "2", "--out", str(out), *more]) == 0
+    assert main(["table", "--smoke", "--jobs", "2", "--out", str(out), *more]) == 0
     again = json.loads((out / "evaluation.json").read_text())
     assert {path: path.stat().st_mtime_ns for path in (out / "cache").rglob("*.npz")} == kept
     assert again["protocols"] == report["protocols"]
@@ -88,7 +88,7 @@ def test_a_stream_of_the_same_quiet_recordings_can_be_added(smoke, tmp_path):
     (tmp_path / "array.xml").write_bytes((out / "smoke" / "array.xml").read_bytes())
     more = ["--hazard-free", str(tmp_path / "quiet.wav"), "--out", str(tmp_path / "out")]
     features = next((out / "cache").glob("windows-*.csv"))
-    assert main(["evaluate", str(out / "smoke"), "--features", str(features), *more]) == 0
+    assert main(["table", str(out / "smoke"), "--features", str(features), *more]) == 0
     found = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     before = report["protocols"]["static"]["published"]["hazard_free_hours"]
     # The stream has no edges: it is scored from its first second to its last.
@@ -100,12 +100,12 @@ def test_partial_data_are_refused_with_what_is_missing(smoke, tmp_path, capsys):
     broken = tmp_path / "broken"
     shutil.copytree(out / "smoke", broken, ignore=shutil.ignore_patterns("out_multi.wav"))
     started = time.monotonic()
-    assert main(["evaluate", str(broken), "--out", str(tmp_path / "no")]) == 2
+    assert main(["table", str(broken), "--out", str(tmp_path / "no")]) == 2
     said = capsys.readouterr().err
     assert said.count("out_multi.wav") == 4 and "4 things are missing" in said
-    assert main(["evaluate", str(tmp_path), "--out", str(tmp_path / "no")]) == 2
+    assert main(["table", str(tmp_path), "--out", str(tmp_path / "no")]) == 2
     assert "DataLog.csv" in capsys.readouterr().err
-    assert main(["evaluate", str(broken), "--stage-streams", "--out", str(tmp_path / "no")]) == 2
+    assert main(["table", str(broken), "--stage-streams", "--out", str(tmp_path / "no")]) == 2
     assert "expected streams with --hazard-free" in capsys.readouterr().err
     assert time.monotonic() - started < 10.0
     assert not (tmp_path / "no" / "cache").exists()
@@ -119,7 +119,7 @@ def test_streets_whose_simulation_was_interrupted_are_completed(smoke, tmp_path)
     shutil.copytree(out / "cache", again / "cache")
     log = again / "smoke" / "DataLog.csv"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:-1]))
-    assert main(["evaluate", "--smoke", "--out", str(again)]) == 0
+    assert main(["table", "--smoke", "--out", str(again)]) == 0
     found = json.loads((again / "evaluation.json").read_text())
     assert found["recordings"] == report["recordings"]
     assert found["protocols"] == report["protocols"]
@@ -135,7 +135,7 @@ def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys
     whole = sound.read_bytes()
     sound.unlink()
     sound.write_bytes(whole[: len(whole) // 2])
-    assert main(["evaluate", "--smoke", "--out", str(tmp_path)]) == 2
+    assert main(["table", "--smoke", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "2 approaches with a T0, found 1" in said
     assert f"not heard: {sound.parent.name}: " in said and "cut short" in said
@@ -152,7 +152,7 @@ def test_a_cluster_gives_the_same_figures(smoke, tmp_path, monkeypatch):
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
         monkeypatch.chdir(tmp_path)
         there = ["--engine", "dask", "--scheduler", workers.scheduler_address]
-        assert main(["evaluate", "--smoke", "--out", "again", *there]) == 0
+        assert main(["table", "--smoke", "--out", "again", *there]) == 0
     found = json.loads((tmp_path / "again" / "evaluation.json").read_text())
     assert found.pop("against") == []
     assert found == {name: value for name, value in report.items() if name != "against"}
@@ -167,7 +167,7 @@ def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
     cut, two = (next(root.glob(f"SB1/{side}/*/out_multi.wav")) for side in ("left", "none"))
     cut.write_bytes(cut.read_bytes()[:5_000_000])
     soundfile.write(two, np.zeros((48_000, 2)), 47_998, subtype="PCM_24")
-    assert main(["evaluate", str(root), "--out", str(out)]) == 0
+    assert main(["table", str(root), "--out", str(out)]) == 0
     found = json.loads((out / "evaluation.json").read_text())
     assert set(found["failed"]) == {cut.parent.name, two.parent.name}
     assert found["recordings"] == found["stands_on"]["static"]["recordings"] == 4
@@ -182,6 +182,6 @@ def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
     # A model that is named is refused at once: somebody asked for it.
     save_model(tmp_path / "model.json", read_model())
     model = ["--model", str(tmp_path / "model.json")]
-    assert main(["evaluate", str(root), "--out", str(tmp_path / "no"), *model]) == 2
+    assert main(["table", str(root), "--out", str(tmp_path / "no"), *model]) == 2
     said = capsys.readouterr().err
     assert "not the array of the model" in said and "--uncalibrated" not in said

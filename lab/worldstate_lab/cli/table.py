@@ -40,12 +40,13 @@ from worldstate.cli.common.outputs import output_folder
 from worldstate.cli.common.progress import Bar, progress_bar
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from worldstate.operations.recordings.hop_table import HopTable
     from worldstate_lab.degradation.degradation_study import DegradationSettings
     from worldstate_lab.evaluation.against import Comparison
     from worldstate_lab.evaluation.evaluation import Evaluation
-    from worldstate_lab.evaluation.operating_curve import EqualDetection
-    from worldstate_lab.evaluation.scores import Score
+    from worldstate_lab.report.table import Cell, Table
     from worldstate_lab.signatures.signature_study import SignatureStudy
     from worldstate_lab.trials.classification import Classifiers
     from worldstate_lab.trials.takes import TakeList
@@ -68,8 +69,9 @@ PASSAGES = 6
 # What two evaluations must have in common for their figures to be comparable.
 COMPARABLE = {"alpha": 0.02, "longest_lead_s": 5.0}
 # Where the work is done and what is printed of it.
-_NO_FIGURE = ("run", "json", "results", "dataset", "out", "jobs", "engine", "scheduler", "against")
+_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "engine", "scheduler", "against")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
+SHOWN = ("lead_s", "detection", "random_detection", "bearing_deg")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -131,7 +133,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         )
     save_scores(arguments.out, found.scores, COMPARABLE)
     compared = _compared(arguments)
-    report = _report(found) | {"against": [_difference(one) for one in compared]}
+    report = _report(found, compared)
     write_report(arguments.out / "evaluation.json", report)
     signatures = None if arguments.smoke else _signatures(arguments)
     write_document(evaluation_document(found, signatures, _configuration(arguments)), arguments.out)
@@ -231,7 +233,7 @@ def _told(value: object) -> str:
     return "none" if value is None else value.name if isinstance(value, Path) else str(value)
 
 
-def _compared(arguments: argparse.Namespace) -> "tuple[Comparison, ...]":
+def _compared(arguments: argparse.Namespace) -> "Sequence[Comparison]":
     import numpy as np
 
     from worldstate_lab.evaluation.against import compare
@@ -247,18 +249,16 @@ def _difference(one: "Comparison") -> dict[str, object]:
     return {"protocol": one.protocol, "method": one.method, "shared": one.shared, "differences": known}
 
 
-def _against_lines(compared: "tuple[Comparison, ...]") -> list[str]:
-    """Show the differences of the main figures to the other evaluation, with their intervals."""
-    lines = []
-    for one in compared:
-        shown = [
-            f"{name} {ours:+.3g} [{low:+.3g}, {high:+.3g}]"
-            for name in COMPARED
-            for ours, low, high in (one.differences[name],)
-            if ours == ours
-        ]
-        lines.append(f"{one.protocol}, {one.method}, {one.shared} shared: {'; '.join(shown) or 'nothing'}")
-    return ["", "less the other evaluation:", *lines] if lines else []
+def _against_lines(compared: "Sequence[Comparison]") -> list[str]:
+    """Return the differences of the main figures to the other evaluation, with their intervals."""
+    from worldstate_lab.report.table import Table, Value
+
+    rows: list[tuple[Cell, ...]] = [
+        (one.protocol, one.method, one.shared, *(Value(*one.differences[name]) for name in COMPARED))
+        for one in compared
+    ]
+    table = Table("against", "less the other evaluation:", ("protocol", "method", "shared", *COMPARED), rows)
+    return ["", *table.lines()] if rows else []
 
 
 class _Bars:
@@ -359,84 +359,64 @@ def _classifiers(arguments: argparse.Namespace, takes: "TakeList") -> "Classifie
     return Classifiers(*(found or (None, "the calibration recordings of each fold")))
 
 
-def _report(found: "Evaluation") -> dict[str, object]:
-    import math
-    from dataclasses import asdict
+def _report(found: "Evaluation", compared: "Sequence[Comparison]") -> dict[str, object]:
+    from worldstate_lab.evaluation.report.degradation_section import degradation_record
+    from worldstate_lab.report.table import plain
 
-    from worldstate_lab.degradation.degradation_report import degradation_record
-    from worldstate_lab.degradation.stream_sweep import stream_record
-
-    def known(values: "dict[str, float]") -> dict[str, float | None]:
-        return {name: value if math.isfinite(value) else None for name, value in values.items()}
-
-    return {
-        "data": found.takes.origin,
-        "recordings": len(found.trials),
-        "failed": {one.name: one.problem for one in found.failed},
-        "stands_on": {name: run.stands_on for name, run in found.runs.items()},
-        "refused": {name: refused for name, refused in found.refused.items() if refused},
-        "lacking": dict(found.lacking),
-        "cautions": {name: run.cautions for name, run in found.runs.items()},
-        "protocols": {
-            name: {
-                method: known(score.figures() | {"false_alarms_upper_90": score.poisson_upper()})
-                for method, score in scores.items()
-            }
-            for name, scores in found.scores.items()
-        },
-        "equal_detection": {
-            name: [known(asdict(one)) for one in every] for name, every in found.equal.items()
-        },
-        "degradation": None if found.degradation is None else degradation_record(found.degradation),
-        "staged_streams": None if found.staged is None else stream_record(found.staged),
-        "front_end": None if found.front_end is None else known(dict(found.front_end.figures)),
-    }
+    report: dict[str, object] = plain(
+        {
+            "data": found.takes.origin,
+            "recordings": len(found.trials),
+            "failed": {one.name: one.problem for one in found.failed},
+            "stands_on": {name: run.stands_on for name, run in found.runs.items()},
+            "refused": {name: refused for name, refused in found.refused.items() if refused},
+            "lacking": found.lacking,
+            "cautions": {name: run.cautions for name, run in found.runs.items()},
+            "protocols": {
+                name: {
+                    method: score.figures() | {"false_alarms_upper_90": score.poisson_upper()}
+                    for method, score in scores.items()
+                }
+                for name, scores in found.scores.items()
+            },
+            "equal_detection": found.equal,
+            "degradation": None if found.degradation is None else degradation_record(found.degradation),
+            "staged_streams": found.staged,
+            "front_end": None if found.front_end is None else found.front_end.figures,
+            "against": [_difference(one) for one in compared],
+        }
+    )
+    return report
 
 
 def _lines(found: "Evaluation") -> list[str]:
-    from worldstate_lab.degradation.degradation_report import degradation_lines
-    from worldstate_lab.degradation.stream_sweep import stream_lines
+    from worldstate_lab.evaluation.report.degradation_section import stream_table, sweep_tables
+    from worldstate_lab.evaluation.report.warning_sections import equal_table
 
     lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
-    for name, scores in found.scores.items():
-        run = found.runs[name]
-        hours = next(iter(scores.values())).figures()["hazard_free_hours"]
-        head = f"{run.protocol.title}: {len(run.trials)} recordings, {hours:.3f} h of them hazard-free"
-        lines += ["", head, *run.cautions]
-        lines.append(
-            f"{'':36}{'lead s':>8}{'detected':>10}{'random':>8}{'FA/h':>8}{'(95 %)':>14}{'< (90 %)':>10}"
-            f"{'bearing deg':>13}"
-        )
-        lines += [_row(name, score) for name, score in scores.items() if not name.startswith("curve")]
-        lines += [_equal_line(one) for one in found.equal.get(name, ())]
+    tables = [] if found.degradation is None else sweep_tables(found.degradation)
+    tables += [] if found.staged is None else [stream_table(found.staged)]
+    for name, run in found.runs.items():
         refused = found.refused.get(name, {})
-        lines += [f"{method:36}not scored" for method in refused]
-        lines += [f"not scored: {why}" for why in dict.fromkeys(refused.values())]
-    lines += [] if found.degradation is None else degradation_lines(found.degradation)
-    return lines if found.staged is None else [*lines, *stream_lines(found.staged)]
+        lines += ["", *_warnings(found, name).lines(), *run.cautions]
+        lines += [f"not scored: {method}: {why}" for method, why in refused.items()]
+        lines += equal_table(found, name).lines() if found.equal.get(name) else []
+    return [*lines, *(line for table in tables for line in ("", *table.lines()))]
 
 
-def _equal_line(one: "EqualDetection") -> str:
-    """Say what the two ways to warn cost where both detect as much, each at its best threshold."""
-    return (
-        f"where both detect {one.detected:.2f}, alarms an hour: world-state {one.ours:.0f}, "
-        f"published, sustained {one.baseline:.0f}; ratio {one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}]"
-    )
+def _warnings(found: "Evaluation", protocol: str) -> "Table":
+    """Return the warning figures of every method, with the exact interval of its false alarms."""
+    from worldstate_lab.evaluation.figures import FIGURES
+    from worldstate_lab.report.table import Table, Value
 
-
-def _row(method: str, score: "Score") -> str:
-    figures, (low, high) = score.figures(), score.poisson()
-    forms = {
-        "lead_s": ".2f",
-        "detection": ".2f",
-        "random_detection": ".2f",
-        "false_alarms_per_hour": ".0f",
-        "bearing_deg": ".1f",
-    }
-    lead, detected, random, alarms, bearing = (
-        "-" if figures[name] != figures[name] else format(figures[name], form) for name, form in forms.items()
-    )
-    interval = f"[{low:.0f}, {high:.0f}]" if low == low else "-"
-    upper = f"{score.poisson_upper():.0f}" if low == low else "-"
-    return f"{method:36}{lead:>8}{detected:>10}{random:>8}{alarms:>8}{interval:>14}{upper:>10}{bearing:>13}"
+    rows: list[tuple[Cell, ...]] = []
+    for method, score in found.scores[protocol].items():
+        if not method.startswith("curve"):
+            figures = score.figures()
+            cells = [Value(figures[name], digits=FIGURES[name].digits) for name in SHOWN]
+            rate = Value(figures["false_alarms_per_hour"], *score.poisson(), digits=0)
+            rows.append((method, *cells, rate, Value(score.poisson_upper(), digits=0)))
+    run = found.runs[protocol]
+    heads = ("method", *(FIGURES[name].title for name in SHOWN), "false alarms (1/h)", "at most (90 %)")
+    return Table("warnings", f"{run.protocol.title}: {run.basis}", heads, rows)

@@ -5,11 +5,9 @@ camera are staged instead: each is left out as often as the table of miss rates 
 the camera states. The rain on the roof is staged on the sound, as on filmed recordings.
 """
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -96,33 +94,6 @@ def _row(at: int, onsets: FloatArray, drawn: FloatArray, hours: float) -> FalseA
     return FalseAdvisories(
         STATES[at].name, count, rate, poisson_upper(count, hours), Estimate(share, *middle(shares))
     )
-
-
-def stream_record(sweep: StreamSweep) -> dict[str, Any]:
-    """Return everything that was found, ready for JSON; null where there is nothing to divide by."""
-    rows = [{**asdict(row), "ratio": [_known(one) for one in row.ratio]} for row in sweep.rows]
-    return {"hours": sweep.hours, "rows": rows}
-
-
-def stream_lines(sweep: StreamSweep) -> list[str]:
-    """Return a table, one row a state."""
-    head = f"advisories while the camera fails and it rains, {sweep.hours:.2f} h of streams without hazards"
-    lines = [
-        "",
-        head,
-        f"{'':16}{'onsets':>8}{'1/h':>8}{'(95 %)':>14}{'< (90 %)':>10}{'to clean':>10}{'(95 %)':>16}",
-    ]
-    for row in sweep.rows:
-        rate, share = row.per_hour, row.ratio
-        lines.append(
-            f"{row.name:16}{row.onsets:>8d}{rate.value:>8.1f}{f'[{rate.low:.1f}, {rate.high:.1f}]':>14}"
-            f"{row.upper_90:>10.1f}{share.value:>10.2f}{f'[{share.low:.2f}, {share.high:.2f}]':>16}"
-        )
-    return lines
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _by_minute(advised: BoolArray) -> FloatArray:

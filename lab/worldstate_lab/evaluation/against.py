@@ -46,8 +46,6 @@ class Comparison:
     protocol: str
     method: str
     shared: int  # Recordings of the same name, junction and content
-    only_ours: int
-    only_other: int
     # Figure: ours less the other's, and the middle 95 % over draws of the shared recordings.
     differences: Mapping[str, tuple[float, float, float]]
 
@@ -123,8 +121,6 @@ def _compare(a: SavedScore, b: SavedScore, rng: np.random.Generator, draws: int)
         protocol=a.protocol,
         method=a.method,
         shared=len(rows),
-        only_ours=len(a.score.recordings) - len(rows),
-        only_other=len(b.score.recordings) - len(rows),
         differences=paired_on(a.score, b.score, rows, others, samples),
     )
 

@@ -32,6 +32,15 @@ class ProtocolRun:
         return {**counts, "hazard_free": len(calm), "hazard_free_hours": sum(calm) * HOP_S / SECONDS_PER_HOUR}
 
     @property
+    def basis(self) -> str:
+        """What the figures stand on, as a sentence."""
+        of = self.stands_on
+        return (
+            f"{of['recordings']:.0f} recordings: {of['approaches']:.0f} approaches and "
+            f"{of['hazard_free']:.0f} hazard-free, {of['hazard_free_hours']:.3f} h."
+        )
+
+    @property
     def cautions(self) -> tuple[str, ...]:
         """What to say beside figures from so few approaches or hazard-free recordings."""
         calm = sum(trial.hazard_free for trial in self.trials)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable, joined
 from worldstate_lab.evaluation import reduction
+from worldstate_lab.evaluation.figures import FIGURES
 from worldstate_lab.metrics.intervals import (
     draw_weights,
     highest_share,
@@ -32,27 +32,7 @@ from worldstate_lab.trials.trial import Decisions, Trial
 Interval = tuple[float, float]
 
 _HOURS = HOP_S / SECONDS_PER_HOUR
-# Figure: numerator, denominator and unit of a ratio of sums over recordings; see `reduction`. A mean of the
-# rates of single recordings would let one of ten seconds weigh as much as a stream of an hour.
-_RATIOS = {
-    "detection": ("detected", "approaches", 1.0),
-    "lead_s": ("lead_s", "detected", 1.0),
-    "lead_missed_zero_s": ("lead_s", "approaches", 1.0),
-    "early_onsets_per_approach": ("early_onsets", "approaches", 1.0),
-    "side_correct": ("side_right", "sided", 1.0),
-    "false_alarms_per_hour": ("free_onsets", "free_hops", 1.0 / _HOURS),
-    "advisory_share": ("free_alarm_hops", "free_hops", 1.0),
-    "hazard_awareness": ("aware_hops", "clear_hops", 1.0),
-    # The challenge's means are of recordings, so here each recording with a vehicle in view counts once.
-    "id_switches_per_recording": ("id_switches", "tracked", 1.0),
-    "fragmentations_per_recording": ("fragmentations", "tracked", 1.0),
-    "swap_rate_hz": ("swap_rate_hz", "tracked", 1.0),
-    "fragmentation_rate_hz": ("fragmentation_rate_hz", "tracked", 1.0),
-    "track_latency_s": ("track_latency_s", "tracked", 1.0),
-    "azimuth_error_deg": ("azimuth_error_rad", "matched", np.degrees(1.0)),
-    "gospa_deg": ("gospa_rad", "gospa_hops", np.degrees(1.0)),
-    "visible_coverage": ("visible_inside", "visible_intervals", 1.0),
-}
+_RATIOS = {name: (*kind.counts, kind.unit) for name, kind in FIGURES.items() if kind.counts}
 # What one recording adds; a count that it does not have is zero.
 COUNTS = (
     *dict.fromkeys(name for ratio in _RATIOS.values() for name in ratio[:2]),
@@ -61,21 +41,6 @@ COUNTS = (
     *("squared_error", "visible_hops", "visible_squared", "visible_true", "visible_true_squared"),
 )
 _RISK, _RAW = 0, 1
-# Measured after T0 with a vehicle in view; the other figures are of the time before it or without any.
-_CLEAR = (
-    *("hazard_awareness", "bearing_deg", "bearing_gated_deg", "gospa_deg", "azimuth_error_deg"),
-    *("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz"),
-    *("fragmentation_rate_hz", "track_latency_s"),
-)
-# Whether the greater or the smaller value is the worse one, where junctions are compared.
-_WORSE: dict[str, Literal["low", "high"]] = {
-    **dict.fromkeys(("detection", "lead_s", "lead_missed_zero_s", "side_correct", "hazard_awareness"), "low"),
-    **dict.fromkeys(("auroc_all", "auroc_2s", "auroc_1s", "brier_skill", "visible_coverage"), "low"),
-    **dict.fromkeys(("false_alarms_per_hour", "advisory_share", "early_onsets_per_approach"), "high"),
-    **dict.fromkeys(("bearing_deg", "bearing_gated_deg", "azimuth_error_deg", "gospa_deg"), "high"),
-    **dict.fromkeys(("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz"), "high"),
-    **dict.fromkeys(("fragmentation_rate_hz", "track_latency_s", "visible_error_s"), "high"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +50,12 @@ class Scored:
     name: str
     label: str
     site: str
-    degraded: bool = False  # Whether its images were
     fingerprint: str = ""  # Of its content
 
     @classmethod
     def of(cls, trial: Trial) -> "Scored":
         """Return the row of a trial."""
-        about = trial.hops.about
-        degraded, fingerprint = bool(about.get("degraded", False)), str(about.get("fingerprint", ""))
-        return cls(trial.name, trial.label, trial.site, degraded, fingerprint)
+        return cls(trial.name, trial.label, trial.site, str(trial.hops.about.get("fingerprint", "")))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,19 +167,10 @@ class Score:
         """Return the worst junction and its value, of figures with a better and a worse end."""
         sites = self.by_site()
         return {
-            name: worst_group({site: figures[name] for site, figures in sites.items()}, worse)
-            for name, worse in _WORSE.items()
+            name: worst_group({site: figures[name] for site, figures in sites.items()}, kind.worse)
+            for name, kind in FIGURES.items()
+            if kind.worse
         }
-
-    def strata(self) -> dict[str, dict[str, float]]:
-        """Return the figures before T0, after it in view, and of recordings with degraded images."""
-        figures = self.figures()
-        degraded = np.array([row for row, one in enumerate(self.recordings) if one.degraded], np.intp)
-        strata = {
-            "clear": {name: figures[name] for name in _CLEAR},
-            "occluded": {name: value for name, value in figures.items() if name not in _CLEAR},
-        }
-        return strata | ({"vision-degraded": self.figures(degraded)} if degraded.size else {})
 
     @property
     def _free(self) -> BoolArray:

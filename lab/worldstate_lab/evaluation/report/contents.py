@@ -1,4 +1,4 @@
-"""From the result of an evaluation to the document that tells it."""
+"""The report of an evaluation: its sections in order, what was evaluated, and on which versions."""
 
 import platform
 from collections import Counter
@@ -10,16 +10,16 @@ import sklearn
 
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.protocols import PROTOCOLS, STATIC
+from worldstate_lab.evaluation.protocols import PROTOCOLS, STATIC, Protocol
 from worldstate_lab.evaluation.report import study_sections as study
 from worldstate_lab.evaluation.report import warning_sections as warning
 from worldstate_lab.report.document import Document, Section
-from worldstate_lab.report.table import Table, Value
+from worldstate_lab.report.table import Cell, Table
 from worldstate_lab.signatures.signature_study import SignatureStudy
 from worldstate_lab.trials.hearing import data_fingerprint
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
-from .measured_values import Values, measured_values
+from .measured_values import MeasuredValues
 
 
 def evaluation_document(
@@ -28,29 +28,26 @@ def evaluation_document(
     configuration: Sequence[tuple[str, str]] = (),
 ) -> Document:
     """Return the whole report; sections that nothing was measured for say so, and the options end it."""
-    values = measured_values(
-        found,
-        ({} if found.degradation is None else sweep_values(found.degradation))
-        | ({} if signatures is None else study.signature_values(signatures)),
-    )
+    others = {} if found.degradation is None else sweep_values(found.degradation)
+    others |= {} if signatures is None else study.signature_values(signatures)
+    measured = MeasuredValues.of(found, others)
     panels = () if found.degradation is None else awareness_figures(found.degradation)
     static = STATIC.name in found.runs
     sections = [
-        _data_section(found, values),
-        *((warning.table_i(found, values), warning.budget_section(found, values)) if static else ()),
-        *((warning.cueing_section(found, values, panels), warning.approach_section(found)) if static else ()),
-        study.front_end_section(found, values),
-        study.approach_rate_section(values),
-        study.transfer_section(found, values),
+        _data_section(found),
+        *((warning.table_i(measured), warning.budget_section(measured)) if static else ()),
+        *((warning.cueing_section(measured, panels), warning.approach_section(found)) if static else ()),
+        study.front_end_section(measured),
+        study.approach_rate_section(measured),
+        study.transfer_section(measured),
         degradation_section(
             found.degradation, found.lacking.get("degradation sweep", "not asked for"), found.staged
         ),
-        *((study.ablation_section(found, values),) if static else ()),
+        *((study.ablation_section(measured),) if static else ()),
         study.signature_section(signatures),
-        *((warning.tracking_section(found, values),) if static else ()),
-        *((warning.strata_section(found, values),) if static else ()),
+        *((warning.tracking_section(measured), warning.strata_section(measured)) if static else ()),
         warning.difference_section(found),
-        study.paper_section(found, values),
+        study.paper_section(measured),
     ]
     return Document(
         "Evaluation of hidden-hazard warnings from sound",
@@ -64,31 +61,13 @@ def _hours(found: Evaluation) -> float:
     return sum(len(trial.hops) for trial in found.trials if trial.hazard_free) * 0.1 / 3600.0
 
 
-def _data_section(found: Evaluation, values: Values) -> Section:
-    rows = []
-    for protocol in PROTOCOLS:
-        run = found.runs.get(protocol.name)
-        if run is None:
-            rows.append(
-                (protocol.title, "0", "0", Value(np.nan), "", f"not run: {found.lacking[protocol.name]}")
-            )
-            continue
-        approaches = sum(not trial.hazard_free for trial in run.trials)
-        hours = values[protocol.name, warning.PROPOSED, "hazard_free_hours"]
-        told = "; ".join(run.cautions) or "run"
-        counts = str(len(run.trials)), str(approaches)
-        rows.append((protocol.title, *counts, Value(hours.value, digits=3), run.trained_on, told))
-    heads = (
-        "protocol",
-        "recordings",
-        "approaches",
-        "hazard-free (h)",
-        "published classifier trained on",
-        "state",
-    )
-    blocks = [Table("protocols", "Protocols", heads, tuple(rows))]
+def _data_section(found: Evaluation) -> Section:
+    heads = ("protocol", "recordings", "approaches", "hazard-free (h)", "published classifier trained on")
+    blocks = [
+        Table("protocols", "Protocols", (*heads, "state"), [_protocol_row(found, p) for p in PROTOCOLS])
+    ]
     if found.failed:
-        failed = tuple((one.name, one.problem) for one in found.failed)
+        failed = [(one.name, one.problem) for one in found.failed]
         blocks.append(
             Table("skipped", "Recordings that could not be heard", ("recording", "problem"), failed)
         )
@@ -102,14 +81,23 @@ def _data_section(found: Evaluation, values: Values) -> Section:
     strata = Counter((trial.label, trial.site) for trial in found.trials)
     single = sum(count == 1 for count in strata.values())
     intervals = (
-        f"Intervals draw recordings again within side and junction: {single} of {len(strata)} such strata "
-        f"hold a "
-        "single recording, which every draw repeats, so intervals are too narrow by what it would add."
+        f"{single} of {len(strata)} such strata hold a single recording, which every draw repeats, so "
+        "intervals are too narrow by what it would add."
         if single
-        else "Intervals draw recordings again within side and junction; every such stratum holds several."
+        else "Every such stratum holds several."
     )
+    intervals = f"Intervals draw recordings again within side and junction. {intervals}"
     skipped = f"{len(found.failed)} recordings could not be heard and are left out of every figure."
     return Section("What was evaluated", (sound, intervals, skipped), tuple(blocks))
+
+
+def _protocol_row(found: Evaluation, protocol: Protocol) -> tuple[Cell, ...]:
+    run = found.runs.get(protocol.name)
+    if run is None:
+        return protocol.title, "0", "0", None, "", f"not run: {found.lacking[protocol.name]}"
+    of = run.stands_on
+    counts = str(of["recordings"]), str(of["approaches"]), of["hazard_free_hours"]
+    return protocol.title, *counts, run.trained_on, "; ".join(run.cautions) or "run"
 
 
 def _facts(found: Evaluation) -> tuple[tuple[str, str], ...]:

@@ -1,4 +1,4 @@
-"""The four panels of calibrated cueing: ROC by horizon, reliability, operating curve, hazard awareness."""
+"""Three panels of calibrated cueing: ROC by horizon, reliability, operating curve."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,16 +8,13 @@ import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import reliability_curve
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from worldstate.operations.figure_style import GREEN
 from worldstate_lab.report.table import Figure, Value
 
-from .panels import GREY, legend_below, mark_chance, thinned
+from .panels import COLOURS, MARKS, legend_below, mark_chance, thinned
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
-
-_MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
-_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 
 def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -77,7 +74,7 @@ def reliability_figure(
     def draw(canvas: "Canvas") -> None:
         axes, counts = canvas.subplots(2, 1, sharex=True, height_ratios=(1.0, 0.28))
         mark_chance(axes)
-        for (name, curve), mark in zip(curves.items(), _MARKS, strict=False):
+        for (name, curve), mark in zip(curves.items(), MARKS, strict=False):
             axes.plot(
                 curve.predicted,
                 curve.observed,
@@ -124,66 +121,15 @@ def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) 
     def draw(canvas: "Canvas") -> None:
         _draw_operating(canvas, points, max(quantum_per_hour, 1e-3))
 
-    names = ("detection", "false_alarms_per_hour")
-    columns = [f"{name}{part}" for name in names for part in ("", "_low", "_high", "_paper")]
-    rows = [
-        (
-            one.name,
-            "" if one.alpha is None else one.alpha,
-            *_numbers(one.detection),
-            *_numbers(one.false_alarms_per_hour),
-        )
-        for one in points
-    ]
     return Figure(
         "cueing_operating",
         "(c) Detection against achieved false alarms",
         f"Bars are 95 % intervals; open marks are the paper's. One alarm onset is {quantum_per_hour:.3g} "
         "an hour: left of it the axis is linear, right of it logarithmic.",
         draw,
-        ("method", "alpha", *columns),
-        rows,
+        ("method", "alpha", "detection", "false_alarms_per_hour"),
+        [(one.name, one.alpha, one.detection, one.false_alarms_per_hour) for one in points],
         size_in=(4.4, 4.4),
-    )
-
-
-def awareness_figure(
-    families: Mapping[str, Sequence[tuple[Value, Value]]], paper_least: float | None = None
-) -> Figure:
-    """Draw hazard awareness over the measured miss rate beta, one line a family of degradations.
-
-    `families` holds (beta, awareness) by level, the clean camera first.
-    """
-
-    def draw(canvas: "Canvas") -> None:
-        axes = canvas.subplots()
-        axes.plot([0.0, 1.0], [1.0, 0.0], color=GREY, linestyle="--", label=r"vision alone, $1-\beta$")
-        for (name, levels), mark in zip(families.items(), _MARKS, strict=False):
-            beta, aware = zip(*levels, strict=True)
-            x = [one.value for one in beta]
-            (line,) = axes.plot(x, [one.value for one in aware], marker=mark, ms=4, label=name)
-            low, high = [one.low for one in aware], [one.high for one in aware]
-            axes.fill_between(x, low, high, color=line.get_color(), alpha=0.13, lw=0)
-        if paper_least is not None:
-            axes.axhline(paper_least, color="black", linewidth=0.9, linestyle=":", label="paper, least")
-        axes.set(xlabel=r"measured miss rate $\beta$ of the camera", ylabel="hazard awareness after $T_0$")
-        axes.set(xlim=(-0.02, 1.02), ylim=(0.0, 1.03))
-        legend_below(canvas)
-
-    rows = [
-        (name, level, beta.value, aware.value, aware.low, aware.high)
-        for name, levels in families.items()
-        for level, (beta, aware) in enumerate(levels)
-    ]
-    return Figure(
-        "cueing_awareness",
-        "(d) Hazard awareness while the camera fails",
-        "Share of the hops after T0 in which the vehicle is seen or said to be there, over the share that "
-        "the camera misses; level 0 is the clean camera. Bands are 95 % intervals over recordings.",
-        draw,
-        ("family", "level", "miss_rate", "awareness", "awareness_low", "awareness_high"),
-        rows,
-        size_in=(4.4, 4.2),
     )
 
 
@@ -202,7 +148,7 @@ def _draw_operating(canvas: "Canvas", points: Sequence[OperatingPoint], linear: 
         place = one.false_alarms_per_hour.value, one.detection.value
         axes.annotate(f"{one.alpha:g}", place, (-5, 5), textcoords="offset points", ha="right", fontsize=8)
     for i, one in enumerate(others):
-        _mark(canvas, one, _COLOURS[i % len(_COLOURS)], _MARKS[(i + 1) % len(_MARKS)], one.name)
+        _mark(canvas, one, COLOURS[i % len(COLOURS)], MARKS[(i + 1) % len(MARKS)], one.name)
     axes.set(xlabel="false alarms per hazard-free hour", ylabel="approaches detected", ylim=(-0.03, 1.05))
     rates = [one.false_alarms_per_hour for one in points]
     right = np.nanmax([[one.value, one.high] for one in rates] + [[10.0 * linear] * 2])
@@ -217,10 +163,6 @@ def _draw_operating(canvas: "Canvas", points: Sequence[OperatingPoint], linear: 
 
 def _beside(value: Value) -> str:
     return value.text + (f", paper {value.paper.number}" if value.paper else "")
-
-
-def _numbers(one: Value) -> tuple[float, float, float, float]:
-    return one.value, one.low, one.high, one.paper.value if one.paper else float("nan")
 
 
 def _mark(canvas: "Canvas", one: OperatingPoint, colour: str, mark: str, label: str) -> None:

@@ -1,35 +1,29 @@
 """The section on degraded cameras: miss rates, awareness by family and level, and rain as a common cause."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 from worldstate.adapters.camera.degradation import LEVELS
-from worldstate_lab.degradation.awareness import AwarenessRow, Estimate
+from worldstate_lab.degradation.awareness import AwarenessRow
 from worldstate_lab.degradation.beta_curves import Band
 from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
 from worldstate_lab.degradation.stream_sweep import StreamSweep
 from worldstate_lab.evaluation.paper_values import COMMANDS, paper_value
 from worldstate_lab.report.document import Section
-from worldstate_lab.report.table import Cell, Figure, Table, Value
+from worldstate_lab.report.table import Cell, Figure, Table, Value, plain
 
-from .cueing_panels import awareness_figure
+from .camera_panels import awareness_figure, miss_rate_angle_figure, miss_rate_level_figure
 from .measured_values import Place
-from .miss_rate_panels import miss_rate_angle_figure, miss_rate_level_figure
 
 _RATES, _AWARE = "miss rate of the camera", "after line-of-sight entry"
-
 _CONDITION = (
-    "condition",
-    "estimated d",
-    "vision alone (share)",
-    "awareness (share)",
-    "awareness where unseen (share)",
-    "detected before T0 (share)",
-    "lead (s)",
-    "false alarms (1/h)",
-    "false awareness (1/h)",
+    *("condition", "estimated d", "beta", "vision alone (share)", "awareness (share)"),
+    *("awareness where unseen (share)", "detected before T0 (share)", "lead (s)", "false alarms (1/h)"),
+    *("false awareness (1/h)", "false awareness (share)"),
 )
+_RAIN = ("level", "noise (dB)", "lens alone", "roof alone", "rain", "if effects added up", "optimism of (A1)")
 
 
 def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
@@ -46,7 +40,7 @@ def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
         values["beta_20_30_deg"] = _at(beta.by_azimuth, (0, beta.azimuth_deg.index(20.0), 0))
     least = {"awareness_least": first.least_awareness.awareness, "vision_least": first.least_vision.vision}
     rates = {("degradation", _RATES, name): value for name, value in values.items()}
-    return rates | {("degradation", _AWARE, name): _value(one) for name, one in least.items()}
+    return rates | {("degradation", _AWARE, name): Value(*one) for name, one in least.items()}
 
 
 def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
@@ -55,13 +49,10 @@ def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
     figures = []
     for number, sweep in enumerate(study.sweeps, start=1):
         # A condition without a camera is not of a family: the line would have one point.
-        names = dict.fromkeys(
-            r.condition.family for r in sweep.awareness.rows[1:] if r.condition.family != OFF
-        )
-        families = {name: [_point(row) for row in sweep.family(name)] for name in names}
-        figures.append(
-            _of_detector(awareness_figure(families, paper.value if paper else None), sweep, number)
-        )
+        names = dict.fromkeys(row.condition.family for row in sweep.awareness.rows[1:])
+        families = {name: [_point(row) for row in sweep.family(name)] for name in names if name != OFF}
+        figure = awareness_figure(families, paper.value if paper else math.nan)
+        figures.append(_of_detector(figure, sweep, number))
     return tuple(figures)
 
 
@@ -69,7 +60,7 @@ def degradation_section(
     study: DegradationStudy | None, lacking: str, staged: StreamSweep | None = None
 ) -> Section:
     """Return miss rates and awareness of every detector, or what is lacking and what would fill them."""
-    title, streams = "Vision degradation", () if staged is None else (_streams(staged),)
+    title, streams = "Vision degradation", () if staged is None else (stream_table(staged),)
     if study is None:
         told = f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it."
         return Section(title, (told,), streams)
@@ -82,7 +73,7 @@ def degradation_section(
         *(f"{one}." for one in study.missing),
         *(f"Left out: {name}, {why}." for name, why in study.skipped.items()),
     ]
-    # One detector agrees with itself: the sentence would claim what nobody measured.
+    # One detector agrees with itself: the sentence would claim what was not measured.
     if len(study.sweeps) > 1:
         text.append(
             "Between the first and the last detector awareness differs by at most "
@@ -92,20 +83,15 @@ def degradation_section(
     return Section(title, tuple(text), streams, parts)
 
 
-def _streams(sweep: StreamSweep) -> Table:
-    rows = tuple(
-        (
-            row.name,
-            Value(row.onsets, digits=0),
-            replace(_value(row.per_hour), digits=1),
-            Value(row.upper_90, digits=1),
-            _value(row.ratio),
-        )
-        for row in sweep.rows
-    )
+def stream_table(sweep: StreamSweep) -> Table:
+    """Return the advisories an hour in every staged state of camera and roof."""
+    rows: list[tuple[Cell, ...]] = []
+    for row in sweep.rows:
+        rates = Value(*row.per_hour, digits=1), Value(row.upper_90, digits=1)
+        rows.append((row.name, row.onsets, *rates, Value(*row.ratio)))
     return Table(
         "staged_streams",
-        "Advisories where nobody comes, while the camera fails and it rains",
+        "Advisories without hazards, while the camera fails and it rains",
         ("state", "onsets", "an hour", "at most (90 %)", "to the clean camera"),
         rows,
         f"On {sweep.hours:.2f} h of streams without hazards; the boxes of the camera are left out as often "
@@ -114,11 +100,41 @@ def _streams(sweep: StreamSweep) -> Table:
     )
 
 
+def sweep_tables(study: DegradationStudy) -> list[Table]:
+    """Return awareness by condition and rain as a common cause, for every detector."""
+    parts = enumerate(study.sweeps, start=1)
+    return [table for number, sweep in parts for table in (_conditions(sweep, number), _rain(sweep, number))]
+
+
+def degradation_record(study: DegradationStudy) -> dict[str, Any]:
+    """Return everything that was found, ready for JSON; null where nothing is known."""
+    record: dict[str, Any] = plain(
+        {
+            **{name: getattr(study, name) for name in ("approaches", "hazard_free", "skipped", "missing")},
+            "beta_shift": study.beta_shift,
+            "largest_awareness_difference": study.largest_awareness_difference,
+            "detectors": {sweep.detector: _sweep_record(sweep) for sweep in study.sweeps},
+        }
+    )
+    return record
+
+
+def _sweep_record(sweep: DetectorSweep) -> dict[str, object]:
+    bands = {"by_azimuth": sweep.beta.by_azimuth._asdict(), "overall": sweep.beta.overall._asdict()}
+    return {
+        **asdict(sweep.awareness),
+        "rows": [{"name": row.condition.name, **asdict(row)} for row in sweep.awareness.rows],
+        "least_awareness": sweep.least_awareness.awareness,
+        "least_vision": sweep.least_vision.vision,
+        "beta": {"families": FAMILIES, "levels": LEVELS, **asdict(sweep.beta), **bands},
+    }
+
+
 def _detector_section(sweep: DetectorSweep, number: int) -> Section:
     beta = sweep.beta
     steps = range(beta.overall.value.shape[1])
-    levels: dict[str, list[tuple[str, Value]]] = {
-        family: [(f"{LEVELS[level]:g}", _at(beta.overall, (f, level))) for level in steps]
+    levels = {
+        str(family): [(f"{LEVELS[level]:g}", _at(beta.overall, (f, level))) for level in steps]
         for f, family in enumerate(FAMILIES)
     }
     states = {"clean": (0, 0)} | {
@@ -128,22 +144,18 @@ def _detector_section(sweep: DetectorSweep, number: int) -> Section:
     angles = {
         name: [_at(beta.by_azimuth, (f, b, level)) for b in bins] for name, (f, level) in states.items()
     }
-    figures = (
-        _of_detector(miss_rate_level_figure(levels), sweep, number),
-        _of_detector(miss_rate_angle_figure(angles, beta.azimuth_deg), sweep, number),
-    )
-    return Section(
-        f"Detector {sweep.detector}", (), (*figures, _conditions(sweep, number), _rain(sweep, number))
-    )
+    figures = miss_rate_level_figure(levels), miss_rate_angle_figure(angles, beta.azimuth_deg)
+    named = [_of_detector(one, sweep, number) for one in figures]
+    tables = _conditions(sweep, number), _rain(sweep, number)
+    return Section(f"Detector {sweep.detector}", (), (*named, *tables))
 
 
 def _conditions(sweep: DetectorSweep, number: int) -> Table:
-    rows = tuple(_condition(row) for row in sweep.awareness.rows)
     return Table(
         f"degradation_{number}",
         f"Awareness by condition, {sweep.detector}",
         _CONDITION,
-        rows,
+        [_condition(row) for row in sweep.awareness.rows],
         f"On {sweep.awareness.hops_in_view} hops in view and {sweep.awareness.hazard_free_hours:.3f} h of "
         "hazard-free time. Thresholds are those of the clean camera. Paper: awareness at least 0.87 while "
         "vision falls to 0.03.",
@@ -151,41 +163,26 @@ def _conditions(sweep: DetectorSweep, number: int) -> Table:
 
 
 def _condition(row: AwarenessRow) -> tuple[Cell, ...]:
+    before = row.unseen_awareness, row.detected, row.lead_time_s
     return (
         row.condition.name,
-        Value(row.degradation),
-        _value(row.vision),
-        _value(row.awareness),
-        _known(row.unseen_awareness),
-        Value(row.detected),
-        _known(row.lead_time_s),
-        replace(_value(row.false_alarms_per_hour), digits=0),
-        replace(_value(row.false_awareness_per_hour), digits=0),
+        *(_known(one) for one in (row.degradation, row.miss_rate)),
+        *(Value(*one) for one in (row.vision, row.awareness)),
+        *(_known(one) for one in before),
+        *(Value(*one, digits=0) for one in (row.false_alarms_per_hour, row.false_awareness_per_hour)),
+        Value(row.false_awareness),
     )
 
 
 def _rain(sweep: DetectorSweep, number: int) -> Table:
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (
-            str(one.level),
-            Value(one.noise_db, digits=0),
-            *map(_value, (one.lens, one.roof, one.rain, one.additive, one.optimism)),
-        )
-        for one in sweep.awareness.common_cause
-    )
-    heads = (
-        "level",
-        "noise (dB)",
-        "lens alone",
-        "roof alone",
-        "rain",
-        "if effects added up",
-        "optimism of (A1)",
-    )
+    rows: list[tuple[Cell, ...]] = []
+    for one in sweep.awareness.common_cause:
+        shares = one.lens, one.roof, one.rain, one.additive, one.optimism
+        rows.append((str(one.level), Value(one.noise_db, digits=0), *(Value(*share) for share in shares)))
     return Table(
         f"rain_{number}",
         f"Rain as a common cause: awareness (share), {sweep.detector}",
-        heads,
+        _RAIN,
         rows,
         "Rain soils the lens and drums on the roof at once; noise over the recording's own level. "
         "Optimism: what independent effects would leave, less what rain leaves.",
@@ -197,15 +194,11 @@ def _of_detector(figure: Figure, sweep: DetectorSweep, number: int) -> Figure:
 
 
 def _point(row: AwarenessRow) -> tuple[Value, Value]:
-    return Value(1.0 - row.vision.value), _value(row.awareness)
+    return Value(1.0 - row.vision.value), Value(*row.awareness)
 
 
 def _at(band: Band, place: tuple[int, ...]) -> Value:
     return Value(float(band.value[place]), float(band.low[place]), float(band.high[place]))
-
-
-def _value(one: Estimate) -> Value:
-    return Value(one.value, one.low, one.high)
 
 
 def _known(value: float | None) -> Value:

@@ -1,8 +1,8 @@
 """Every figure of an evaluation as a value with its interval and the paper's, by place in the report."""
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,76 +10,111 @@ from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.operations.arrays.array_bounds import array_bounds
 from worldstate.operations.recordings.bearing_gating import PUBLISHED_COVERAGE
 from worldstate_lab.evaluation.evaluation import Evaluation
+from worldstate_lab.evaluation.figures import FIGURES
 from worldstate_lab.evaluation.front_end_study import FrontEndStudy
-from worldstate_lab.evaluation.paper_values import PAPER_VALUES, paper_value
+from worldstate_lab.evaluation.paper_values import PAPER_VALUES, PaperValue, paper_value
 from worldstate_lab.evaluation.protocols import RETRAINED, STATIC
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.line_of_sight import seen_early_s
 from worldstate_lab.metrics.intervals import middle, ratio
-from worldstate_lab.report.table import Value
+from worldstate_lab.report.table import Cell, Table, Value
 
 Place = tuple[str, str, str]  # Group, row and figure, as in `PAPER_VALUES`
-Values = Mapping[Place, Value]
 
-# Decimals that the numbers of recordings at hand can bear; two where nothing is said.
-_DIGITS = {
-    "false_alarms_per_hour": 0, "false_alarms_per_hour_draws": 0, "hazard_free_hours": 3,
-    "quantum_per_hour": 1, "auroc_all": 3, "auroc_2s": 3, "auroc_1s": 3, "ece": 3, "ece_raw": 3,
-    "ece_floor": 3, "brier_skill": 3, "hazard_share": 3, "advisory_share": 3, "bearing_deg": 1,
-    "bearing_gated_deg": 1, "bearing_music_deg": 1, "bearing_best_site_deg": 1, "bearing_worst_site_deg": 1,
-    "gospa_deg": 1, "azimuth_error_deg": 1, "looming_auroc": 3, "frames": 0, "recordings": 0,
-    "approaches": 0, "hazard_free_recordings": 0, "dynamic_recordings": 0, "junctions": 0, "folds": 0,
-    "doppler_usable": 0, "pass_bys": 0, "microphones": 0, "alias_hz": 0, "sigma_deg": 2,
-    "mean_spacing_m": 4, "approaches_with_early_box": 0, "false_onsets": 1,
-}  # fmt: skip
-# Names of the front-end study, where the paper's list has another.
-_FRONT_END = {
-    "bearing_srp_deg": ("front-end", "bearing in view", "bearing_deg"),
-    "bearing_music_deg": ("front-end", "bearing in view", "bearing_music_deg"),
-    "bearing_gated_deg": ("front-end", "bearing in view", "bearing_gated_deg"),
-    "prominence_in_view": ("front-end", "bearing in view", "prominence_in_view"),
-    "prominence_in_silence": ("front-end", "bearing in view", "prominence_in_silence"),
+PROPOSED = "proposed .02"
+_FRONT_END, _LOOMING = ("front-end", "bearing in view"), ("approach rate", "looming")
+# Places of the front-end study's figures in the paper's list.
+_STUDIED = {
+    "bearing_srp_deg": (*_FRONT_END, "bearing_deg"),
     "doppler_usable": ("approach rate", "Doppler", "doppler_usable"),
-    "looming_auroc": ("approach rate", "looming", "looming_auroc"),
-    "looming_correlation": ("approach rate", "looming", "looming_correlation"),
+    **{name: (*_LOOMING, name) for name in ("looming_auroc", "looming_correlation")},
+    **{name: (*_FRONT_END, name) for name in ("bearing_music_deg", "bearing_gated_deg")},
+    **{name: (*_FRONT_END, name) for name in ("prominence_in_view", "prominence_in_silence")},
 }
+_UNSTATED = {
+    **dict.fromkeys(("bearing_deg", "side_correct", "gospa_deg"), "states none"),
+    "lead_s": "none detected",
+}
+_REFUSED = Value(math.nan, note="not scored: the model was not made for this sound")
 
 
-def measured_values(found: Evaluation, others: Values) -> dict[Place, Value]:
-    """Return the values of all protocols and methods, the front-end, the array and the data, and others."""
-    values = dict(others) | dict(_data_values(found)) | dict(_array_values())
-    for protocol, scores in found.scores.items():
-        for method, score in scores.items():
-            if not method.startswith("curve"):
-                values |= dict(_score_values(protocol, method, score, found))
-    if found.front_end is not None:
-        values |= dict(_front_end_values(found.front_end))
-    values |= dict(_derived_values(values, found))
-    return {place: _beside_paper(place, value) for place, value in values.items()}
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredValues:
+    """An evaluation with all of its values; sections of the report are made of it."""
+
+    found: Evaluation
+    values: Mapping[Place, Value]
+
+    @classmethod
+    def of(cls, found: Evaluation, others: Mapping[Place, Value]) -> "MeasuredValues":
+        """Return the values of protocols, methods, the front-end, the array and the data, and others."""
+        values = dict(others) | dict(_data_values(found)) | dict(_array_values())
+        for protocol, scores in found.scores.items():
+            for method, score in scores.items():
+                if not method.startswith("curve"):
+                    figures = score_values(score, found, protocol)
+                    values |= {(protocol, method, name): value for name, value in figures.items()}
+        if found.front_end is not None:
+            values |= dict(_front_end_values(found.front_end))
+        values |= dict(_derived_values(values, found))
+        return cls(found, {place: _beside_paper(place, value) for place, value in values.items()})
+
+    def at(self, *place: str, note: str = "") -> Value:
+        """Return the value at a place, NaN with a note where there is none."""
+        group, row, figure = place
+        return self.values.get((group, row, figure), Value(math.nan, note=note))
+
+    def methods(self, protocol: str, figures: Iterable[str] = ()) -> list[str]:
+        """Return the methods with a row of their own; given figures, those that have any of them."""
+        scored = [name for name in self.found.scores[protocol] if not name.startswith("curve")]
+        every = [*scored, *self.found.refused.get(protocol, {})]
+        if not figures:
+            return every
+        return [m for m in every if any(math.isfinite(self.at(protocol, m, one).value) for one in figures)]
+
+    def table(
+        self,
+        protocol: str,
+        methods: Sequence[str],
+        figures: Sequence[str],
+        name: str,
+        title: str,
+        caption: str,
+    ) -> Table:
+        """Return a table with a row for each method and a column for each figure."""
+        refused = self.found.refused.get(protocol, {})
+        reasons = [f"Not scored: {refused[method]}." for method in methods if method in refused]
+        rows = [(method, *self._cells(protocol, method, figures)) for method in methods]
+        told = " ".join((self.found.runs[protocol].basis, caption, *dict.fromkeys(reasons)))
+        return Table(name, title, ("method", *(FIGURES[one].title for one in figures)), rows, told)
+
+    def _cells(self, protocol: str, method: str, figures: Sequence[str]) -> list[Cell]:
+        if method in self.found.refused.get(protocol, {}):
+            return [_REFUSED, *[None] * (len(figures) - 1)]
+        cells = [(self.at(protocol, method, figure), figure) for figure in figures]
+        return [v if math.isfinite(v.value) else replace(v, note=_UNSTATED.get(f, "")) for v, f in cells]
 
 
 def score_values(score: Score, found: Evaluation, protocol: str) -> dict[str, Value]:
     """Return every figure of one score with its interval; false alarms with the exact one."""
-    figures, intervals = score.figures(), score.intervals(found.draws[protocol])
+    intervals = score.intervals(found.draws[protocol])
     # The exact interval covers what drawing recordings again cannot: that no alarm was seen at all.
-    intervals["false_alarms_per_hour_draws"] = intervals["false_alarms_per_hour"]
-    figures["false_alarms_per_hour_draws"] = figures["false_alarms_per_hour"]
     intervals["false_alarms_per_hour"] = intervals["false_alarms_per_hour_poisson"]
     # A draw repeats recordings, and so its ECE lies above that of all: only the value is stated.
     intervals |= dict.fromkeys(("ece", "ece_raw", "ece_floor"), (math.nan, math.nan))
     notes = _worst_notes(score)
     return {
-        name: Value(value, *intervals[name], figure_digits(name), notes.get(name, ""))
-        for name, value in figures.items()
+        name: Value(value, *intervals[name], FIGURES[name].digits, notes.get(name, ""))
+        for name, value in score.figures().items()
     }
 
 
 def _worst_notes(score: Score) -> dict[str, str]:
-    """Say of every figure which junction is the worst; nothing where there is one alone."""
+    """Return the worst junction of every figure; nothing where there is one alone."""
     if len({one.site for one in score.recordings}) < 2:
         return {}
     return {
-        name: f"worst {site} {Value(value, digits=figure_digits(name)).number}"
+        name: f"worst {site} {Value(value, digits=FIGURES[name].digits).number}"
         for name, (site, value) in score.worst_sites().items()
         if math.isfinite(value)
     }
@@ -95,83 +130,66 @@ def site_values(score: Score, found: Evaluation, protocol: str) -> dict[str, dic
         # Place i of every draw holds a recording of the stratum of i, so its junction is that of i.
         drawn, figures = score.draws(found.draws[protocol][:, rows]), score.figures(np.array(rows))
         values[site] = {
-            name: Value(value, *middle(drawn[name]), figure_digits(name))
+            name: Value(value, *middle(drawn[name]), FIGURES[name].digits)
             for name, value in figures.items()
             if math.isfinite(value)
         }
     return values
 
 
-def figure_digits(name: str) -> int:
-    """Return the decimals with which a figure is printed."""
-    return _DIGITS.get(name, 2)
-
-
-def _plain(name: str, value: float) -> Value:
-    return Value(value, digits=figure_digits(name))
-
-
-def _score_values(
-    protocol: str, method: str, score: Score, found: Evaluation
-) -> Iterator[tuple[Place, Value]]:
-    for name, value in score_values(score, found, protocol).items():
-        yield (protocol, method, name), value
+def _stated(group: str, figures: Mapping[str, Value]) -> Iterator[tuple[Place, Value]]:
+    """Yield the places at which the paper states figures of a group, with what was measured."""
+    for one in PAPER_VALUES:
+        if one.group == group and one.figure in figures:
+            yield (group, one.row, one.figure), figures[one.figure]
 
 
 def _data_values(found: Evaluation) -> Iterator[tuple[Place, Value]]:
     standing = [trial for trial in found.trials if not trial.hops.about["moving"]]
-    approaches = [trial for trial in standing if not trial.hazard_free]
+    approaches = sum(not trial.hazard_free for trial in standing)
     counts = {
         "recordings": len(standing),
-        "approaches": len(approaches),
-        "hazard_free_recordings": len(standing) - len(approaches),
+        "approaches": approaches,
+        "hazard_free_recordings": len(standing) - approaches,
         "dynamic_recordings": len(found.trials) - len(standing),
         "junctions": len({trial.site for trial in standing}),
     }
-    for one in PAPER_VALUES:
-        if one.group == "data" and one.figure in counts:
-            yield ("data", one.row, one.figure), _plain(one.figure, counts[one.figure])
+    return _stated("data", {name: Value(count, digits=0) for name, count in counts.items()})
 
 
 def _array_values() -> Iterator[tuple[Place, Value]]:
     bounds = array_bounds(roof_array_56(), 1000.0, (0.0,))
     _, width_m, height_m = bounds.aperture_m
     figures = {
-        "horizontal_moment_m2": bounds.horizontal_moment_m2,
-        "sigma_deg": bounds.sigma_deg[0.0] or math.nan,
-        "mean_spacing_m": bounds.mean_spacing_m,
-        "alias_hz": bounds.alias_hz,
-        "aperture_width_m": width_m,
-        "aperture_height_m": height_m,
-        "microphones": bounds.microphones,
+        "horizontal_moment_m2": Value(bounds.horizontal_moment_m2),
+        "sigma_deg": Value(bounds.sigma_deg[0.0] or math.nan),
+        "mean_spacing_m": Value(bounds.mean_spacing_m, digits=4),
+        "alias_hz": Value(bounds.alias_hz, digits=0),
+        "aperture_width_m": Value(width_m),
+        "aperture_height_m": Value(height_m),
+        "microphones": Value(bounds.microphones, digits=0),
     }
-    for one in PAPER_VALUES:
-        if one.group == "array bounds":
-            yield (one.group, one.row, one.figure), _plain(one.figure, figures[one.figure])
+    return _stated("array bounds", figures)
 
 
 def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
-    for name, place in _FRONT_END.items():
-        yield place, Value(study.figures[name], *study.intervals[name], figure_digits(name))
+    for name, place in _STUDIED.items():
+        yield place, Value(study.figures[name], *study.intervals[name], FIGURES[place[2]].digits)
     medians = sorted(
         (Value(one.median_deg, *one.interval_deg, 1, site) for site, one in study.by_site.items()),
         key=lambda one: one.value,
     )
     ends = ("bearing_best_site_deg", "bearing_worst_site_deg")
     for name, median in zip(ends, (*medians[:1], *medians[-1:]), strict=False):
-        yield ("front-end", "bearing in view", name), median
-    counts = {
-        "frames": study.frames,
-        "recordings": study.approaches,
-        "gated_coverage": PUBLISHED_COVERAGE,
-    }
-    for name, value in counts.items():
-        yield ("front-end", "bearing in view", name), _plain(name, value)
-    yield ("approach rate", "Doppler", "pass_bys"), _plain("pass_bys", study.approaches)
+        yield (*_FRONT_END, name), median
+    yield (*_FRONT_END, "frames"), Value(study.frames, digits=0)
+    yield (*_FRONT_END, "recordings"), Value(study.approaches, digits=0)
+    yield (*_FRONT_END, "gated_coverage"), Value(PUBLISHED_COVERAGE)
+    yield ("approach rate", "Doppler", "pass_bys"), Value(study.approaches, digits=0)
 
 
-def _derived_values(values: Values, found: Evaluation) -> Iterator[tuple[Place, Value]]:
-    """Values that the paper states as differences, worst cases or counts over the figures."""
+def _derived_values(values: Mapping[Place, Value], found: Evaluation) -> Iterator[tuple[Place, Value]]:
+    """Yield what the paper states as differences, worst cases or counts over the figures."""
     if STATIC.name in found.runs:
         yield ("static", "against the sustained rule", "fewer_false_alarms"), _fewer(found)
         early = seen_early_s(found.runs[STATIC.name].trials)
@@ -179,15 +197,14 @@ def _derived_values(values: Values, found: Evaluation) -> Iterator[tuple[Place, 
         yield ("static", "Vision-only", "approaches_with_early_box"), count
         yield from _seed_range(found)
     if RETRAINED.name in found.scores:
-        sites = site_values(found.scores[RETRAINED.name]["proposed .02"], found, RETRAINED.name)
+        sites = site_values(found.scores[RETRAINED.name][PROPOSED], found, RETRAINED.name)
         shares = [replace(one["detection"], note=site) for site, one in sites.items() if "detection" in one]
         shares.sort(key=lambda one: one.value)
-        for name, share in (("detection_worst", shares[0]), ("detection_best", shares[-1])):
-            yield (RETRAINED.name, "proposed .02", name), share
+        yield (RETRAINED.name, PROPOSED, "detection_worst"), shares[0]
+        yield (RETRAINED.name, PROPOSED, "detection_best"), shares[-1]
     for row, figure in (("raw statistic", "ece_raw"), ("calibrated risk", "ece")):
-        value = values.get(("static", "proposed .02", figure))
-        if value:
-            yield ("ablations", row, "ece"), value
+        if (place := ("static", PROPOSED, figure)) in values:
+            yield ("ablations", row, "ece"), values[place]
 
 
 def _fewer(found: Evaluation) -> Value:
@@ -195,27 +212,25 @@ def _fewer(found: Evaluation) -> Value:
     every = np.vstack([np.arange(len(found.runs[STATIC.name].trials)), found.draws[STATIC.name]])
     ours, others = (
         found.scores[STATIC.name][method].draws(every)["false_alarms_per_hour"]
-        for method in ("proposed .02", "published, sustained")
+        for method in (PROPOSED, "published, sustained")
     )
     fewer = 1.0 - ratio(ours, others)
     return Value(float(fewer[0]), *middle(fewer[1:]))
 
 
 def _seed_range(found: Evaluation) -> Iterator[tuple[Place, Value]]:
-    counts = found.scores[STATIC.name]["proposed .02"].counts
+    counts = found.scores[STATIC.name][PROPOSED].counts
     shares = counts["detected"].sum(axis=1) / counts["approaches"].sum(axis=1)
-    seeds = len(found.runs[STATIC.name].seeds)
+    note = "" if len(found.runs[STATIC.name].seeds) > 1 else "one seed; --full draws five"
     for name, share in (("detection_least", shares.min()), ("detection_most", shares.max())):
-        row = "proposed .02, least and most over five seeds"
-        yield (
-            ("static", row, name),
-            Value(float(share), note="" if seeds > 1 else "one seed; --full draws five"),
-        )
+        yield ("static", f"{PROPOSED}, least and most over five seeds", name), Value(float(share), note=note)
 
 
 def _beside_paper(place: Place, value: Value) -> Value:
     stated = paper_value(*place)
-    if stated is None:
-        return value
-    paper = Value(stated.value, stated.low, stated.high, stated.digits)
-    return Value(value.value, value.low, value.high, value.digits, value.note, paper)
+    return value if stated is None else replace(value, paper=printed(stated))
+
+
+def printed(one: PaperValue) -> Value:
+    """Return a number of the paper as the paper prints it."""
+    return Value(one.value, one.low, one.high, one.digits)

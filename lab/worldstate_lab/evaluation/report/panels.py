@@ -1,10 +1,11 @@
-"""What the panels of a report share: a legend below the axes, paper values as open marks, curves thinned."""
+"""What the panels of a report share: marks and colours, a legend below the axes, thinned curves."""
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldstate.ground.typing import FloatArray
+from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 # A curve of more points than this looks the same at 600 pixels, and its CSV takes megabytes.
 MOST_POINTS = 200
 GREY = "0.55"
+MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 
 def legend_below(canvas: "Canvas", columns: int = 2) -> None:

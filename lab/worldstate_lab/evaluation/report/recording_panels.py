@@ -7,18 +7,16 @@ import numpy as np
 
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
-from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from worldstate.operations.figure_style import BLUE, RED
 from worldstate.operations.recordings.bearing_gating import bearing_curve, draw_gating
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.metrics.intervals import worst_group
 from worldstate_lab.report.table import Figure, Value
 
-from .panels import legend_below
+from .panels import COLOURS, MARKS, legend_below
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
-
-_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
-_MARKS = ("o", "s", "^", "D", "v", "P")
 
 
 def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float]) -> Figure:
@@ -74,13 +72,13 @@ def junction_figure(
     def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for (method, by_site), offset, colour, mark in zip(
-            values.items(), offsets, _COLOURS, _MARKS, strict=False
+            values.items(), offsets, COLOURS, MARKS, strict=False
         ):
             for site, value in by_site.items():
                 row = sites.index(site) + offset
                 axes.plot([value.low, value.high], [row, row], color=colour, linewidth=1.0, alpha=0.6)
                 axes.plot(value.value, row, mark, color=colour, ms=5, label=method, linestyle="none")
-            marked = worst_junction(by_site, worst)
+            marked, _ = worst_group({site: value.value for site, value in by_site.items()}, worst)
             if marked:
                 place = by_site[marked].value, sites.index(marked) + offset
                 axes.plot(*place, "ko", ms=11, fillstyle="none", label="worst junction")
@@ -88,34 +86,17 @@ def junction_figure(
         axes.set(xlabel=unit, ylim=(len(sites) - 0.5, -0.5))
         legend_below(canvas, columns=1)
 
-    rows = [
-        (method, site, value.value, value.low, value.high)
-        for method, by_site in values.items()
-        for site, value in by_site.items()
-    ]
+    rows = [(method, *row) for method, by_site in values.items() for row in by_site.items()]
     return Figure(
         name,
         title,
         "Bars are 95 % intervals over the recordings of the junction; the ring marks the worst junction of "
         "a method.",
         draw,
-        ("method", "junction", "value", "low", "high"),
+        ("method", "junction", "figure"),
         rows,
         size_in=(4.4, 1.6 + 0.18 * len(values) + 0.5 * max(len(sites), 1)),
     )
-
-
-def worst_junction(by_site: Mapping[str, Value], worst: Literal["low", "high"]) -> str | None:
-    """Return the junction with the worst value, None where none has one.
-
-    Examples
-    --------
-    >>> worst_junction({"SA1": Value(0.9), "SB1": Value(0.5), "SB2": Value(float("nan"))}, "low")
-    'SB1'
-    """
-    known = {site: value.value for site, value in by_site.items() if np.isfinite(value.value)}
-    choose = min if worst == "low" else max
-    return choose(known, key=lambda site: known[site]) if known else None
 
 
 def bearing_gating_figure(checks: HopTable) -> Figure:

@@ -1,42 +1,31 @@
 """Sections behind the warnings: front-end, junctions, ablations, signatures, the paper's list."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
+from worldstate_lab.evaluation.figures import FIGURES
 from worldstate_lab.evaluation.paper_values import COMMANDS, PAPER_VALUES, PaperValue
 from worldstate_lab.evaluation.protocols import FIXED, RETRAINED, STATIC
 from worldstate_lab.methods.table_rows import GROUNDED
 from worldstate_lab.report.document import Section
-from worldstate_lab.report.table import Cell, Table, Value
+from worldstate_lab.report.table import Cell, Figure, Table, Value
 from worldstate_lab.signatures.signature_study import SignatureRow, SignatureStudy
 
-from .measured_values import Place, Values, site_values
-from .method_table import method_table, methods_of, stands_on
+from .measured_values import PROPOSED, MeasuredValues, Place, printed, site_values
 from .recording_panels import bearing_gating_figure, junction_figure
-from .warning_sections import PROPOSED
 
-_NOT_MEASURED = Value(np.nan, note="not measured")
+_UNMEASURED = "not measured"
 _TRANSFER = (
-    ("detected (share)", "detection"),
-    ("lead (s)", "lead_s"),
-    ("false alarms (1/h)", "false_alarms_per_hour"),
-    ("random alarms detect (share)", "random_detection"),
-    ("AUROC, all before T0", "auroc_all"),
-    ("ECE", "ece"),
-    ("right side (share)", "side_correct"),
+    *("detection", "lead_s", "false_alarms_per_hour", "random_detection", "auroc_all", "ece"),
+    "side_correct",
 )
-_BY_SITE = {
-    "hazard_free_hours": "hazard-free (h)",
-    "detection": "detected (share)",
-    "random_detection": "random alarms detect (share)",
-    "lead_s": "lead (s)",
-    "false_alarms_per_hour": "false alarms (1/h)",
-    "auroc_all": "AUROC",
-}
+_BY_SITE = (
+    *("hazard_free_hours", "detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all"),
+)
 # Part taken away, and the row that shows it.
 _ABLATIONS = (
     ("everything on", "with absence .02", "ece"),
@@ -45,120 +34,74 @@ _ABLATIONS = (
     ("with looming, weight from the calibration folds", "with absence .02 + looming", "ece"),
 )
 _ABLATED = ("detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all")
-
-_WORDS = {
-    "lead_s": "lead",
-    "detection": "detected",
-    "false_alarms_per_hour": "false alarms",
-    "ece": "ECE",
-    "ece_raw": "ECE of the raw statistic",
-    "auroc_all": "AUROC, all before T0",
-    "auroc_2s": "AUROC, last 2 s",
-    "auroc_1s": "AUROC, last 1 s",
-    "hazard_free_hours": "hazard-free time",
-    "quantum_per_hour": "one alarm onset",
-    "bearing_deg": "median error",
-    "bearing_best_site_deg": "median error, best junction",
-    "bearing_worst_site_deg": "median error, worst junction",
-    "bearing_music_deg": "median error of MUSIC",
-    "bearing_gated_deg": "median error, gated",
-    "gated_coverage": "share kept by the gate",
-    "prominence_in_view": "prominence in view",
-    "prominence_in_silence": "prominence, hazard-free",
-    "detection_least": "detected, least",
-    "detection_most": "detected, most",
-    "detection_worst": "detected, worst junction",
-    "detection_best": "detected, best junction",
-    "approaches_with_early_box": "approaches with a box before T0",
-    "t0_s": "T0",
-    "fewer_false_alarms": "false alarms saved",
-    "pass_bys": "approaches",
-    "doppler_usable": "with a usable tone",
-    "doppler_speed_km_h": "speed read from it",
-    "looming_correlation": "correlation with the true time",
-    "looming_auroc": "AUROC, last 3 s",
-    "beta_boresight_clean": "clean, at boresight",
-    "beta_20_30_deg": "clean, 20 to 30 deg",
-    "beta_harshest": "harshest noise",
-    "beta_clean": "clean, all angles",
-    "beta_clean_large": "clean, all angles, other detector",
-    "awareness_least": "least hazard awareness",
-    "vision_least": "least of vision alone",
-}
+# Rows of the paper's list that say by themselves which figure they are.
+_NAMED_BY_ROW = ("array bounds", "signature study", "data", "real time")
 
 
-def group_table(name: str, title: str, values: Values, groups: Sequence[str], caption: str = "") -> Table:
-    """Return the paper's values of some groups beside ours, a row each."""
-    rows = tuple(
-        (_label(one), _ours(one, values), _paper(one), one.unit)
+def _group_table(name: str, title: str, measured: MeasuredValues, group: str, caption: str) -> Table:
+    """Return the paper's values of a group beside ours, a row each."""
+    rows = [
+        (_label(one), _ours(one, measured), printed(one), one.unit)
         for one in PAPER_VALUES
-        if one.group in groups and one.basis != "stated"
-    )
+        if one.group == group and one.basis != "stated"
+    ]
     return Table(name, title, ("figure", "here", "paper", "unit"), rows, caption)
 
 
 def _label(one: PaperValue) -> str:
-    """Condition and figure in words; where the row names the figure already, the row alone."""
-    if one.group in ("array bounds", "signature study", "data", "real time"):
+    """Return condition and figure in words."""
+    if one.group in _NAMED_BY_ROW:
         return one.row
-    return f"{one.row}: {_WORDS.get(one.figure, one.figure.replace('_', ' '))}"
+    words = FIGURES[one.figure].words if one.figure in FIGURES else one.figure.replace("_", " ")
+    return f"{one.row}: {words}"
 
 
-def _ours(one: PaperValue, values: Values) -> Value:
+def _ours(one: PaperValue, measured: MeasuredValues) -> Value:
     # With the digits of what was measured: the paper rounds 0.0883 m to 0.088.
-    found = values.get((one.group, one.row, one.figure), _NOT_MEASURED)
-    return Value(found.value, found.low, found.high, found.digits, found.note)
+    return replace(measured.at(one.group, one.row, one.figure, note=_UNMEASURED), paper=None)
 
 
-def _paper(one: PaperValue) -> Value:
-    return Value(one.value, one.low, one.high, one.digits)
-
-
-def front_end_section(found: Evaluation, values: Values) -> Section:
+def front_end_section(measured: MeasuredValues) -> Section:
     """Return bearings against the camera, and the bounds of the array."""
-    array = group_table(
+    array = _group_table(
         "array",
         "What the 56-microphone array allows",
-        values,
-        ("array bounds",),
+        measured,
+        "array bounds",
         "Computed from the positions of the microphones; no sound is needed.",
     )
-    bounds = Section("Bounds of the array", (), (array,))
-    if found.front_end is None:
+    bounds, study = Section("Bounds of the array", (), (array,)), measured.found.front_end
+    if study is None:
         return Section("Front-end accuracy", ("No recording has a camera reference.",), (), (bounds,))
-    study = found.front_end
-    sites = tuple(
-        (site, Value(one.median_deg, *one.interval_deg, digits=1), str(one.frames))
-        for site, one in study.by_site.items()
+    bearings = _group_table(
+        "front_end",
+        "Bearings in view, and prominence",
+        measured,
+        "front-end",
+        "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0; MUSIC on the same "
+        "hops; gated: the 16 % of the bearings whose peak stands out most.",
     )
-    blocks = (
-        group_table(
-            "front_end",
-            "Bearings in view, and prominence",
-            values,
-            ("front-end",),
-            "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0; MUSIC on the "
-            "same hops; gated: the 16 % of the bearings whose peak stands out most.",
-        ),
-        Table(
-            "bearing_by_junction",
-            "Bearing error by junction",
-            ("junction", "median error (deg)", "hops"),
-            sites,
-            "The paper's medians of junctions lie between 2.5 and 5.8 degrees.",
-        ),
-        bearing_gating_figure(study.checked),
+    sites = Table(
+        "bearing_by_junction",
+        "Bearing error by junction",
+        ("junction", "median error (deg)", "hops"),
+        [
+            (site, Value(one.median_deg, *one.interval_deg, digits=1), str(one.frames))
+            for site, one in study.by_site.items()
+        ],
+        "The paper's medians of junctions lie between 2.5 and 5.8 degrees.",
     )
+    blocks = (bearings, sites, bearing_gating_figure(study.checked))
     return Section("Front-end accuracy", (), blocks, (bounds,))
 
 
-def approach_rate_section(values: Values) -> Section:
+def approach_rate_section(measured: MeasuredValues) -> Section:
     """Return looming and tonal Doppler."""
-    table = group_table(
+    table = _group_table(
         "approach_rate",
         "Approach rate in the wild",
-        values,
-        ("approach rate",),
+        measured,
+        "approach rate",
         "Looming AUROC: energy slope of the last 3 s before the pass against hazard-free sound. "
         "Correlation: time to arrival read from the slope, with the true time until the pass. Doppler: "
         "approaches with a usable tone.",
@@ -166,49 +109,36 @@ def approach_rate_section(values: Values) -> Section:
     return Section("Approach rate", (), (table,))
 
 
-def transfer_section(found: Evaluation, values: Values) -> Section:
+def transfer_section(measured: MeasuredValues) -> Section:
     """Return the protocols beyond the static folds, and every junction of all of them."""
     parts = []
-    for name, run in found.runs.items():
+    for name, run in measured.found.runs.items():
         if name != STATIC.name:
-            table = method_table(
-                found,
-                values,
-                name,
-                methods_of(found, name),
-                _TRANSFER,
-                name=f"protocol_{name}",
-                title=run.protocol.title,
-                caption=f"Published classifier trained on: {run.trained_on}. Intervals as in Table I.",
-            )
-            parts.append(Section(run.protocol.title, (), (table,)))
-    return Section("Generalisation", (), (), (*parts, _junctions(found)))
+            told = f"Published classifier trained on: {run.trained_on}. Intervals as in Table I."
+            methods, title = measured.methods(name), run.protocol.title
+            table = measured.table(name, methods, _TRANSFER, f"protocol_{name}", title, told)
+            parts.append(Section(title, (), (table,)))
+    return Section("Generalisation", (), (), (*parts, _junctions(measured.found)))
 
 
 def _junctions(found: Evaluation) -> Section:
-    """Show the proposed method at every junction, by protocol."""
-    names = [name for name in (STATIC.name, FIXED.name, RETRAINED.name) if name in found.scores]
+    """Return the proposed method at every junction, by protocol."""
     sites = {name: site_values(scores[PROPOSED], found, name) for name, scores in found.scores.items()}
+    standing = [name for name in (STATIC.name, FIXED.name, RETRAINED.name) if name in sites]
 
-    def chosen(figure: str) -> dict[str, dict[str, Value]]:
-        return {
-            found.runs[name].protocol.title: {
-                site: one[figure] for site, one in sites[name].items() if figure in one
+    def drawn(figure: str, name: str, title: str) -> Figure:
+        by_protocol = {
+            found.runs[protocol].protocol.title: {
+                site: one[figure] for site, one in sites[protocol].items() if figure in one
             }
-            for name in names
+            for protocol in standing
         }
+        kind = FIGURES[figure]
+        return junction_figure(name, title, kind.title, by_protocol, "low" if kind.worse == "low" else "high")
 
     figures = (
-        junction_figure(
-            "junction_detection", "Detection by junction", "detected (share)", chosen("detection"), "low"
-        ),
-        junction_figure(
-            "junction_false_alarms",
-            "False alarms by junction",
-            "false alarms per hazard-free hour",
-            chosen("false_alarms_per_hour"),
-            "high",
-        ),
+        drawn("detection", "junction_detection", "Detection by junction"),
+        drawn("false_alarms_per_hour", "junction_false_alarms", "False alarms by junction"),
     )
     return Section("By junction", (), (*figures, _junction_table(found, sites)))
 
@@ -219,57 +149,45 @@ def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[
         run = found.runs[name]
         counts = Counter(trial.site for trial in run.trials)
         for site, one in by_site.items():
-            figures = (one.get(figure, Value(np.nan)) for figure in _BY_SITE)
-            rows.append((run.protocol.title, site, str(counts[site]), *figures))
+            rows.append((run.protocol.title, site, str(counts[site]), *map(one.get, _BY_SITE)))
     return Table(
         "junctions",
         f"Every junction, {PROPOSED}",
-        ("protocol", "junction", "recordings", *_BY_SITE.values()),
-        tuple(rows),
+        ("protocol", "junction", "recordings", *(FIGURES[name].title for name in _BY_SITE)),
+        rows,
         "Intervals over the recordings of the junction. A junction has few: one alarm is many an hour.",
     )
 
 
-def ablation_section(found: Evaluation, values: Values) -> Section:
+def ablation_section(measured: MeasuredValues) -> Section:
     """Return ablations (a) and (b), looming, and the approach rate in the grounded likelihood."""
 
     def cell(row: str, figure: str) -> Value:
         # Beside the paper's value stands the row of Table I, not what is left of it here.
-        return replace(values.get((STATIC.name, row, figure), _NOT_MEASURED), paper=None)
+        return replace(measured.at(STATIC.name, row, figure, note=_UNMEASURED), paper=None)
 
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (part, *(cell(row, figure) for figure in (*_ABLATED, error, "hazard_awareness")))
-        for part, row, error in _ABLATIONS
-    )
-    heads = (
-        "detected (share)",
-        "random alarms detect (share)",
-        "lead (s)",
-        "false alarms (1/h)",
-        "AUROC",
-        "ECE",
-        "awareness (share)",
-    )
-    vision = cell("Vision-only", "hazard_awareness")
+    shown = (*_ABLATED, "ece", "hazard_awareness")
     table = Table(
         "ablations",
         "Ablations, standing ego",
-        ("part", *heads),
-        rows,
-        f"{stands_on(found, STATIC.name)}. One part off at a time, same folds; vision alone is aware in "
-        f"{vision.text}. Paper: (a) changes no entry of Table I with a clean camera; (b) ECE 0.167 raw, "
-        "0.034 calibrated; (c) is the section on degradation.",
+        ("part", *(FIGURES[name].title for name in shown)),
+        [
+            (part, *(cell(row, figure) for figure in (*_ABLATED, error, "hazard_awareness")))
+            for part, row, error in _ABLATIONS
+        ],
+        f"{measured.found.runs[STATIC.name].basis} One part off at a time, same folds; vision alone is aware "
+        f"in {cell('Vision-only', 'hazard_awareness').text}. Paper: (a) changes no entry of Table I with a "
+        "clean camera; (b) ECE 0.167 raw, 0.034 calibrated; (c) is the section on degradation.",
     )
-    grounded = method_table(
-        found,
-        values,
+    names = {one.name for one in GROUNDED}
+    grounded = measured.table(
         STATIC.name,
-        [name for name in methods_of(found, STATIC.name) if name in {one.name for one in GROUNDED}],
+        [name for name in measured.methods(STATIC.name) if name in names],
         _TRANSFER,
-        name="grounded",
-        title="Bearing and approach rate in the likelihood, eq. (5)",
-        caption="The shipped scores alone, weighed by bearing and approach rate, and without the rate. The "
-        "paper calls the last ablation vacuous, as tonal Doppler is rarely usable.",
+        "grounded",
+        "Bearing and approach rate in the likelihood, eq. (5)",
+        "The shipped scores alone, weighed by bearing and approach rate, and without the rate. The paper "
+        "calls the last ablation vacuous, as tonal Doppler is rarely usable.",
     )
     return Section("Ablations", (), (table, grounded))
 
@@ -295,14 +213,14 @@ def signature_section(study: SignatureStudy | None) -> Section:
     """Return the separability of single clips, or what would fill it."""
     if study is None:
         return Section("Signature study", (f"Not part of this run: {COMMANDS['corpora']} fills it.",))
-    rows = tuple(
-        (row.name, row.corpus, row.figure, _signature(row), str(row.n_clips), row.note) for row in study.rows
-    )
     table = Table(
         "signatures",
         "Separability of single clips",
         ("row", "corpus", "figure", "value", "clips", "how"),
-        rows,
+        [
+            (row.name, row.corpus, row.figure, _signature(row), str(row.n_clips), row.note)
+            for row in study.rows
+        ],
     )
     text = "SIMULATED clips stand for the corpora." if study.simulated else "Published corpora."
     return Section("Signature study", (text,), (table,))
@@ -318,21 +236,13 @@ def _signature(row: SignatureRow) -> Value:
     return Value(value, low, high, digits, paper=paper)
 
 
-def paper_section(found: Evaluation, values: Values) -> Section:
+def paper_section(measured: MeasuredValues) -> Section:
     """Return every number of the paper beside ours, and the command that fills it on what it stands on."""
-    simulated = found.takes.simulated
-    rows = tuple(
-        (
-            one.section,
-            one.group,
-            _label(one),
-            _paper(one),
-            one.unit,
-            _ours(one, values),
-            _filled(one, simulated),
-        )
+    simulated = measured.found.takes.simulated
+    rows = [
+        (*_named(one), printed(one), one.unit, _ours(one, measured), _filled(one, simulated))
         for one in PAPER_VALUES
-    )
+    ]
     text = (
         "The recordings here are SIMULATED: where the last column names a command, the paper's number "
         "stands on real sound or video, and what is printed here is its simulated counterpart."
@@ -346,6 +256,10 @@ def paper_section(found: Evaluation, values: Values) -> Section:
         rows,
     )
     return Section("The paper's numbers, and what they need", (text,), (table,))
+
+
+def _named(one: PaperValue) -> tuple[str, str, str]:
+    return one.section, one.group, _label(one)
 
 
 def _filled(one: PaperValue, simulated: bool) -> str:
