@@ -15,8 +15,8 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.posterior import statistic
-from worldstate.belief.acoustic_update import acoustic_update
-from worldstate.belief.existence import after_empty_look, after_sighting
+from worldstate.belief.track import after_empty_look, after_sighting
+from worldstate.core.acoustic_update import acoustic_update
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
 from worldstate.ground.values import NotUsable
 from worldstate.state import Priors, Rates
@@ -581,13 +581,11 @@ def test_overlapping_bearings_are_not_counted_twice():
     world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
     m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
     (track,) = world.memory.tracks
-    once, often = (track,), (track,)
-    sides, visible = world.memory.sides, world.explanation.visible
-    once = acoustic_update(once, m, sides, visible, 1.0, FilterSettings())
+    once, often = acoustic_update(world.memory, m, 1.0, FilterSettings()), world.memory
     for _ in range(10):
-        often = acoustic_update(often, m, sides, visible, 0.1, FilterSettings())
+        often = acoustic_update(often, m, 0.1, FilterSettings())
     for row, most in ((0, 0.35), (2, 0.2)):
-        one, ten, none = (t.motion.covariance[row, row] for t in (once[0], often[0], track))
+        one, ten, none = (t.motion.covariance[row, row] for t in (once.tracks[0], often.tracks[0], track))
         assert ten == pytest.approx(one, rel=most)
         assert one < 0.9 * none
 

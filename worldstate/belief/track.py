@@ -15,6 +15,7 @@ from worldstate.belief.kinematics.polar import AZIMUTH_RATE
 from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 
+from .explanation import HiddenBelief
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry
 
@@ -78,6 +79,27 @@ def entity_id(stream: str, kind: str, number: int) -> str:
     True
     """
     return str(uuid5(_NAMESPACE, f"{stream}/{kind}/{number}"))
+
+
+def after_empty_look(existence: float, miss_rate: float) -> float:
+    r"""Return the existence after a missed detection.
+
+    .. math:: r \leftarrow \frac{r \beta}{r \beta + 1 - r} = \frac{r (1 - p_D)}{1 - r\, p_D},
+        \qquad p_D = 1 - \beta
+    """
+    # At r = 1 and beta = 0 the ratio is 0/0; what certainly exists stays.
+    missed = existence * miss_rate
+    return missed / (missed + 1.0 - existence) if existence < 1.0 else 1.0
+
+
+def after_sighting(existence: float, miss_rate: float, clutter_rate: float) -> float:
+    r"""Return the existence after a detection.
+
+    .. math:: r \leftarrow \frac{r\, (1 - \beta (1 - c))}{r\, (1 - \beta (1 - c)) + (1 - r)\, c}
+    """
+    # A look finds something where the entity is detected or, if it is missed, where there is clutter.
+    found = existence * (1.0 - miss_rate * (1.0 - clutter_rate))
+    return found / (found + (1.0 - existence) * clutter_rate)
 
 
 def predict_tracks(
@@ -177,6 +199,13 @@ def relabelled(
     for label, probability in seen_as:
         kept[label] = kept.get(label, 0.0) + gain * probability
     return tuple(sorted((label, round(p, 12)) for label, p in kept.items() if p > 1e-3))
+
+
+def hidden_share(track: Track, sides: HiddenBelief) -> float:
+    """Return P(hidden | exists) of a track, 0 once it was seen."""
+    if track.seen:
+        return 0.0
+    return sides.hidden_share(track.side) if track.place is None else track.behind
 
 
 def heard_as(track: Track, kinds: ClassShares) -> tuple[Label, ...]:

@@ -8,9 +8,9 @@ import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
 from worldstate.belief.announced import announced
-from worldstate.belief.birth_death import hidden_on
 from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
 
+from .birth_death import hidden_on
 from .memory import Memory, priors_of
 from .sequence_memory import SequenceMemory
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival, visible_in

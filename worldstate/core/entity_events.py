@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 
-from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.track import Track
+from worldstate.belief.track import Track, hidden_share
 from worldstate.ground.values import nanoseconds
 from worldstate.state import Event
 from worldstate.state.entity import EventKind

@@ -1,7 +1,8 @@
 """The state that the filter carries from one call to the next."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias
 
 import numpy as np
@@ -116,13 +117,17 @@ class Memory:
 
     @property
     def sides(self) -> HiddenBelief:
-        """What is believed of hidden vehicles: by the sequence where one is read, or the explanations."""
-        return sides_of(self.explanation, self.sequence)
+        """Hidden vehicles as a sequence has them; without one, as explanations that exclude each other."""
+        if self.sequence is not None:
+            return self.sequence.hidden
+        return HiddenBelief(self.explanation.hidden, self.explanation.emerged)
 
+    def explained(self, change: Callable[[ExplanationBelief], ExplanationBelief]) -> "Memory":
+        """Return the memory with a function applied to the explanations, now and within the lag.
 
-def sides_of(explanation: ExplanationBelief, sequence: SequenceMemory | None) -> HiddenBelief:
-    """Return the sides as a sequence has them; without one, as explanations that exclude each other."""
-    return HiddenBelief(explanation.hidden, explanation.emerged) if sequence is None else sequence.hidden
+        The lagged beliefs are what the next windows build on: they have to know of a hand-over, too.
+        """
+        return replace(self, explanation=change(self.explanation), lag=self.lag.map(change))
 
 
 def first_memory(context: Context, start_ns: int) -> Memory:

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import STATED
-from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.site_geometry import normal_share
-from worldstate.belief.track import Track
+from worldstate.belief.track import Track, hidden_share
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import nanoseconds
 from worldstate.state import Context, Relation

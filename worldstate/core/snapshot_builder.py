@@ -8,7 +8,6 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.acoustic_update import hidden_share
 from worldstate.belief.announced import time_to_visible
 from worldstate.belief.ego_motion import EgoBelief
 from worldstate.belief.explanation import HiddenBelief
@@ -17,7 +16,7 @@ from worldstate.belief.kinematics.motion import FARTHEST_M, NEAREST_M, MotionBel
 from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LEAST_Q, LOG_RANGE, RADIAL_RATE
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import PARKED_ACCELERATION, Track
+from worldstate.belief.track import PARKED_ACCELERATION, Track, hidden_share
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.state import Classification, Context, Entity, SearchedView, SensorHealth, Visibility

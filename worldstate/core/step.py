@@ -16,19 +16,15 @@ from worldstate.abduction.posterior import posterior_of
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign
-from worldstate.belief.acoustic_update import acoustic_update, hidden_share
 from worldstate.belief.announced import announced
 from worldstate.belief.belief_lag import SourceEvidence
-from worldstate.belief.birth_death import birth_death, merged_tracks
 from worldstate.belief.ego_motion import EgoBelief, corrected, driven
 from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
 from worldstate.belief.hidden_bearing import hidden_motion
-from worldstate.belief.position_update import position_update
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.track import Track, predict_tracks, turned
-from worldstate.belief.vision_update import VisionUpdate, log_co_evidence, surviving, vision_update
-from worldstate.ground.values import NANOSECONDS_PER_SECOND, NotUsable, nanoseconds, seconds
+from worldstate.belief.track import Track, hidden_share, predict_tracks, turned
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import CameraLook, Measurement
 from worldstate.measurement.odometry import Odometry
 from worldstate.measurement.position import PositionScan
@@ -36,10 +32,15 @@ from worldstate.measurement.sector import Sector
 from worldstate.state import Context
 from worldstate.state.context import seen_from
 
+from .acoustic_update import acoustic_update
+from .birth_death import birth_death, merged_tracks
 from .entity_events import HIDDEN, events_between, halves_of_one, published
-from .memory import CountedLook, Instant, Memory, SourceRule, priors_of, sides_of
+from .hand_over import past_edges, surviving
+from .memory import CountedLook, Instant, Memory, SourceRule, priors_of
+from .position_update import position_update
 from .relations import relations_at
 from .sequence_memory import carried, informed
+from .vision_update import log_co_evidence, vision_update
 
 # Relative: rounding must not choose a side, or the mirrored world would have the other one.
 _TIE = 1e-9
@@ -192,8 +193,7 @@ def _places_passed(before: Sequence[Track], memory: Memory, model: FilterModel) 
         if now[old.id] in others and (len(others) > 1 or not heard[old.side]):
             memory = replace(memory, tracks=tuple(one for one in memory.tracks if one.id != old.id))
     left = dict.fromkeys(emerged, model.site.settings.handover_residual)
-    look = VisionUpdate(memory.tracks, memory.explanation, left, emerged, memory.sighted)
-    return _after_look(memory, look, memory.stamp_ns, model)
+    return past_edges(memory, left, emerged, memory.stamp_ns)
 
 
 def update_evidence(memory: Memory, measurement: Measurement, weight: float, model: FilterModel) -> Memory:
@@ -208,20 +208,9 @@ def update_evidence(memory: Memory, measurement: Measurement, weight: float, mod
     # -inf would stay for the length of the lag and cannot be written as JSON.
     own = np.maximum(signature.log_likelihoods + answer, LOG_FLOOR)
     evidence = SourceEvidence(source, stamp_ns, tuple(own.tolist()))
-    return replace(
-        memory,
-        explanation=explanation,
-        lag=memory.lag.add(evidence, explanation, window_ns),
-        tracks=acoustic_update(
-            memory.tracks,
-            measurement,
-            sides_of(explanation, memory.sequence),
-            explanation.visible,
-            weight,
-            settings,
-        ),
-        predicted=priors_of(prior),
-    )
+    lag, predicted = memory.lag.add(evidence, explanation, window_ns), priors_of(prior)
+    memory = replace(memory, explanation=explanation, lag=lag, predicted=predicted)
+    return acoustic_update(memory, measurement, weight, settings)
 
 
 def _with_hand_overs(
@@ -244,29 +233,7 @@ def update_sightings(
     if seen.look.sector_rad is not None:
         recent = (one for one in memory.looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
         others = [Sector.between(*one.sector_rad) for one in recent if one.sector_rad is not None]
-    known = memory.tracks, memory.explanation
-    update = vision_update(*known, measurement, seen, weight, memory.sighted, model.site, others)
-    return _after_look(memory, update, measurement.stamp_ns, model)
-
-
-def _after_look(memory: Memory, seen: VisionUpdate, stamp_ns: int, model: FilterModel) -> Memory:
-    """Return the memory after what a look, or a scan, has made of entities and explanations."""
-    handover_ns = tuple(
-        stamp_ns if k in seen.handed_over else before_ns for k, before_ns in enumerate(memory.handover_ns)
-    )
-    # The lagged beliefs are what the next windows build on: they have to know of the hand-over, too.
-    lag = memory.lag
-    for side, residual in seen.handed_over.items():
-        lag = lag.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
-    return replace(
-        memory,
-        tracks=surviving(seen.tracks, model.site.settings),
-        explanation=seen.explanation,
-        lag=lag,
-        handover_ns=handover_ns,
-        sighted=seen.born,
-        sequence=memory.sequence and memory.sequence.emerged(seen.emerged, stamp_ns),
-    )
+    return vision_update(memory, measurement, seen, weight, model.site, others)
 
 
 def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> Memory:
@@ -274,18 +241,13 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
     settings, last = model.site.settings, _last_look(memory, scan.source)
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     weight = min(elapsed_s / settings.look_interval_s, 1.0)
-    seen, births = position_update(
-        memory.tracks, memory.explanation, scan, weight, memory.sighted, memory.births, model.site
-    )
-    memory = _after_look(memory, seen, scan.stamp_ns, model)
-    looks = _with_look(memory, _scan_look(scan))
-    memory = replace(memory, births=births, looks=looks, seq=memory.seq + 1)
+    memory = position_update(memory, scan, weight, model.site)
+    memory = replace(memory, looks=_with_look(memory, _scan_look(scan)), seq=memory.seq + 1)
     chances = announced(memory.tracks, model.site)
     if not any(chances):
         # Whoever has come into view, or is gone, ends the rule of the source that announced it.
         return replace(memory, rules=tuple(one for one in memory.rules if one.source != scan.source))
-    raised = partial(ExplanationBelief.at_least, hidden=chances)
-    memory = replace(memory, explanation=raised(memory.explanation), lag=memory.lag.map(raised))
+    memory = memory.explained(partial(ExplanationBelief.at_least, hidden=chances))
     if scan.searched is not None:
         return memory
     said = SignatureEvidence(model.context.directions, tuple(map(claimed_nats, chances)), 0.0, 0.0)
@@ -425,27 +387,11 @@ def _rule_ends_ns(memory: Memory, announced: int | None = None) -> int | None:
 
 def update_entities(memory: Memory, measurement: Measurement, model: FilterModel) -> Memory:
     """Return the memory after births and deaths of hidden entities."""
-    rearm_ns = model.site.settings.rearm_s * NANOSECONDS_PER_SECOND
-    hidden = birth_death(
-        memory.tracks,
-        memory.explanation,
-        memory.sides,
-        memory.births,
-        alarmed(memory),
-        [before is None or memory.stamp_ns - before > rearm_ns for before in memory.handover_ns],
-        measurement,
-        model.site,
-    )
-    lag = memory.lag
-    for side in hidden.begun:
-        lag = lag.map(partial(ExplanationBelief.forget_origin, direction=side))
+    memory = birth_death(memory, alarmed(memory), measurement, model.site)
     last_ns = dict(memory.last_ns) | {measurement.source: measurement.stamp_ns}
     return replace(
         memory,
-        tracks=_on_their_way(hidden.tracks, memory, model.site),
-        explanation=hidden.explanation,
-        lag=lag,
-        births=hidden.births,
+        tracks=_on_their_way(memory, model.site),
         seq=memory.seq + 1,
         bearing=None if isinstance(measurement.bearing, NotUsable) else measurement.bearing,
         domain=measurement.domain,
@@ -453,9 +399,9 @@ def update_entities(memory: Memory, measurement: Measurement, model: FilterModel
     )
 
 
-def _on_their_way(tracks: tuple[Track, ...], memory: Memory, site: SiteGeometry) -> tuple[Track, ...]:
+def _on_their_way(memory: Memory, site: SiteGeometry) -> tuple[Track, ...]:
     """Return the tracks, those that are only heard and hidden where the sequence has them."""
-    kept, sides = memory.sequence, memory.sides
+    kept, sides, tracks = memory.sequence, memory.sides, memory.tracks
     if kept is None:
         return tracks
     coming, shares = kept.coming, [hidden_share(one, sides) for one in tracks]

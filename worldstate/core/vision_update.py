@@ -1,28 +1,36 @@
 """Update the entities with a look of the co-evidence channel: detections, missed detections, hand-overs."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.belief.association import associated
 from worldstate.belief.kinematics.cartesian import update_bearing
 from worldstate.belief.kinematics.motion import MotionBelief, update_azimuth
 from worldstate.belief.kinematics.polar import AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.track import (
+    Track,
+    after_empty_look,
+    after_sighting,
+    entity_id,
+    follow_places,
+    merged,
+    relabelled,
+)
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import CameraLook, Look, Measurement, Sighting
 from worldstate.measurement.sector import Sector
 
-from .association import associated
-from .existence import after_empty_look, after_sighting
-from .explanation import ExplanationBelief
-from .settings import FilterSettings
-from .site_geometry import SiteGeometry
-from .track import Track, entity_id, follow_places, merged, relabelled
+from .hand_over import after_look
+from .memory import Memory
 
 # Of (theta_dot rad/s, rho 1/s) at the first sighting: a car at 50 km/h passing at 15 m has .9 rad/s, two
 # deviations. A parked one has none, but zero would make the covariance singular.
@@ -35,17 +43,6 @@ _MOST_MISSES = 0.99
 _OUTSIDE = Unqueried("outside the field of view")
 
 
-@dataclass(frozen=True, slots=True)
-class VisionUpdate:
-    """Result of a look."""
-
-    tracks: tuple[Track, ...]
-    explanation: ExplanationBelief
-    handed_over: Mapping[int, float]  # Share of P(hidden) that a hand-over has left, by its side
-    emerged: tuple[int, ...]  # Sides past whose edge somebody came into view, heard before or not
-    born: int  # Entities born in view so far
-
-
 def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
     """Return log p(V | hidden_1 .. hidden_K, visible, none), shape (K + 2,), nats."""
     hidden, visible, none = answer.log_likelihoods().tolist()
@@ -53,22 +50,20 @@ def log_co_evidence(answer: CoEvidence, directions: int) -> FloatArray:
 
 
 def vision_update(
-    tracks: tuple[Track, ...],
-    explanation: ExplanationBelief,
+    memory: Memory,
     measurement: Measurement,
     seen: CameraLook,
     weight: float,
-    born: int,
     site: SiteGeometry,
     others: Sequence[Sector] = (),
-) -> VisionUpdate:
-    """Return tracks and explanations after one look; `born` counts the entities born in view so far.
+) -> Memory:
+    """Return the memory after one look: detections, missed detections and hand-overs.
 
-    Of who stands where only `others` have looked, their answer holds.
+    For an entity where only `others` have looked, their answer holds.
     """
     # Sorted, so that the state does not depend on the order in which a detector lists its boxes.
     sightings, view = tuple(sorted(seen.sightings, key=_BY_ALL)), site.view(seen.look)
-    whose = associated(tracks, sightings, view, site)
+    tracks, whose = memory.tracks, associated(memory.tracks, sightings, view, site)
     found, after = whose.found, []
     turned, rates = _turned(tracks, sightings, found, site), _rates(measurement.co_evidence, site.settings)
     for i, track in enumerate(tracks):
@@ -83,37 +78,10 @@ def vision_update(
         else:
             left = _has_left(track, answer, measurement.stamp_ns, site)
             after.append(_not_sighted(track, existence, _OUTSIDE if left else answer))
-    handed_over = whose.handed_over(tracks, after, site.settings)
-    for side, residual in handed_over.items():
-        explanation = explanation.emerge(side, residual)
     unheard = [sighting for j, sighting in enumerate(sightings) if j not in found.values()]
-    fresh = [_born(sighting, measurement, born + n, site) for n, sighting in enumerate(unheard)]
-    emerged = emerged_sides(handed_over, fresh, site)
-    return VisionUpdate((*after, *fresh), explanation, handed_over, emerged, born + len(fresh))
-
-
-def emerged_sides(handed_over: Iterable[int], fresh: Sequence[Track], site: SiteGeometry) -> tuple[int, ...]:
-    """Return the sides past whose edge somebody has just come: hidden before, or first seen there."""
-    near = (
-        track.side
-        for track in fresh
-        if track.seen and track.moving
-        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * site.settings.edge_std_rad
-    )
-    return tuple(sorted({*handed_over, *near}))
-
-
-def surviving(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
-    """Return the tracks without seen entities of too little existence or too uncertain azimuth."""
-    return tuple(
-        track
-        for track in tracks
-        if not track.seen
-        or (
-            track.existence >= settings.delete_existence
-            and track.motion.azimuth_std_rad <= settings.lost_std_rad
-        )
-    )
+    fresh = [_born(one, measurement, memory.sighted + n, site) for n, one in enumerate(unheard)]
+    memory = replace(memory, sighted=memory.sighted + len(fresh))
+    return after_look(memory, (*after, *fresh), whose, measurement.stamp_ns, site)
 
 
 def _rates(answer: CoEvidence, settings: FilterSettings) -> tuple[float, float]:

@@ -1,23 +1,23 @@
 """Update the entities with an acoustic bearing and approach rate, by probabilistic data association."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from worldstate.belief.explanation import HiddenBelief
 from worldstate.belief.kinematics.motion import (
     MotionBelief,
     log_azimuth_likelihood,
     update_approach,
     update_azimuth,
 )
+from worldstate.belief.settings import FilterSettings
+from worldstate.belief.track import Track, hidden_share, merged
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Measurement
 
-from .explanation import HiddenBelief
-from .settings import FilterSettings
-from .track import Track, merged
+from .memory import Memory
 
 # Density of peaks that are not this entity's: uniform over the half-plane ahead, since images in walls and
 # other sources were found at all azimuths.
@@ -26,35 +26,42 @@ _ANYWHERE_RAD2 = math.pi**2 / 12.0
 
 
 def acoustic_update(
-    tracks: tuple[Track, ...],
-    measurement: Measurement,
-    sides: HiddenBelief,
-    visible: float,
-    weight: float,
-    settings: FilterSettings,
-) -> tuple[Track, ...]:
-    """Return the tracks after the bearing and the approach rate of a measurement; `visible` is P(visible)."""
-    # R is divided by `weight`: consecutive windows overlap, and full weight for each would count the same
-    # samples up to ten times.
-    if weight <= 0.0:
-        return tracks
+    memory: Memory, measurement: Measurement, weight: float, settings: FilterSettings
+) -> Memory:
+    """Return the memory after the bearing and the approach rate of a measurement.
+
+    R is divided by `weight`: consecutive windows overlap, and full weight for each would count the same
+    samples up to ten times.
+    """
     # A measured position tells more than a bearing that may be that of a wall.
-    sounding = [i for i, track in enumerate(tracks) if track.moving and track.place is None]
-    silent = isinstance(measurement.bearing, NotUsable) and isinstance(measurement.approach, NotUsable)
-    if not sounding or silent:
-        return tracks
-    updated = list(tracks)
-    heard = _updated([tracks[i] for i in sounding], measurement, sides, visible, weight, settings)
-    for i, track in zip(sounding, heard, strict=True):
-        updated[i] = track
-    return tuple(updated)
-
-
-def hidden_share(track: Track, sides: HiddenBelief) -> float:
-    """Return P(hidden | exists) of a track, 0 once it was seen."""
-    if track.seen:
-        return 0.0
-    return sides.hidden_share(track.side) if track.place is None else track.behind
+    at = [i for i, track in enumerate(memory.tracks) if track.moving and track.place is None]
+    bearing, approach = measurement.bearing, measurement.approach
+    silent = isinstance(bearing, NotUsable) and isinstance(approach, NotUsable)
+    if weight <= 0.0 or silent or not at:
+        return memory
+    updated, tracks, sides = list(memory.tracks), [memory.tracks[i] for i in at], memory.sides
+    sounding = [_sounding(track, sides, memory.explanation.visible) for track in tracks]
+    motion = MotionBelief.stacked([track.motion for track in tracks])
+    if not isinstance(bearing, NotUsable):
+        paths = [_path(bearing.std_rad, hidden_share(track, sides), settings) for track in tracks]
+        own = [
+            association_probability(track, bearing.azimuth_rad, std, path * chance)
+            for track, (std, path), chance in zip(tracks, paths, sounding, strict=True)
+        ]
+        stds = np.array([std for std, _ in paths]) / math.sqrt(weight)
+        motion = update_azimuth(motion, bearing.azimuth_rad, stds, np.array(own))
+    if not isinstance(approach, NotUsable):
+        std = approach.std_hz / math.sqrt(weight)
+        motion = update_approach(motion, approach.inverse_tta_hz, std, np.array(sounding))
+    for i, track, moved, chance in zip(at, tracks, motion.each(), sounding, strict=True):
+        updated[i] = replace(
+            track,
+            motion=moved,
+            updated_ns=measurement.stamp_ns,
+            sources=merged(track.sources, measurement.source),
+            approach_heard=track.approach_heard or (chance > 0.5 and not isinstance(approach, NotUsable)),
+        )
+    return replace(memory, tracks=tuple(updated))
 
 
 def association_probability(
@@ -70,41 +77,6 @@ def association_probability(
     other = _LOG_CLUTTER_DENSITY + math.log1p(-own_path_probability)
     # exp overflows above 709.
     return 1.0 / (1.0 + math.exp(min(other - own, 700.0)))
-
-
-def _updated(
-    tracks: list[Track],
-    measurement: Measurement,
-    sides: HiddenBelief,
-    visible: float,
-    weight: float,
-    settings: FilterSettings,
-) -> Iterator[Track]:
-    sounding = [_sounding(track, sides, visible) for track in tracks]
-    motion, bearing, approach = (
-        MotionBelief.stacked([track.motion for track in tracks]),
-        measurement.bearing,
-        measurement.approach,
-    )
-    if not isinstance(bearing, NotUsable):
-        paths = [_path(bearing.std_rad, hidden_share(track, sides), settings) for track in tracks]
-        own = [
-            association_probability(track, bearing.azimuth_rad, std, path * chance)
-            for track, (std, path), chance in zip(tracks, paths, sounding, strict=True)
-        ]
-        stds = np.array([std for std, _ in paths]) / math.sqrt(weight)
-        motion = update_azimuth(motion, bearing.azimuth_rad, stds, np.array(own))
-    if not isinstance(approach, NotUsable):
-        std = approach.std_hz / math.sqrt(weight)
-        motion = update_approach(motion, approach.inverse_tta_hz, std, np.array(sounding))
-    for track, moved, chance in zip(tracks, motion.each(), sounding, strict=True):
-        yield replace(
-            track,
-            motion=moved,
-            updated_ns=measurement.stamp_ns,
-            sources=merged(track.sources, measurement.source),
-            approach_heard=track.approach_heard or (chance > 0.5 and not isinstance(approach, NotUsable)),
-        )
 
 
 def _path(std_rad: float, share: float, settings: FilterSettings) -> tuple[float, float]:

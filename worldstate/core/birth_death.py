@@ -1,75 +1,56 @@
 """Birth and death of hidden entities, one at most on each side; entities that have become one."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
+from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
+from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.track import Track, entity_id, heard_as
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
 
-from .explanation import ExplanationBelief, HiddenBelief
-from .site_geometry import SiteGeometry
-from .track import Track, entity_id, heard_as
+from .memory import Memory
 
 # Of two at one place; whoever is found by himself within it is somebody else.
 _ALONE_NS = nanoseconds(1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class BirthDeath:
-    """Result: tracks, explanations, births so far on each side, sides of this step's births."""
-
-    tracks: tuple[Track, ...]
-    explanation: ExplanationBelief
-    births: tuple[int, ...]
-    begun: tuple[int, ...]
-
-
 def birth_death(
-    tracks: tuple[Track, ...],
-    explanation: ExplanationBelief,
-    sides: HiddenBelief,
-    births: tuple[int, ...],
-    alarmed: Sequence[bool],
-    rearmed: Sequence[bool],
-    measurement: Measurement,
-    site: SiteGeometry,
-) -> BirthDeath:
-    """Return the tracks with hidden entities born, updated and removed.
+    memory: Memory, alarmed: Sequence[bool], measurement: Measurement, site: SiteGeometry
+) -> Memory:
+    """Return the memory with hidden entities born, updated and removed.
 
-    Shapes: alarmed (K,), rearmed (K,).
+    Shapes: alarmed (K,).
     """
-    settings, kept, counts = site.settings, list(tracks), list(births)
-    begun = []
-    for k in range(len(site.sides)):
-        current = hidden_on(kept, k)
-        if current is None:
-            heard = sides.hidden[k] >= settings.birth_probability or alarmed[k]
-            if heard and rearmed[k]:
-                # What came into view from here before was another vehicle: the new one starts without its
-                # mass.
-                explanation = explanation.forget_origin(k)
-                begun.append(k)
-                returning = _returning(kept, k, measurement.stamp_ns, site)
-                existence = min(sides.hidden[k], 1.0)
-                if returning is None:
-                    kept.append(_born(k, counts[k], existence, measurement, site))
-                    counts[k] += 1
-                else:
-                    kept.remove(returning)
-                    kept.append(_hidden_again(returning, k, existence, measurement, site))
-        else:
+    settings, sides, kept, counts = site.settings, memory.sides, list(memory.tracks), list(memory.births)
+    rearm_ns = settings.rearm_s * NANOSECONDS_PER_SECOND
+    for k, before_ns in enumerate(memory.handover_ns):
+        current, existence = hidden_on(kept, k), sides.existence(k)
+        if current is not None:
             kept.remove(current)
-            existence = sides.existence(k)
-            labels = heard_as(current, measurement.kinds)
+            current = replace(current, labels=heard_as(current, measurement.kinds))
             if current.place is not None:
                 # It was announced, and is there until its place is lost.
-                kept.append(replace(current, labels=labels))
+                kept.append(current)
             elif existence >= settings.death_probability or alarmed[k]:
-                kept.append(replace(current, existence=existence, labels=labels))
-    return BirthDeath(tuple(kept), explanation, tuple(counts), tuple(begun))
+                kept.append(replace(current, existence=existence))
+            continue
+        rearmed = before_ns is None or memory.stamp_ns - before_ns > rearm_ns
+        if rearmed and (sides.hidden[k] >= settings.birth_probability or alarmed[k]):
+            # What came into view from here before was another vehicle: the new one starts without its mass.
+            memory = memory.explained(partial(ExplanationBelief.forget_origin, direction=k))
+            returning = _returning(kept, k, measurement.stamp_ns, site)
+            if returning is None:
+                kept.append(_born(k, counts[k], min(sides.hidden[k], 1.0), measurement, site))
+                counts[k] += 1
+            else:
+                kept.remove(returning)
+                kept.append(_hidden_again(returning, k, min(sides.hidden[k], 1.0), measurement, site))
+    return replace(memory, tracks=tuple(kept), births=tuple(counts))
 
 
 def merged_tracks(tracks: tuple[Track, ...], stamp_ns: int) -> tuple[tuple[Track, ...], dict[str, str]]:

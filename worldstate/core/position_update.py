@@ -7,6 +7,7 @@ from operator import attrgetter
 import numpy as np
 
 from worldstate.abduction.road_users import UNKNOWN
+from worldstate.belief.association import FORBIDDEN, emergence_density, joint_association
 from worldstate.belief.kinematics.cartesian import (
     CartesianBelief,
     at_position,
@@ -15,16 +16,22 @@ from worldstate.belief.kinematics.cartesian import (
     update_position,
 )
 from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
+from worldstate.belief.site_geometry import SiteGeometry, normal_share
+from worldstate.belief.track import (
+    Track,
+    after_empty_look,
+    after_sighting,
+    entity_id,
+    follow_places,
+    merged,
+    relabelled,
+)
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, wrap_angle
 from worldstate.measurement.position import Position, PositionScan, SearchedSector
 
-from .association import FORBIDDEN, emergence_density, joint_association
-from .existence import after_empty_look, after_sighting
-from .explanation import ExplanationBelief
-from .site_geometry import SiteGeometry, normal_share
-from .track import Track, entity_id, follow_places, merged, relabelled
-from .vision_update import VisionUpdate, emerged_sides
+from .hand_over import after_look
+from .memory import Memory
 
 # m/s, of a velocity that was not measured: wide, so that it decides nothing.
 _ANY_SPEED_STD = 100.0
@@ -47,22 +54,14 @@ _MOST_ENTITIES = 128
 _BY_ALL = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
 
 
-def position_update(
-    tracks: tuple[Track, ...],
-    explanation: ExplanationBelief,
-    scan: PositionScan,
-    weight: float,
-    born: int,
-    births: tuple[int, ...],
-    site: SiteGeometry,
-) -> tuple[VisionUpdate, tuple[int, ...]]:
-    """Return the result of one scan, and the hidden ones born so far by side; misses count by `weight`."""
+def position_update(memory: Memory, scan: PositionScan, weight: float, site: SiteGeometry) -> Memory:
+    """Return the memory after one scan; misses count by `weight`."""
     # Sorted, so that the state does not depend on the order in which a sensor lists what it found.
-    positions = tuple(sorted(scan.positions, key=_BY_ALL))
+    positions, tracks = tuple(sorted(scan.positions, key=_BY_ALL)), memory.tracks
     whose = joint_association(
         _log_ratios(tracks, positions, scan, site), np.array([track.detected for track in tracks], bool)
     )
-    found, after = whose.found, []
+    found, after = whose.found, list[Track]()
     for i, (track, chance) in enumerate(zip(tracks, whose.chances, strict=True)):
         existence = track.existence
         if scan.searched is not None:
@@ -71,20 +70,15 @@ def position_update(
             after.append(_found(track, positions[found[i]], existence, scan, site))
         else:
             after.append(_missed(track, existence, scan.searched))
-    handed_over = whose.handed_over(tracks, after, site.settings)
-    for side, residual in handed_over.items():
-        explanation = explanation.emerge(side, residual)
-    counts, fresh = list(births), []
+    births, sighted = list(memory.births), memory.sighted
     unknown = [one for j, one in enumerate(positions) if j not in found.values()]
     for position in unknown[: max(_MOST_ENTITIES - len(tracks), 0)]:
-        track = _born(position, scan, counts, born, site)
-        counts[track.side] += track.was_hidden
-        born += not track.was_hidden
-        fresh.append(track)
-    known = follow_places([*after, *fresh], site)
-    emerged = emerged_sides(handed_over, known[len(after) :], site)
-    seen = VisionUpdate(known, explanation, handed_over, emerged, born)
-    return seen, tuple(counts)
+        track = _born(position, scan, births, sighted, site)
+        births[track.side] += track.was_hidden
+        sighted += not track.was_hidden
+        after.append(track)
+    memory = replace(memory, births=tuple(births), sighted=sighted)
+    return after_look(memory, follow_places(after, site), whose, scan.stamp_ns, site)
 
 
 def _log_new(scan: PositionScan, site: SiteGeometry) -> float:
