@@ -2,7 +2,11 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,6 +62,41 @@ def test_a_hidden_place_is_not_stated_wider_than_drivers_vary(labelled):
     for (start, _), one in zip(starts, passes, strict=True):
         stated_m = np.interp(t0_s(start, 5.0) - 2.0, one.track.time_s, one.track.position_std_m)
         assert 0.6 < stated_m < 2.3
+
+
+@pytest.mark.parametrize(("missing", "told"), [("gtsam", "RTS smoother"), ("gtsam filterpy", "[smoothing]")])
+def test_without_gtsam_the_rts_smoother_makes_the_labels(missing, told):
+    program = """
+import sys
+sys.modules |= dict.fromkeys(sys.argv[1].split())
+import numpy as np
+from passing_boxes import CAMERA, passing
+from worldstate.adapters.camera.detections import DetectionFilter
+from worldstate.ground.errors import MissingExtraError
+from worldstate.operations.labelling.box_tracks import box_tracks
+from worldstate.operations.labelling.pass_labels import label_passes
+log = passing([(1.0, 1), (1.5, -1)], 5.0, np.random.default_rng(0))
+try:
+    for one in label_passes(box_tracks(log, CAMERA, DetectionFilter())):
+        print(one.track.smoother, one.t0.time_s, *one.track.states[30, :2], one.track.time_s[30], sep=",")
+except MissingExtraError as error:
+    print(error)
+"""
+    path = os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parents[1])])
+    ran = subprocess.run(
+        [sys.executable, "-c", program, missing],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert told in ran.stdout
+    for (start, side), line in zip([(1.0, 1), (1.5, -1)], ran.stdout.splitlines(), strict=False):
+        if told == "RTS smoother":
+            at_s, x, y, hidden_s = map(float, line.split(",")[1:])
+            assert abs(at_s - t0_s(start, 5.0)) < 0.1
+            # Two seconds before T0.
+            assert math.hypot(x - LANE_M, y - side * (20.0 - 5.0 * (hidden_s - start))) < 2.0
 
 
 def test_who_drives_ahead_or_stands_comes_out_of_no_arm():
@@ -169,7 +208,7 @@ def test_the_command_labels_a_recording(recording, tmp_path, capsys):
     assert {one.label for one in listed} >= {"left", "right", "front"}
     assert {one.path for one in listed} == {tmp_path / "street" / "street.wav"}
     capsys.readouterr()
-    assert main([*recording[:2], "--out", str(out)]) == 2
+    assert main([*recording[:3], "--out", str(out)]) == 2
     assert "--detections" in capsys.readouterr().err
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from worldstate.belief.kinematics.cartesian import constant_velocity
 from worldstate.belief.site_geometry import normal_share
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
@@ -80,8 +81,7 @@ def motion_noise(settings: SmoothingSettings, step_s: float) -> NoiseModel:
     """Return the noise of (x, y, vx, vy) after a step of white acceleration."""
     import gtsam
 
-    t = max(step_s, 1e-3)
-    unit = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
+    _, unit = constant_velocity(max(step_s, 1e-3))
     plain = gtsam.noiseModel.Gaussian.Covariance(settings.acceleration_psd * unit)
     if settings.manoeuvre_k is None:
         return plain
@@ -110,7 +110,7 @@ def motion_factor(before: Node, after: Node, step_s: float, noise: NoiseModel) -
 
 @lru_cache(maxsize=64)
 def _flow(step_s: float) -> FloatArray:
-    return np.eye(4) + step_s * np.eye(4, k=_PLANE)
+    return constant_velocity(step_s)[0]
 
 
 def bearing_factor(node: Node, one: Bearing, settings: SmoothingSettings) -> Factor:

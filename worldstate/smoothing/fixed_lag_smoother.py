@@ -29,7 +29,7 @@ from .observations import (
     ReflectedBearing,
     SmoothingSettings,
 )
-from .smoothed_track import FirstSight, SmoothedTrack
+from .smoothed_track import FirstSight, SmoothedTrack, crossing
 from .vector_factor import CORNER, EGO, ENTITY, HEIGHT, WALL, Factor, key_of
 
 # Of (theta, theta_dot, rho) of an entity that nobody has told anything of: anywhere, passing or closing at
@@ -273,15 +273,12 @@ class FixedLagSmoother:
             beyond.append(found)
             # The pose is known far better than either of the others.
             slopes.append(np.concatenate([by[0][0], by[-1][0]]))
-        crossed = [i for i in range(1, len(stamps)) if beyond[i - 1] > 0.0 >= beyond[i]]
-        if not crossed:
+        passed = crossing(stamps, beyond)
+        if passed is None:
             return None
-        i = crossed[-1]
-        step_s = seconds(stamps[i] - stamps[i - 1])
-        share, rate = beyond[i - 1] / (beyond[i - 1] - beyond[i]), (beyond[i - 1] - beyond[i]) / step_s
+        i, time_s, rate = passed
         spread = refined.joint_covariance(one.keys[stamps[i]], edge.key)
-        std_s = math.sqrt(slopes[i] @ spread @ slopes[i]) / rate
-        return FirstSight(seconds(stamps[i - 1]) + share * step_s, std_s)
+        return FirstSight(time_s, math.sqrt(slopes[i] @ spread @ slopes[i]) / rate)
 
     def _start(self, stamp_ns: int) -> None:
         if self._origin_ns is None:

@@ -1,11 +1,14 @@
 """What the smoother says of an entity: where it was, hidden phase included, and when it came into view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.typing import FloatArray, IntArray
+from worldstate.ground.values import seconds
 
 from .geometry import cartesian
 
@@ -43,6 +46,8 @@ class SmoothedTrack:
         Polar states about `anchor_m`, mean (n, 4) and covariance (n, 4, 4).
     anchor_m : ndarray, shape (2,)
         Where the ego stood when the entity was first observed.
+    smoother : {"fixed-lag smoother", "RTS smoother"}
+        By which it was made: gtsam's factor graph, or filterpy's where gtsam is not installed.
 
     Examples
     --------
@@ -56,6 +61,7 @@ class SmoothedTrack:
     stamps_ns: IntArray
     motion: MotionBelief
     anchor_m: FloatArray
+    smoother: Literal["fixed-lag smoother", "RTS smoother"] = "fixed-lag smoother"
 
     @property
     def time_s(self) -> FloatArray:
@@ -77,3 +83,20 @@ class SmoothedTrack:
     def position_std_m(self) -> FloatArray:
         """Standard deviation of the position along its longest axis, shape (n,)."""
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, -1]))
+
+
+def crossing(stamps_ns: Sequence[int], beyond: Sequence[float]) -> tuple[int, float, float] | None:
+    """Return the state after the last passage of an edge, its time, s, and the rate there; None without one.
+
+    Examples
+    --------
+    >>> crossing([0, 10**9], [0.25, -0.25])
+    (1, 0.5, 0.5)
+    """
+    crossed = [i for i in range(1, len(stamps_ns)) if beyond[i - 1] > 0.0 >= beyond[i]]
+    if not crossed:
+        return None
+    i = crossed[-1]
+    step_s = seconds(stamps_ns[i] - stamps_ns[i - 1])
+    share, rate = beyond[i - 1] / (beyond[i - 1] - beyond[i]), (beyond[i - 1] - beyond[i]) / step_s
+    return i, seconds(stamps_ns[i - 1]) + share * step_s, rate

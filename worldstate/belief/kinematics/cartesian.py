@@ -72,6 +72,13 @@ def arc(speed_mps: float, yaw_rate_rad_s: float, step_s: float) -> tuple[float, 
     return speed_mps * step_s * float(np.sinc(0.5 * turned / math.pi)), turned
 
 
+def constant_velocity(step_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return F, and Q of a white acceleration of density 1, shape (4, 4) each."""
+    t = step_s
+    noise = np.kron(np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]]), np.eye(2))
+    return np.eye(4) + t * np.eye(4, k=2), noise
+
+
 def predict_place(
     belief: CartesianBelief,
     step_s: float,
@@ -85,8 +92,7 @@ def predict_place(
 
     with u the chord that the ego vehicle drives, and R the turn of its axes the other way.
     """
-    t, flow = step_s, np.eye(4) + step_s * np.eye(4, k=2)
-    noise = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
+    flow, noise = constant_velocity(step_s)
     mean = belief.mean @ flow.T
     chord, turned = arc(ego_speed_mps, ego_yaw_rate_rad_s, step_s)
     mean[..., :2] -= chord * np.array([math.cos(0.5 * turned), math.sin(0.5 * turned)])

@@ -74,7 +74,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         rows = _windows(arguments, source, tracks, passes, file)
         write_window_labels(arguments.windows, rows)
         summary |= {"windows": str(arguments.windows), "n_windows": len(rows)}
-    lines = [f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}" for one in passes]
+    lines = [
+        f"{one.t0.time_s:9.2f} s +- {one.t0.std_s:.2f}  {one.arm:5}  {one.label}, {one.track.smoother}"
+        for one in passes
+    ]
     return CommandResult(summary, lines=lines)
 
 

@@ -27,6 +27,7 @@ CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
 def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
     """Return the passes as an OpenLABEL document: objects with T0, a frame every tenth of a second."""
     objects, frames = {}, dict[str, dict[str, Any]]()
+    smoother = next((one.track.smoother for one in passes), "fixed-lag smoother")
     for number, one in enumerate(passes):
         objects[str(number)] = {
             "name": f"{one.arm}-{number}",
@@ -51,7 +52,7 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
         "openlabel": {
             "metadata": {
                 "schema_version": "1.0.0",
-                "annotator": f"worldstate {__version__}, fixed-lag smoother",
+                "annotator": f"worldstate {__version__}, {smoother}",
                 "tagged_file": recording,
             },
             "coordinate_systems": {"base_link": {"type": "local_cs", "parent": ""}},

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother
 from worldstate.smoothing.observations import AngularHeight, Observation, SmoothingSettings
+from worldstate.smoothing.rts import rts_first_sight, rts_track
 from worldstate.smoothing.smoothed_track import FirstSight, SmoothedTrack
 from worldstate.state.context import blind_corner
 
@@ -58,7 +59,10 @@ def label_passes(
     settings: SmoothingSettings | None = None,
     on_pass: Callable[[], None] = lambda: None,
 ) -> list[PassLabel]:
-    """Return the labels of all vehicles that came out of an arm, in the order of their boxes."""
+    """Return the labels of all vehicles that came out of an arm, in the order of their boxes.
+
+    By the factor graph; where gtsam is not installed, by the RTS smoother of filterpy.
+    """
     # Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
     # runs off and the system is indeterminate.
     chosen = settings or SmoothingSettings(
@@ -101,20 +105,38 @@ def _smoothed(
     camera_ahead_m: float,
     settings: SmoothingSettings,
 ) -> PassLabel | None:
-    edge = edges[one.arm or ""]
+    observed = _observations(one, camera_ahead_m)
+    stamped = {nanoseconds(at * HOP_S): observed[at] for at in sorted(observed)}
+    smooth = _by_rts if find_spec("gtsam") is None else _by_graph
+    track, t0 = smooth(name, one.arm or "", edges[one.arm or ""], stamped, settings)
+    return None if t0 is None else PassLabel(one.arm or "", one.label, t0, track, one.edge_rad)
+
+
+def _by_graph(
+    name: str,
+    arm: str,
+    edge: tuple[float, float],
+    observed: dict[int, list[Observation]],
+    settings: SmoothingSettings,
+) -> tuple[SmoothedTrack, FirstSight | None]:
     smoother = FixedLagSmoother(settings)
-    side: Literal[1, -1] = 1 if one.arm == "left" else -1
     place = _CORNER_M * np.array([math.cos(edge[0]), math.sin(edge[0])])
-    smoother.add_corner("edge", side, place.tolist(), (_CORNER_M * edge[1],) * 2)
-    observations = _observations(one, camera_ahead_m)
-    times = sorted(observations)
-    smoother.begin(name, nanoseconds(times[0] * HOP_S), start_of(one.arm or ""))
-    for at in times:
-        smoother.update(nanoseconds(at * HOP_S), {name: observations[at]})
-    t0 = smoother.first_sight(name, "edge")
-    if t0 is None:
-        return None
-    return PassLabel(one.arm or "", one.label, t0, smoother.track(name), one.edge_rad)
+    smoother.add_corner("edge", 1 if arm == "left" else -1, place.tolist(), (_CORNER_M * edge[1],) * 2)
+    smoother.begin(name, min(observed), start_of(arm))
+    for stamp_ns, every in observed.items():
+        smoother.update(stamp_ns, {name: every})
+    return smoother.track(name), smoother.first_sight(name, "edge")
+
+
+def _by_rts(
+    name: str,
+    arm: str,
+    edge: tuple[float, float],
+    observed: dict[int, list[Observation]],
+    settings: SmoothingSettings,
+) -> tuple[SmoothedTrack, FirstSight | None]:
+    track = rts_track(name, start_of(arm), observed)
+    return track, rts_first_sight(track, 1 if arm == "left" else -1, *edge)
 
 
 def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observation]]:
