@@ -3,7 +3,6 @@ from .dataset.dataset import write_recording as write_recording
 from .dataset.plan import DatasetSettings as DatasetSettings
 from .dataset.recording import SimulatedRecording as SimulatedRecording
 from .dataset.recording import simulate_recording as simulate_recording
-from .scene.ego_motion import EgoMotion as EgoMotion
 from .scene.junction import MOVING_SITES as MOVING_SITES
 from .scene.junction import SITES as SITES
 from .scene.junction import Site as Site
@@ -15,6 +14,7 @@ from .scene.presets import DEFAULT_PRESET as DEFAULT_PRESET
 from .scene.presets import PRESETS as PRESETS
 from .scene.presets import Preset as Preset
 from .scene.presets import preset as preset
+from .scene.route import EgoMotion as EgoMotion
 from .scene.settings import SimulationSettings as SimulationSettings
 from .scene.settings import VehicleSettings as VehicleSettings
 from .scene.settings import draw_settings as draw_settings

@@ -8,8 +8,7 @@ from tutorial_options import tutorial_options
 from worldstate import MicrophoneArray
 from worldstate.adapters import save_model
 from worldstate.commissioning.commission import commission, exam_of
-from worldstate.commissioning.exam_figure import write_exam_figure
-from worldstate.commissioning.exam_report import exam_figures
+from worldstate.commissioning.exam_report import exam_figures, write_exam_figure
 from worldstate.commissioning.plan import CommissionSettings, quick_settings
 
 CORNERS = [(x, y, 0.0) for x in (0.1, -0.1) for y in (0.1, -0.1)]

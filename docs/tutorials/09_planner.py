@@ -5,7 +5,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from tutorial_options import tutorial_options
-from worldstate_lab.planner.ego_vehicle import EgoVehicle
+from worldstate_lab.planner.encounters import EgoVehicle
 
 from worldstate import WorldState, listen, open_source
 from worldstate.operations.figure_style import BLUE, GREEN, RED, figure_file

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 from worldstate_lab.planner.believed_stream import BelievedStream, with_chances
 from worldstate_lab.planner.closed_loop import drive_through
-from worldstate_lab.planner.ego_vehicle import FROM_STANDING, EgoVehicle
-from worldstate_lab.planner.encounters import STEP_S, Encounters
+from worldstate_lab.planner.encounters import FROM_STANDING, STEP_S, EgoVehicle, Encounters
 from worldstate_lab.planner.planner_exam import (
     CHANCE,
     FULL,

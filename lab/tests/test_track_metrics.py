@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from worldstate_lab.metrics.gospa import gospa_bearing
-from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, track_measures
+from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import wrap_angle

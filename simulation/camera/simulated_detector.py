@@ -9,10 +9,10 @@ import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.simulation.scene.ego_motion import ARRAY_HEIGHT_M
+from worldstate.simulation.scene.driving import camera_sees
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import LIGHT, VehicleKind
-from worldstate.simulation.scene.sight import camera_sees
+from worldstate.simulation.scene.route import ARRAY_HEIGHT_M
 from worldstate.simulation.scene.vehicle import LENGTH_M, WIDTH_M, Trajectory
 
 LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs

@@ -6,8 +6,8 @@ from functools import lru_cache, partial
 import numpy as np
 
 from worldstate.ground.typing import BoolArray, Float32Array, ImageArray
-from worldstate.simulation.scene.ego_motion import ARRAY_HEIGHT_M
 from worldstate.simulation.scene.junction import Site, site_generator
+from worldstate.simulation.scene.route import ARRAY_HEIGHT_M
 
 from .rays import OVERSAMPLING, Panel, Patch, View, cast_panels, reduced
 from .textures import Facade, asphalt, flags, grass, leaves, paving, smooth_noise, tinted

@@ -9,14 +9,11 @@ from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.sound_kinds import SoundKind
 
-from .bells import bell, bicycle_bell
 from .birds import birds
-from .music import music
+from .machines import drill, saw, tone
+from .music import bell, bicycle_bell, music
+from .people import steps, voice
 from .signals import gate
-from .steps import steps
-from .tones import tone
-from .tools import drill, saw
-from .voice import voice
 from .warning_signals import beeper, horn, siren, wail
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]

@@ -16,15 +16,13 @@ from worldstate.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.late_field import add_late_sound
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.scatter import scattering
 from worldstate.simulation.sound.scattered_sound import add_scattered
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 from .emitter import emitted
-from .gusts import add_gusts
-from .rain import add_rain
+from .weather import add_gusts, add_rain
 
 # Silence before and after: the octave bands of a sound that begins at once begin a little earlier.
 SILENT_BLOCKS = 8

@@ -7,11 +7,11 @@ import numpy as np
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 
-from .ego_motion import EgoMotion
 from .junction import MOVING_SITES, Site, site
 from .kinds import VehicleKind, vehicle_kind
 from .places import Way, place_of
 from .presets import Preset, preset
+from .route import EgoMotion
 from .sound_kinds import SIGNALS
 from .sound_settings import SoundSettings
 

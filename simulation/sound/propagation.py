@@ -13,10 +13,9 @@ from .air import air_gain, ground_gain
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import MovingSource
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls, trace_paths
-from .receiver import Receiver, add_along, add_to_all, add_turning
+from .receiver import Receiver, Surroundings, add_along, add_to_all, add_turning, in_own_street
 from .screened import ScreenedLeg, open_images, screened_legs
 from .static_field import StaticSources
-from .surroundings import Surroundings, in_own_street
 
 TYPICAL_LEG_M = 8.0  # source to corner; only the tilt of the last leg depends on it
 ANY_ORDER = range(99)

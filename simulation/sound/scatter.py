@@ -31,8 +31,7 @@ from .paths import (
     source_images,
     through_mouth,
 )
-from .receiver import NEAREST_M
-from .surroundings import Surroundings
+from .receiver import NEAREST_M, Surroundings
 
 PATCH_M = 0.9  # along the wall
 WALL_HEIGHT_M = 3.0  # what of a wall is near enough to matter

@@ -10,7 +10,7 @@ from .delay import KNOT_SAMPLES, add_delayed, emission_times
 from .diffraction import SPEED_OF_SOUND_MPS
 from .emission import Emission, MovingSource
 from .paths import receiver_images
-from .receiver import NEAREST_M, Receiver, add_turning, distance_m
+from .receiver import NEAREST_M, Receiver, Surroundings, add_turning, distance_m
 from .scatter import (
     IMAGE_ORDERS,
     FirstLeg,
@@ -22,7 +22,6 @@ from .scatter import (
     seen_through_mouth,
 )
 from .static_field import StaticSources
-from .surroundings import Surroundings
 
 # Left out where it is 30 dB below all that rough walls send on together: while the ego moves most patches and
 # images are, at any moment. Features change by 1e-4 rms.

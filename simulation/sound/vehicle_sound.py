@@ -12,11 +12,10 @@ from .delay import KNOT_SAMPLES
 from .emission import Emission, MovingSource
 from .late_field import add_late_sound
 from .propagation import ANY_ORDER, add_sources
-from .receiver import Receiver
+from .receiver import Receiver, Surroundings
 from .scatter import scattering
 from .scattered_sound import add_scattered
 from .static_field import StaticSources
-from .surroundings import Surroundings
 
 # From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
 # whether the second image is lit, on the vehicle's own side, hangs on a metre.

@@ -1,15 +1,38 @@
-"""The background of a stream, piece by piece, without a seam."""
+"""What a stream keeps throughout: the faults of its microphones, and a background without a seam."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.typing import Float32Array
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.ambience import Ambience, recording_ambience, site_ambience
 from worldstate.simulation.sound.background import add_background
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.receiver import Receiver, standing_m
 
-from .microphones import Microphones
 from .settings import StreamSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Microphones:
+    """Where the microphones are and how they differ."""
+
+    positions_m: FloatArray  # shape (M, 3): In `base_link`, z above the road
+    skew_s: FloatArray  # shape (M,): Phase mismatch as a delay
+    gains: FloatArray  # shape (M,): About 1
+    sample_rate_hz: float
+
+
+def draw_microphones(
+    settings: StreamSettings, array: MicrophoneArray, rng: np.random.Generator
+) -> Microphones:
+    """Draw what differs between the channels, once for a whole stream."""
+    positions = standing_m(array)
+    skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
+    gains = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(positions)) / 20.0)
+    return Microphones(positions, skew, gains, settings.sample_rate_hz)
+
 
 # As long as a distant vehicle swells or fades: one that is cut by a piece's end would begin within a shorter
 # overlap as no vehicle does (with 2 s the spectrogram showed where the pieces begin).

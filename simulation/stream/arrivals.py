@@ -7,10 +7,10 @@ import numpy as np
 
 from worldstate.ground.typing import FloatArray
 from worldstate.simulation.scene.drawn_sounds import with_sounds
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
 from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.scene.settings import EGO_STOPS_AFTER_S, SimulationSettings
 from worldstate.simulation.scene.sound_settings import SoundSettings
 

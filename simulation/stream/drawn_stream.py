@@ -9,9 +9,8 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Float32Array
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 
-from .ambience import stream_ambience
+from .ambience import draw_microphones, stream_ambience
 from .arrivals import SoundEvent, draw_events, draw_sounds
-from .microphones import draw_microphones
 from .rendering import Block, StreamScene, render_blocks
 from .settings import StreamSettings
 from .truth import VehicleTruth, vehicle_truth

@@ -6,17 +6,17 @@ import numpy as np
 
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
 from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.receiver import Receiver
 from worldstate.simulation.sound.static_field import StaticSources
 from worldstate.simulation.sound.vehicle_sound import add_vehicle
 
+from .ambience import Microphones
 from .arrivals import STANDING, Event, SoundEvent, VehicleEvent
-from .microphones import Microphones
 
 HEAD_START_S = 1.0  # emission begins this long before it is heard: 100 m of way and the late field
 FADE_S = 2.0

@@ -15,10 +15,9 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import add_ego_echo, ego_noise
 from worldstate.simulation.sound.receiver import Receiver
 
-from .ambience import ambience_piece, overlap_samples
+from .ambience import Microphones, ambience_piece, overlap_samples
 from .arrivals import Event
 from .event_sound import ALWAYS_S, ROW_S, event_blocks, event_sound, loudness_db
-from .microphones import Microphones
 from .settings import StreamSettings
 
 # What one process renders at a time: 40 MB of sound for 56 channels at 6 kHz, 80 MB at the full rate.

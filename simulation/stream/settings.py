@@ -6,9 +6,9 @@ import numpy as np
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site, ego_moves
 from worldstate.simulation.scene.presets import Preset, preset
+from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SAMPLE_RATE_HZ
 
 from .traffic import Traffic, traffic_named

@@ -15,8 +15,8 @@ from worldstate.simulation.camera.simulated_detector import (
     lost,
     park,
 )
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.route import EgoMotion
 
 from .arrivals import STANDING, SoundEvent, VehicleEvent
 from .settings import StreamSettings

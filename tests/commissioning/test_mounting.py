@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from worldstate.commissioning.bearing_exam import in_view_bearings
+from worldstate.commissioning.exam_report import in_view_bearings
 from worldstate.commissioning.heard_stream import HeardStream, hear_stream
-from worldstate.commissioning.mounting import mountings
+from worldstate.commissioning.plan import mountings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation import site

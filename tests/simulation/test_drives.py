@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.simulation import preset
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import drawn_site
 from worldstate.simulation.scene.kinds import LIGHT
+from worldstate.simulation.scene.route import EgoMotion
+from worldstate.simulation.stream.ambience import draw_microphones
 from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
 from worldstate.simulation.stream.drawn_stream import draw_stream
 from worldstate.simulation.stream.event_sound import event_sound, loudness_db
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
-from worldstate.simulation.stream.microphones import draw_microphones
 from worldstate.simulation.stream.settings import StreamSettings
 from worldstate.simulation.stream.traffic import traffic_named
 

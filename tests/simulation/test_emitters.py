@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.signal import bilinear_zpk, find_peaks, sosfilt, stft, zpk2sos
 
 from worldstate.simulation.emitters.emitter import SYNTHESES, emitted
-from worldstate.simulation.emitters.tools import saw, saw_motion
+from worldstate.simulation.emitters.machines import saw, saw_motion
 from worldstate.simulation.scene.octave_bands import split_octaves
 from worldstate.simulation.scene.sound_kinds import MICROPHONES, SOUNDS
 

@@ -10,17 +10,15 @@ from hypothesis import strategies as st
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.occluders import OccludingBody
-from worldstate.simulation.scene.route import along
+from worldstate.simulation.scene.route import EgoMotion, along
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 FS, NFFT, HEIGHT_M = 12_000.0, 128, 1.7
 HEAD_S = 0.4  # sound from 130 m away has arrived when the recording begins

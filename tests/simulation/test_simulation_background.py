@@ -12,9 +12,9 @@ from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.ambience import site_ambience
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.places import place
+from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.scene.vehicle import Trajectory, drive, load_db
 from worldstate.simulation.sound.background import add_background, opening_images
 from worldstate.simulation.sound.delay import KNOT_SAMPLES

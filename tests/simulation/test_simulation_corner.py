@@ -13,9 +13,8 @@ from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, SPEED_OF_SOUND
 from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.paths import through_mouth, trace_paths
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 C = SPEED_OF_SOUND_MPS
 

@@ -22,18 +22,17 @@ from worldstate.simulation import (
     site,
 )
 from worldstate.simulation.scene.driving import trajectories
-from worldstate.simulation.scene.ego_motion import EgoMotion
 from worldstate.simulation.scene.junction import Site
+from worldstate.simulation.scene.route import EgoMotion
 from worldstate.simulation.sound import scattered_sound
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver, add_turning
+from worldstate.simulation.sound.receiver import Receiver, Surroundings, add_turning
 from worldstate.simulation.sound.scatter import scattering
 from worldstate.simulation.sound.scattered_sound import add_scattered
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS

@@ -11,11 +11,11 @@ from scipy.spatial import ConvexHull
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import SimulationSettings, draw_settings, site
 from worldstate.simulation.scene.driving import trajectories
-from worldstate.simulation.scene.ego_motion import BRAKING_MPS2, EgoMotion
 from worldstate.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
 from worldstate.simulation.scene.occluders import OccludingBody, box, detours, hidden_by
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
 from worldstate.simulation.scene.places import place
+from worldstate.simulation.scene.route import BRAKING_MPS2, EgoMotion
 from worldstate.simulation.scene.vehicle import (
     GEARS_HZ_PER_MPS,
     IDLE_HZ,

@@ -18,9 +18,8 @@ from worldstate.simulation.sound.delay import (
 )
 from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from worldstate.simulation.sound.emission import Emission, MovingSource
-from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS

@@ -40,9 +40,8 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.paths import trace_paths
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver
+from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 FS = 48_000.0
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])

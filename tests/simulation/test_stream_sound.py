@@ -27,11 +27,10 @@ from worldstate.simulation import SITES, preset, site
 from worldstate.simulation.scene.ambience import site_ambience
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.sound_settings import SoundSettings
-from worldstate.simulation.stream.ambience import OVERLAP_S
+from worldstate.simulation.stream.ambience import OVERLAP_S, draw_microphones
 from worldstate.simulation.stream.arrivals import Event, SoundEvent, VehicleEvent
 from worldstate.simulation.stream.event_sound import event_sound, loudness_db
 from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver
-from worldstate.simulation.stream.microphones import draw_microphones
 from worldstate.simulation.stream.rendering import (
     EVENT,
     StreamScene,

@@ -30,9 +30,8 @@ from worldstate.simulation.stream.settings import StreamSettings
 
 from .guard_training import train_guard
 from .heard_stream import HeardStream, hear_recording, hear_stream
-from .mounting import mountings
 from .open_field import N_OPEN, open_field_features, open_field_windows
-from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams, mounting_streams
+from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams, mounting_streams, mountings
 from .road_user_training import train_road_users
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for

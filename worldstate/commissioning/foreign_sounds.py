@@ -16,10 +16,9 @@ from worldstate.simulation.scene.drawn_sounds import with_sounds
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SimulationSettings
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.simulation.sound.receiver import standing_m
-from worldstate.simulation.stream.ambience import ambience_piece, stream_ambience
+from worldstate.simulation.stream.ambience import Microphones, ambience_piece, stream_ambience
 from worldstate.simulation.stream.arrivals import SOUND_MARGIN_S, Event, SoundEvent
 from worldstate.simulation.stream.event_sound import event_sound
-from worldstate.simulation.stream.microphones import Microphones
 from worldstate.simulation.stream.settings import StreamSettings
 
 from .heard_stream import HeardStream

@@ -28,9 +28,8 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.simulation.sound.emission import Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver, standing_m
+from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
 from worldstate.simulation.sound.static_field import StaticSources
-from worldstate.simulation.sound.surroundings import Surroundings
 
 # 180 windows at a weight of .1 took the other side, named with p > .5, from .39 of the windows to .03
 # (prototype); more of them, or heavier ones, call real hidden vehicles direct.

@@ -33,7 +33,7 @@ from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.state import WorldState
 from worldstate_lab.methods.oc_sort import OcSort
-from worldstate_lab.metrics.gospa import gospa_bearing
+from worldstate_lab.metrics.track_measures import gospa_bearing
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import stream_measurements
 

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     import numpy as np
 
     from worldstate.ground.checks import in_range
-    from worldstate_lab.planner.ego_vehicle import FROM_STANDING, EgoVehicle
+    from worldstate_lab.planner.encounters import FROM_STANDING, EgoVehicle
     from worldstate_lab.planner.planner_exam import (
         THRESHOLDS,
         approaches_drawn,

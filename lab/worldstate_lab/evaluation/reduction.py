@@ -13,8 +13,7 @@ from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, SLACK_S
 from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.gospa import gospa_bearing
-from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, track_measures
+from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 from worldstate_lab.trials.trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 
 # The paper's, before line-of-sight entry.

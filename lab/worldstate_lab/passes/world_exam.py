@@ -25,8 +25,7 @@ from worldstate.operations.labelling.street_sound import HeardStreet
 from worldstate.simulation.scene.junction import site
 from worldstate.state.context import Context, corner_at
 
-from .followed_stream import followed
-from .measured_stream import measurements
+from .followed_stream import followed, measurements
 from .pass_outcomes import PassedStream
 from .stream_camera import stream_detections, with_mover, without_passes
 

@@ -7,8 +7,7 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.ground.typing import BoolArray, FloatArray
 
-from .ego_vehicle import EgoVehicle
-from .encounters import HALF_LANE_M, HOP_STEPS, STEP_S, STEPS, Encounters
+from .encounters import HALF_LANE_M, HOP_STEPS, STEP_S, STEPS, EgoVehicle, Encounters
 
 HORIZON_S = 3.0
 NEEDED_WITHIN_S = 1.0

@@ -12,8 +12,7 @@ from worldstate_lab.metrics.intervals import draw_weights, middle, stratified_dr
 
 from .believed_stream import BelievedStream
 from .closed_loop import Drives, drive_through
-from .ego_vehicle import EgoVehicle
-from .encounters import Encounters, approach_encounters, empty_encounters, recorded_approaches
+from .encounters import EgoVehicle, Encounters, approach_encounters, empty_encounters, recorded_approaches
 
 NOBODY, PHANTOM, FULL, CHANCE, LOUD = (
     "no knowledge",

@@ -9,8 +9,7 @@ import numpy as np
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, RED, SKY, figure_file
 
 from .closed_loop import sight_m
-from .ego_vehicle import EgoVehicle
-from .encounters import STEP_S, Encounters
+from .encounters import STEP_S, EgoVehicle, Encounters
 from .planner_exam import CHANCE, FULL, LOUD, NOBODY, PHANTOM, SHARES, CornerDrives, Corners
 
 if TYPE_CHECKING:

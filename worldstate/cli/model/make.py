@@ -76,12 +76,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.adapters.files.model_file import save_model
     from worldstate.cli.common.output import write_report
     from worldstate.commissioning.commission import LEARNING_STEPS, commission, exam_of
-    from worldstate.commissioning.exam_figure import write_exam_figure
     from worldstate.commissioning.exam_report import (
         REFERENCE,
         beside_reference,
         exam_figures,
         mounting_lines,
+        write_exam_figure,
     )
     from worldstate.commissioning.plan import exam_streams, learned_streams
     from worldstate.frontend.array.ovad_array import ovad_array

@@ -1,13 +1,15 @@
-"""Rain: drops round each microphone by itself, and the rain of the whole street from everywhere."""
+"""Weather at the microphones: rain round each of them and from the whole street, and gusts."""
 
 from functools import cache
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, level_curve
 from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.sound.background import noise_frequencies, shaped_noise, wind_density
 from worldstate.simulation.sound.receiver import Receiver
 from worldstate.simulation.sound.static_field import (
     StaticSources,
@@ -17,7 +19,7 @@ from worldstate.simulation.sound.static_field import (
 )
 
 from .emitter import a_weight, a_weighted
-from .signals import add_ringing, gate, octave_noise
+from .signals import add_ringing, bursts, gate, octave_noise
 
 # Drops that hit the sheet metal within a hand's breadth of a microphone (assumed: moderate rain, 4 mm/h), the
 # damped modes each of them excites, and how much louder the largest are: masses spread like an exponential.
@@ -29,7 +31,7 @@ FAR_WAVES, FAR_LIFT_RAD = 24, 0.3
 FAR_SHARE = 0.3  # of the energy at a microphone
 # Levels are those of the whole sound: a low sample rate hears less of it.
 WHOLE_HZ = np.arange(1.0, 20_000.0, 5.0)
-RAMP_S = 0.5  # a shower sets in
+SHOWER_RAMP_S = 0.5  # a shower sets in
 
 
 def add_rain(
@@ -39,7 +41,7 @@ def add_rain(
     rate, samples = receiver.sample_rate_hz, static.out.shape[1]
     level = REFERENCE_PA * 10.0 ** ((sound.what.level_db + sound.level_offset_db) / 20.0)
     begin = sound.start_s - receiver.knots_s[0]
-    swell = gate(samples, rate, [(begin, begin + sound.duration_s)], RAMP_S).astype(np.float32)
+    swell = gate(samples, rate, [(begin, begin + sound.duration_s)], SHOWER_RAMP_S).astype(np.float32)
     to_drops, to_street = rng.spawn(2)
     for channel, draws in zip(static.out, to_drops.spawn(len(static.out)), strict=True):
         channel += swell * _drumming(samples, rate, draws) * np.float32(level * np.sqrt(1.0 - FAR_SHARE))
@@ -83,3 +85,25 @@ def _hiss_pressure() -> float:
     """A-weighted pressure of a wave of the levels `FAR_DB`, Pa."""
     density = level_curve(np.array(FAR_DB), WHOLE_HZ) * a_weight(WHOLE_HZ) ** 2
     return float(np.sqrt(np.trapezoid(density, WHOLE_HZ)))
+
+
+GUST_S, LULL_S, GUST_RAMP_S = (0.5, 2.5), (0.3, 2.0), 0.2
+
+
+def add_gusts(
+    static: StaticSources, sound: SoundSettings, receiver: Receiver, rng: np.random.Generator
+) -> None:
+    """Add gusts to the microphones that they hit, to each of them by itself."""
+    if max(sound.channels) >= len(static.out) or min(sound.channels) < 0:
+        raise InvalidArgumentError(
+            f"channels of gusts: expected 0 to {len(static.out) - 1}, got {sound.channels}"
+        )
+    rate, samples = receiver.sample_rate_hz, static.out.shape[1]
+    level_db = sound.what.level_db + sound.level_offset_db
+    density = wind_density(level_db, noise_frequencies(samples, rate)) * rate
+    begin = sound.start_s - receiver.knots_s[0]
+    for channel, draws in zip(sound.channels, rng.spawn(len(sound.channels)), strict=True):
+        spans = bursts(sound.duration_s, GUST_S, LULL_S, draws)
+        within = [(begin + a, begin + min(b, sound.duration_s)) for a, b in spans if a < sound.duration_s]
+        blowing = gate(samples, rate, within, GUST_RAMP_S).astype(np.float32)
+        static.out[channel] += blowing * shaped_noise(density, samples, draws, 1)[0]
