@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.ground.checks import in_range
+from worldstate.ground.checks import in_range, one_of
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
@@ -187,8 +187,7 @@ def site(name: str) -> Site:
     """
     if name in MOVING_SITES:
         return replace(site("S" + name[1:]), name=name)
-    if name not in SITES:
-        raise InvalidArgumentError(f"site: expected one of {', '.join(SITES + MOVING_SITES)}, got {name!r}")
+    one_of("site", name, SITES + MOVING_SITES)
     return PLANS[name] if name in PLANS else drawn_site(name)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.checks import one_of
 
 Octaves = tuple[float, float, float, float, float, float, float, float]
 
@@ -158,6 +158,4 @@ KINDS = {kind.name: kind for kind in (LIGHT, MEDIUM, HEAVY, ELECTRIC, BICYCLE, S
 
 def vehicle_kind(name: str) -> VehicleKind:
     """Return a kind by its name."""
-    if name not in KINDS:
-        raise InvalidArgumentError(f"kind: expected one of {', '.join(KINDS)}, got {name!r}")
-    return KINDS[name]
+    return KINDS[one_of("kind", name, KINDS)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.checks import one_of
 
 from .junction import Site
 from .occluders import OccludingBody, box
@@ -138,9 +138,7 @@ def place(name: str) -> Place:
     >>> settings.site.occluders[0].corners_m[0], pier.approaches
     ((7.0, 1.0), ('left', 'right'))
     """
-    if name not in PLACES:
-        raise InvalidArgumentError(f"scene: expected one of {', '.join(PLACES)}, got {name!r}")
-    return PLACES[name]()
+    return PLACES[one_of("scene", name, PLACES)]()
 
 
 def place_of(site_name: str) -> Place | None:

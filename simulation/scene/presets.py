@@ -31,41 +31,15 @@ classifier's scores on simulated windows; what was kept of it (ambient octaves) 
 Earlier presets are not offered: the physics that they were set with is gone. A change is a new name.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from typing import Any
 
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.checks import finite_array, in_range, one_of
 
-LIMITS: dict[str, tuple[float, float]] = {
-    "ambient_spread_db": (0.0, 20.0),
-    "ambient_waves": (8, 512),
-    "wave_fluctuation_db": (0.0, 20.0),
-    "sky_share": (0.0, 1.0),
-    "opening_db": (-40.0, 20.0),
-    "site_ambient_db": (0.0, 20.0),
-    "site_wind_db": (0.0, 20.0),
-    "site_opening_db": (0.0, 20.0),
-    "opening_spread_db": (0.0, 20.0),
-    "wind_spread_db": (0.0, 20.0),
-    "far_spread_db": (0.0, 20.0),
-    "far_rate": (0.0, 10.0),
-    "far_level_db": (-60.0, 30.0),
-    "wind_100hz_db": (-20.0, 100.0),
-    "self_noise_db": (0.0, 80.0),
-    "gain_mismatch_db": (0.0, 10.0),
-    "delay_mismatch_s": (0.0, 1e-3),
-    "late_walled_db": (-90.0, 0.0),
-    "late_open_db": (-90.0, 0.0),
-    "late_decay_s": (0.05, 5.0),
-    "vehicle_level_db": (-30.0, 30.0),
-    "vehicle_spread_db": (0.0, 20.0),
-    "engine_spread_db": (0.0, 20.0),
-    "engine_bass_db": (-40.0, 20.0),
-    "ego_engine_db": (-60.0, 20.0),
-    "screen_cap_db": (5.0, 60.0),
-    "wall_scattering": (0.0, 1.0),
-    "late_lobe_share": (0.0, 1.0),
-}
+
+def _within(low: float, high: float, default: float) -> Any:
+    """Declare a number of a preset with its limits."""
+    return field(default=default, metadata={"limits": (low, high)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +103,7 @@ class Preset:
     Raises
     ------
     InvalidArgumentError
-        If a number is outside `LIMITS`.
+        If a number is outside its limits.
 
     Examples
     --------
@@ -139,41 +113,42 @@ class Preset:
 
     name: str
     ambient_octaves_db: tuple[float, ...] = (55.0, 54.5, 54.0, 52.0, 47.5, 40.0, 34.0, 28.0)
-    ambient_spread_db: float = 1.6
-    ambient_waves: int = 72
-    wave_fluctuation_db: float = 2.0
-    sky_share: float = 0.7
-    opening_db: float = -6.0
-    site_ambient_db: float = 4.0
-    site_wind_db: float = 3.0
-    site_opening_db: float = 3.0
-    opening_spread_db: float = 2.0
-    wind_spread_db: float = 2.6
-    far_spread_db: float = 3.0
-    far_rate: float = 0.6
-    far_level_db: float = -1.0
-    wind_100hz_db: float = 60.5
-    self_noise_db: float = 40.0
-    gain_mismatch_db: float = 0.5
-    delay_mismatch_s: float = 1e-5
-    late_walled_db: float = -12.0
-    late_open_db: float = -24.0
-    late_decay_s: float = 0.7
-    vehicle_level_db: float = 3.0
-    vehicle_spread_db: float = 2.4
-    engine_spread_db: float = 3.4
-    engine_bass_db: float = -10.0
-    ego_engine_db: float = -15.0
-    screen_cap_db: float = 24.0
-    wall_scattering: float = 0.15
-    late_lobe_share: float = 0.75
+    ambient_spread_db: float = _within(0.0, 20.0, 1.6)
+    ambient_waves: int = _within(8, 512, 72)
+    wave_fluctuation_db: float = _within(0.0, 20.0, 2.0)
+    sky_share: float = _within(0.0, 1.0, 0.7)
+    opening_db: float = _within(-40.0, 20.0, -6.0)
+    site_ambient_db: float = _within(0.0, 20.0, 4.0)
+    site_wind_db: float = _within(0.0, 20.0, 3.0)
+    site_opening_db: float = _within(0.0, 20.0, 3.0)
+    opening_spread_db: float = _within(0.0, 20.0, 2.0)
+    wind_spread_db: float = _within(0.0, 20.0, 2.6)
+    far_spread_db: float = _within(0.0, 20.0, 3.0)
+    far_rate: float = _within(0.0, 10.0, 0.6)
+    far_level_db: float = _within(-60.0, 30.0, -1.0)
+    wind_100hz_db: float = _within(-20.0, 100.0, 60.5)
+    self_noise_db: float = _within(0.0, 80.0, 40.0)
+    gain_mismatch_db: float = _within(0.0, 10.0, 0.5)
+    delay_mismatch_s: float = _within(0.0, 1e-3, 1e-5)
+    late_walled_db: float = _within(-90.0, 0.0, -12.0)
+    late_open_db: float = _within(-90.0, 0.0, -24.0)
+    late_decay_s: float = _within(0.05, 5.0, 0.7)
+    vehicle_level_db: float = _within(-30.0, 30.0, 3.0)
+    vehicle_spread_db: float = _within(0.0, 20.0, 2.4)
+    engine_spread_db: float = _within(0.0, 20.0, 3.4)
+    engine_bass_db: float = _within(-40.0, 20.0, -10.0)
+    ego_engine_db: float = _within(-60.0, 20.0, -15.0)
+    screen_cap_db: float = _within(5.0, 60.0, 24.0)
+    wall_scattering: float = _within(0.0, 1.0, 0.15)
+    late_lobe_share: float = _within(0.0, 1.0, 0.75)
 
     def __post_init__(self) -> None:
         octaves = finite_array("ambient_octaves_db", self.ambient_octaves_db, (8,))
         in_range("ambient_octaves_db", octaves.min(), -20.0, 100.0)
         in_range("ambient_octaves_db", octaves.max(), -20.0, 100.0)
-        for name, (low, high) in LIMITS.items():
-            in_range(name, getattr(self, name), low, high)
+        for one in fields(self):
+            if "limits" in one.metadata:
+                in_range(one.name, getattr(self, one.name), *one.metadata["limits"])
 
 
 PRESETS = {
@@ -206,6 +181,4 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
     >>> preset("street-6").ambient_waves
     72
     """
-    if name not in PRESETS:
-        raise InvalidArgumentError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
-    return PRESETS[name]
+    return PRESETS[one_of("preset", name, PRESETS)]

@@ -1,10 +1,10 @@
 """What is simulated: a site, an approach, and how the vehicles drive."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from worldstate.ground.checks import finite_array, in_range
+from worldstate.ground.checks import finite_array, in_range, one_of
 from worldstate.ground.errors import InvalidArgumentError
 
 from .junction import MOVING_SITES, Site, site
@@ -84,9 +84,9 @@ class VehicleSettings:
     signal: str = ""
 
     def __post_init__(self) -> None:
-        _one_of("approach", self.approach, ("left", "right"))
-        _one_of("signal", self.signal, ("", *SIGNALS))
-        _one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
+        one_of("approach", self.approach, ("left", "right"))
+        one_of("signal", self.signal, ("", *SIGNALS))
+        one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
         vehicle_kind(self.kind)
         in_range("entry_s", self.entry_s, -60.0, 120.0)
         in_range("speed_mps", self.speed_mps, 1.0, 30.0)
@@ -100,11 +100,6 @@ def _check_route(route_m: tuple[tuple[float, float], ...]) -> None:
     steps = np.hypot(*np.diff(points, axis=0).T)
     if not 2 <= len(points) <= MAX_ROUTE_POINTS or steps.min() < SHORTEST_STEP_M:
         raise InvalidArgumentError(f"route_m: expected 2 to {MAX_ROUTE_POINTS} points apart from each other")
-
-
-def _one_of(name: str, value: str, expected: tuple[str, ...]) -> None:
-    if value not in expected:
-        raise InvalidArgumentError(f"{name}: expected {', '.join(expected)}, got {value!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +164,7 @@ class SimulationSettings:
     sounds: tuple[SoundSettings, ...] = ()
 
     def __post_init__(self) -> None:
-        _one_of("approach", self.approach, APPROACHES)
+        one_of("approach", self.approach, APPROACHES)
         in_range("duration_s", self.duration_s, 0.5, 60.0)
         in_range("entry_s", self.entry_s, 0.0, self.duration_s if self.approach != "none" else 60.0)
         in_range("speed_mps", self.speed_mps, 1.0, 30.0)
@@ -184,17 +179,8 @@ class SimulationSettings:
         """All vehicles, the one that `approach` names first."""
         if self.approach == "none":
             return self.others
-        first = VehicleSettings(
-            self.approach,
-            self.entry_s,
-            self.speed_mps,
-            self.braking_mps2,
-            self.kind,
-            self.manoeuvre,
-            self.route_m,
-            self.signal,
-        )
-        return (first, *self.others)
+        own = {one.name: getattr(self, one.name) for one in fields(VehicleSettings)}
+        return (VehicleSettings(**own), *self.others)
 
 
 def draw_settings(
@@ -237,7 +223,7 @@ def draw_settings(
     in_range("duration_s", duration_s, 0.5, 60.0)
     known = place_of(site_name)
     if known is not None:
-        _one_of("approach", approach, (*known.approaches, "none"))
+        one_of("approach", approach, (*known.approaches, "none"))
     brakes = rng.random() < BRAKING_SHARE
     plan = site(site_name) if known is None else known.site
     drawn = SimulationSettings(

@@ -6,7 +6,7 @@ are within 10 dB of the loudest: a horn is as loud as its blast, whatever its pa
 
 from dataclasses import dataclass
 
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.checks import one_of
 
 from .kinds import FLAT, Octaves
 
@@ -72,6 +72,4 @@ SIGNALS = tuple(kind.name for kind in _TABLE if kind.origin == VEHICLE)
 
 def sound_kind(name: str) -> SoundKind:
     """Return a kind of sound by its name."""
-    if name not in SOUNDS:
-        raise InvalidArgumentError(f"sound: expected one of {', '.join(SOUNDS)}, got {name!r}")
-    return SOUNDS[name]
+    return SOUNDS[one_of("sound", name, SOUNDS)]

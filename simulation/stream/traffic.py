@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation.scene.kinds import vehicle_kind
-from worldstate.simulation.scene.sound_kinds import SIGNALS, sound_kind
+from worldstate.ground.checks import in_range, one_of
+from worldstate.simulation.scene.kinds import KINDS
+from worldstate.simulation.scene.sound_kinds import SIGNALS, SOUNDS
 
 # What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
 HAZARDS = ("left", "right", "both", "waits", "queue")
@@ -33,22 +32,17 @@ class Traffic:
     signals: Mapping[str, float] = field(default_factory=dict)  # Shares of the vehicles that warn, by signal
 
     def __post_init__(self) -> None:
-        for flow, rate in self.per_hour.items():
-            if flow not in FLOWS:
-                raise InvalidArgumentError(f"per_hour: expected flows {', '.join(FLOWS)}, got {flow!r}")
-            in_range(f"per_hour[{flow!r}]", rate, 0.0, MOST_PER_HOUR)
-        for sound, rate in self.sounds.items():
-            sound_kind(sound)
-            in_range(f"sounds[{sound!r}]", rate, 0.0, MOST_PER_HOUR)
-        for signal, share in self.signals.items():
-            if signal not in SIGNALS:
-                raise InvalidArgumentError(f"signals: expected {', '.join(SIGNALS)}, got {signal!r}")
-            in_range(f"signals[{signal!r}]", share, 0.0, 1.0)
+        for name, known, most in (
+            ("per_hour", FLOWS, MOST_PER_HOUR),
+            ("sounds", SOUNDS, MOST_PER_HOUR),
+            ("signals", SIGNALS, 1.0),
+            ("kinds", KINDS, 1.0),
+        ):
+            for key, number in getattr(self, name).items():
+                one_of(name, key, known)
+                in_range(f"{name}[{key!r}]", number, 0.0, most)
         # A share of one would make a queue without an end.
         in_range("follower_share", self.follower_share, 0.0, 0.9)
-        for kind, share in self.kinds.items():
-            vehicle_kind(kind)
-            in_range(f"kinds[{kind!r}]", share, 0.0, 1.0)
         in_range("kinds: sum of the shares", sum(self.kinds.values()), 1e-6, 1e6)
 
     @property
@@ -91,6 +85,4 @@ def traffic_named(name: str) -> Traffic:
     >>> traffic_named("no-hazard").hazard_free, traffic_named("calm").per_hour["both"]
     (True, 2)
     """
-    if name not in TRAFFICS:
-        raise InvalidArgumentError(f"traffic: expected one of {', '.join(TRAFFICS)}, got {name!r}")
-    return TRAFFICS[name]
+    return TRAFFICS[one_of("traffic", name, TRAFFICS)]

@@ -4,7 +4,7 @@ Every check names the argument, what came and what was expected.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,6 +75,19 @@ def in_range(
         left, right = "(" if open_low else "[", ")" if open_high else "]"
         raise InvalidArgumentError(f"{name}: expected a number in {left}{low}, {high}{right}, got {number}")
     return number
+
+
+def one_of(name: str, value: str, expected: Iterable[str]) -> str:
+    """Return `value` if it is one of the words expected.
+
+    Examples
+    --------
+    >>> one_of("side", "left", ("left", "right"))
+    'left'
+    """
+    if value not in (words := tuple(expected)):
+        raise InvalidArgumentError(f"{name}: expected one of {', '.join(words)}, got {value!r:.40}")
+    return value
 
 
 def named(name: str, value: object) -> None:
