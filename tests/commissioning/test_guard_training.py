@@ -5,13 +5,13 @@ import pytest
 from worldstate_lab.streets.guard_exam import guard_exam
 
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
-from worldstate.commissioning.foreign_sounds import FOREIGN, SIGNALS, STREET, GuardRows, sound_rows
 from worldstate.commissioning.guard_training import (
     FLAGGED,
     fit_guard,
     street_excesses,
     threshold_of,
 )
+from worldstate.commissioning.sound_rows import FOREIGN, SIGNALS, STREET, SoundRows, sound_rows
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.serialisation import encode
@@ -19,14 +19,14 @@ from worldstate.ground.serialisation import encode
 SITES, EACH = ("one", "two", "three"), 60
 
 
-def made_up_rows(seed: int, apart: float = 8.0) -> GuardRows:
+def made_up_rows(seed: int, apart: float = 8.0) -> SoundRows:
     """Draw clusters: streets at the origin, each kind of sound on an axis of its own."""
     rng = np.random.default_rng(seed)
     kinds = [kind for kind in (*STREET, *FOREIGN, *SIGNALS) for _ in range(EACH)] * len(SITES)
     sites = np.repeat(SITES, len(kinds) // len(SITES))
     centres = {kind: apart * np.eye(len(MEASURES))[i] for i, kind in enumerate((*FOREIGN, *SIGNALS))}
     middle = np.array([centres.get(kind, np.zeros(len(MEASURES))) for kind in kinds])
-    return GuardRows(middle + rng.standard_normal(middle.shape), np.array(kinds), sites)
+    return SoundRows(middle + rng.standard_normal(middle.shape), np.array(kinds), sites)
 
 
 def test_streets_never_heard_are_flagged_as_often_as_stated_and_sounds_are_found() -> None:

@@ -28,7 +28,7 @@ def made_up_rows(seed: int, apart: float = 4.0) -> RoadUserRows:
     centres = apart * np.stack([np.eye(N_INPUTS)[list(CLASS_OF).index(kind)] for kind in kinds.tolist()])
     measures = rng.standard_normal((len(kinds), N_INPUTS)) + centres * audible[:, None]
     sites = np.repeat(SITES, len(kinds) // len(SITES))
-    return RoadUserRows(measures, kinds, audible, rng.random(len(kinds)) < 0.9, sites)
+    return RoadUserRows(measures, kinds, sites, audible, rng.random(len(kinds)) < 0.9)
 
 
 def test_classes_that_differ_are_told_and_such_that_do_not_are_the_towns_shares() -> None:

@@ -17,8 +17,7 @@ from worldstate.commissioning.open_field import (
     open_field_features,
     open_field_windows,
 )
-from worldstate.commissioning.stream_windows import CuttingSettings, hop_labels, stream_windows
-from worldstate.commissioning.window_model import posteriors_along
+from worldstate.commissioning.stream_windows import WEIGHT, hop_labels, posteriors_along, stream_windows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable
 
@@ -77,11 +76,11 @@ def test_a_bicycle_is_no_hidden_window_and_no_empty_one_either():
 def test_classes_weigh_as_in_the_released_windows_and_a_site_is_compared_with_itself():
     rng = np.random.default_rng(1)
     parts = [stream(("light", "left", 30.0), site=site, rng=rng) for site in ("SA1", "SB1")]
-    found = stream_windows(parts, CuttingSettings(weight=0.5))
+    found = stream_windows(parts)
     hidden = np.isin(found.y, ("left", "right", "both"))
     mass = {name: found.weights[found.y == name].sum() for name in ("front", "none")}
     assert mass == pytest.approx(dict.fromkeys(mass, found.weights[hidden].sum()))
-    assert (found.weights[hidden] == 0.5).all()
+    assert (found.weights[hidden] == WEIGHT).all()
     alone = stream_windows(parts[:1])
     np.testing.assert_array_equal(found.at(["SA1"]).X, alone.X)
     # Told apart by site: an open field belongs to none and is always there.

@@ -36,7 +36,7 @@ from .road_user_training import train_road_users
 from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
 from .stream_labels import stream_truth
-from .window_model import learned_beside, posteriors_along, window_model
+from .stream_windows import learned_beside, posteriors_along, window_model
 
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 2

@@ -6,23 +6,20 @@ from functools import partial
 import numpy as np
 
 from worldstate.abduction.signature.domain_guard import DomainGuard
-from worldstate.abduction.signature.ensemble_training import standardisation
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND, MEASURES
-from worldstate.ground.extras import optional
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import significant
 
-from .foreign_sounds import FOREIGN, SIGNALS, STREET, GuardRows, sound_rows, street_rows
 from .heard_stream import HeardStream
+from .sound_rows import FOREIGN, SIGNALS, STREET, SoundRows, fit_softmax, sound_rows, street_rows
 
 FLAGGED = 0.025  # Share of the hops of each label of streets never heard that may be flagged
 # Of the weight of all rows; within each the classes weigh the same, however long they were heard.
 _STREET, _FOREIGN, _SIGNALS = 0.5, 0.3, 0.2
 _FOLDS, _SITES_OF_SOUNDS = 5, 8  # More of either cost minutes
 _EVERY = 8  # Neighbouring hops share nineteen twentieths of their sound
-_STRENGTH = 0.03  # scikit-learn's C at weights of mean one
 # The pitch of the strongest line belongs to the site: with it the false flags of SA1 rose from .04 to .09. It
 # tells one signal from another, not the street from what is foreign.
 _OF_SIGNALS_ONLY = ("line", "line varies", "line holds")
@@ -39,16 +36,16 @@ def guard_rows(
     rng: np.random.Generator,
     sounds_each: int = 1,
     jobs: int = 1,
-) -> GuardRows:
+) -> SoundRows:
     """Return the rows of streets, and those of so many sounds of each kind at some of their sites."""
     rate_hz = float(streets[0].hops.middle.shape[1] * HOPS_A_SECOND)
     sites = sorted({stream.site for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
     draws = list(zip(sites, rng.spawn(len(sites)), strict=True))
     heard = in_processes(partial(_sounds_at, array, rate_hz), draws, jobs)
-    return GuardRows.joined([street_rows(streets), *heard])
+    return SoundRows.joined([street_rows(streets), *heard])
 
 
-def _sounds_at(array: MicrophoneArray, rate_hz: float, drawn: tuple[str, np.random.Generator]) -> GuardRows:
+def _sounds_at(array: MicrophoneArray, rate_hz: float, drawn: tuple[str, np.random.Generator]) -> SoundRows:
     name, rng = drawn
     return sound_rows(array, name, rate_hz, rng)
 
@@ -67,7 +64,7 @@ def threshold_of(excesses: Sequence[FloatArray]) -> float:
     return max(float(np.quantile(excess, 1.0 - FLAGGED)) for excess in excesses if len(excess))
 
 
-def street_excesses(rows: GuardRows, without: Collection[str] = ()) -> dict[str, FloatArray]:
+def street_excesses(rows: SoundRows, without: Collection[str] = ()) -> dict[str, FloatArray]:
     """Return the log-odds of the hops of streets, by label, from guards that never heard their site."""
     held_out: dict[str, list[FloatArray]] = {label: [] for label in STREET}
     names = np.unique(rows.sites)
@@ -79,7 +76,7 @@ def street_excesses(rows: GuardRows, without: Collection[str] = ()) -> dict[str,
     return {label: np.concatenate(found) for label, found in held_out.items()}
 
 
-def fit_guard(rows: GuardRows, threshold: float = 0.0) -> DomainGuard:
+def fit_guard(rows: SoundRows, threshold: float = 0.0) -> DomainGuard:
     """Fit the coefficients of a guard to all rows, with a threshold from elsewhere."""
     foreign, signals = (_named(rows, names) for names in (FOREIGN, SIGNALS))
     weights, biases = _softmax(rows, foreign, signals)
@@ -98,13 +95,13 @@ def fit_guard(rows: GuardRows, threshold: float = 0.0) -> DomainGuard:
     )
 
 
-def _named(rows: GuardRows, names: dict[str, str]) -> tuple[str, ...]:
+def _named(rows: SoundRows, names: dict[str, str]) -> tuple[str, ...]:
     heard = set(rows.kinds.tolist())
     return tuple(dict.fromkeys(name for kind, name in names.items() if kind in heard))
 
 
 def _softmax(
-    rows: GuardRows, foreign: tuple[str, ...], signals: tuple[str, ...]
+    rows: SoundRows, foreign: tuple[str, ...], signals: tuple[str, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """Fit weights, shape (classes, measures), and biases of raw measures, the street first."""
     names = {**dict.fromkeys((*STREET, ""), "street"), **FOREIGN, **SIGNALS}
@@ -116,15 +113,11 @@ def _softmax(
         [_STREET, *[_FOREIGN / len(foreign)] * len(foreign), *[_SIGNALS / len(signals)] * len(signals)]
     )
     weights = (shares / np.bincount(labels))[labels]
-    mean, scale = standardisation(rows.measures[kept], weights)
-    inputs = (rows.measures[kept] - mean) / scale * _of_all()
-    fitted = optional("sklearn.linear_model").LogisticRegression(C=_STRENGTH, max_iter=300, tol=1e-3)
-    fitted.fit(inputs, labels, sample_weight=weights * len(labels))
-    slopes = fitted.coef_ * _of_all() / scale
-    return slopes, fitted.intercept_ - slopes @ mean
+    of_all = ~np.isin(MEASURES, _OF_SIGNALS_ONLY)
+    return fit_softmax(rows.measures[kept], labels, weights, weights * len(labels), of_all)
 
 
-def _reach(rows: GuardRows, kinds: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+def _reach(rows: SoundRows, kinds: Sequence[str]) -> tuple[FloatArray, FloatArray]:
     r"""Fit centres and whitening A of the signals, scaled so that `_REACH` of their rows lie within 1.
 
     .. math:: A^T A = \Sigma^{-1} / d^2
@@ -137,7 +130,3 @@ def _reach(rows: GuardRows, kinds: Sequence[str]) -> tuple[FloatArray, FloatArra
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     squares = np.square(apart @ whitening.T).sum(axis=1)
     return centres, whitening / np.sqrt(np.quantile(squares, _REACH))
-
-
-def _of_all() -> BoolArray:
-    return ~np.isin(MEASURES, _OF_SIGNALS_ONLY)

@@ -83,7 +83,7 @@ def _drawn_feature(array: MicrophoneArray, moving_ego: bool, rng: np.random.Gene
     return open_feature(array, source, rng, rng.uniform(*EGO_SPEEDS_MPS) if moving_ego else 0.0)
 
 
-def open_field_windows(features: FloatArray, weight: float = OPEN_WEIGHT) -> SimulatedWindows:
+def open_field_windows(features: FloatArray) -> SimulatedWindows:
     """Return windows in the open as a model learns them: direct, and compared with no site.
 
     Shapes: features (n, 60).
@@ -91,7 +91,7 @@ def open_field_windows(features: FloatArray, weight: float = OPEN_WEIGHT) -> Sim
     n = len(features)
     nowhere = np.full((n, len(KINDS) * N_FEATURES), np.nan)
     names = np.full(n, DIRECT), np.full(n, OPEN_FIELD)
-    return SimulatedWindows(np.hstack([features, nowhere]), *names, np.full(n, weight), np.zeros(n))
+    return SimulatedWindows(np.hstack([features, nowhere]), *names, np.full(n, OPEN_WEIGHT), np.zeros(n))
 
 
 def open_feature(

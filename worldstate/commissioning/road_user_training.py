@@ -5,19 +5,17 @@ out of the left arm of every junction instead, over the ambience of the place.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from worldstate.abduction.road_users import UNKNOWN, RoadUserModel
-from worldstate.abduction.signature.ensemble_training import standardisation
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.spectra.sound_character import BANDS, HOPS_A_SECOND, MEASURES
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.extras import optional
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import significant
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.sound.receiver import standing_m
@@ -26,8 +24,8 @@ from worldstate.simulation.stream.manoeuvres import LEFT, draw_driver, emerges
 from worldstate.simulation.stream.settings import StreamSettings
 from worldstate.simulation.stream.sight import visible_s
 
-from .foreign_sounds import characters, event_and_ambience, loudness
 from .plan import junction_named
+from .sound_rows import SoundRows, characters, event_and_ambience, fit_softmax, loudness
 
 # What the simulator's kinds are to a user.
 CLASS_OF = {
@@ -46,29 +44,16 @@ _DRIVEN_S, _LEAD_S = 7.0, 3.0  # Before line of sight, and of ambience before th
 # Over the ambience from 250 to 2600 Hz over one second. At 0 dB a seventh of the hops of cars are unknown,
 # though their class is found as well.
 _AUDIBLE_DB = -6.0
-_STRENGTH = 0.03  # scikit-learn's C at weights of mean one; .01 and .1 lose .015 and gain .002 nats
 _FOLDS = 8
 _FIGURES = 5  # Of a coefficient in the file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RoadUserRows:
+class RoadUserRows(SoundRows):
     """Hops of vehicles that pass alone."""
 
-    measures: FloatArray  # shape (n, MEASURES and BANDS)
-    kinds: TextArray  # shape (n,): The simulator's
     audible: BoolArray  # shape (n,)
     counts: BoolArray  # shape (n,): Whether it is near line of sight
-    sites: TextArray  # shape (n,)
-
-    @classmethod
-    def joined(cls, parts: Sequence["RoadUserRows"]) -> "RoadUserRows":
-        """Return the rows of all."""
-        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
-
-    def select(self, keep: BoolArray) -> "RoadUserRows":
-        """Return some of the rows."""
-        return RoadUserRows(*(getattr(self, one.name)[keep] for one in fields(self)))
 
     @property
     def classes(self) -> IndexArray:
@@ -144,9 +129,9 @@ def _pass(
     rows = RoadUserRows(
         measures,
         np.full(len(measures), kind),
+        np.full(len(measures), site.name),
         audible[usable],
         time_s[usable] >= FIRST_S,
-        np.full(len(measures), site.name),
     )
     return rows.select(learned)
 
@@ -159,11 +144,8 @@ def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
     """Fit a softmax to classes of equal weight, then let them be as frequent as in a town."""
     classes = rows.classes
     equal = 1.0 / np.bincount(classes, minlength=len(CLASSES))[classes]
-    mean, scale = standardisation(rows.measures, equal)
-    fitted = optional("sklearn.linear_model").LogisticRegression(C=_STRENGTH, max_iter=300, tol=1e-3)
-    fitted.fit((rows.measures - mean) / scale, classes, sample_weight=equal * len(classes) / equal.sum())
-    slopes = fitted.coef_ / scale
-    biases = fitted.intercept_ - slopes @ mean + np.log(class_shares(rows))
+    slopes, biases = fit_softmax(rows.measures, classes, equal, equal * len(classes) / equal.sum())
+    biases += np.log(class_shares(rows))
     return RoadUserModel(
         (*MEASURES, *BANDS), CLASSES, significant(slopes, _FIGURES), significant(biases, _FIGURES)
     )

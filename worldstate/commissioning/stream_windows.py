@@ -1,20 +1,25 @@
-"""Windows cut from streams that were listened to, labelled by who drove there.
+"""Windows cut from streams that were listened to, labelled by the vehicles there, and a window model of them.
 
 A stream holds what single recordings do not: vehicles from both sides at once, one behind another, and hours
 of distant ones and of those in plain view, which are no hazards.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
+from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
 from worldstate.abduction.signature.site_reference import log_levels, site_reference
 from worldstate.abduction.signature.site_signature import HOP_S
 from worldstate.abduction.signature.window_classes import BOTH
+from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
+from worldstate.operations.training.site_references import simulated_beside, with_site_references
+from worldstate.operations.training.training import fit_ensemble
 
 from .heard_stream import HeardStream
 from .stream_labels import SILENT_KINDS
@@ -31,18 +36,14 @@ FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
 CALM_S = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class CuttingSettings:
-    """Which hops become windows."""
-
-    every_s: float = 0.5  # Apart at least, while somebody is hidden; windows overlap
-    rest_every_s: float = 10.0  # Apart at least otherwise: most of a stream is empty
-    # Of a hidden window, beside a real one of weight 1; all in view, and all empty, weigh as all hidden.
-    # Real and simulated hazards have their sides by other patterns, and this settles between them: at .15,
-    # .3, .6 and .9 the side is right in .77, .88, .94, .94 of the windows of streams, and in .91, .91, .82,
-    # .76 of real ones at junctions left out, AUROC the same. With a quarter of it given to the other side,
-    # as windows of simulated recordings have it, .77 and .94 at .3.
-    weight: float = 0.3
+# Windows lie so far apart at least: those of hidden vehicles, which overlap, and all others, which most are.
+EVERY_S, REST_EVERY_S = 0.5, 10.0
+# Of a hidden window, beside a real one of weight 1; all in view, and all empty, weigh as all hidden. Real and
+# simulated hazards have their sides by other patterns, and this settles between them: at .15, .3, .6 and .9
+# the side is right in .77, .88, .94, .94 of the windows of streams, and in .91, .91, .82, .76 of real ones at
+# junctions left out, AUROC the same. With a quarter of it given to the other side, as windows of simulated
+# recordings have it, .77 and .94 at .3.
+WEIGHT = 0.3
 
 
 def hop_labels(stream: HeardStream) -> TextArray:
@@ -63,29 +64,26 @@ def hop_labels(stream: HeardStream) -> TextArray:
     return np.select(known, (BOTH, "left", "right", "front", "none"), UNUSED)
 
 
-def stream_windows(
-    streams: Sequence[HeardStream], settings: CuttingSettings | None = None
-) -> SimulatedWindows:
+def stream_windows(streams: Sequence[HeardStream]) -> SimulatedWindows:
     """Cut windows from streams, each compared with all that were cut at its site."""
-    chosen = settings or CuttingSettings()
-    cut = [_cut(stream, chosen) for stream in streams]
+    cut = [_cut(stream) for stream in streams]
     features = np.concatenate([stream.hops.feature[rows] for stream, rows, _ in cut]).astype(np.float64)
     sites = np.concatenate([np.full(len(rows), stream.site) for stream, rows, _ in cut])
     labels = np.concatenate([names for _, _, names in cut])
     references = np.empty((len(sites), 3 * features.shape[1]))
     for site in np.unique(sites):
         references[sites == site] = site_reference(log_levels(features[sites == site])).row
-    weights = chosen.weight * _balance(labels)
-    # All of a hazard says its own side: see `CuttingSettings.weight`.
+    weights = WEIGHT * _balance(labels)
+    # All of a hazard says its own side: see `WEIGHT`.
     own = np.zeros(len(labels))
     return SimulatedWindows(np.hstack([features, references]), labels, sites, weights, own)
 
 
-def _cut(stream: HeardStream, settings: CuttingSettings) -> tuple[HeardStream, IndexArray, TextArray]:
+def _cut(stream: HeardStream) -> tuple[HeardStream, IndexArray, TextArray]:
     labels, time = hop_labels(stream), stream.hops.time_s
     rows = []
     for name in np.unique(labels[labels != UNUSED]):
-        apart = settings.rest_every_s if name in ("none", "front") else settings.every_s
+        apart = REST_EVERY_S if name in ("none", "front") else EVERY_S
         rows.append(_thinned(np.flatnonzero(labels == name), time, apart))
     kept = np.sort(np.concatenate(rows)) if rows else np.zeros(0, np.intp)
     return stream, kept, labels[kept]
@@ -128,3 +126,29 @@ def _in_view(stream: HeardStream, after_s: float, stays_s: float) -> BoolArray:
         mine = rows.time_s[seen & (rows.vehicle == number)]
         near |= (time >= mine[0] + after_s) & (time <= mine[-1] + stays_s)
     return near
+
+
+def learned_beside(
+    streams: Sequence[HeardStream], open_field: SimulatedWindows, tables: Sequence[FeatureTable] = ()
+) -> SimulatedWindows:
+    """Return windows of streams, of sources in the open and of simulated recordings together."""
+    recordings = [simulated_beside(tables)] if tables else []
+    return SimulatedWindows.joined([*recordings, stream_windows(streams), open_field])
+
+
+def window_model(table: FeatureTable, beside: SimulatedWindows | None) -> EnsembleModel:
+    """Fit a window model to a table and the windows beside it."""
+    return replace(fit_ensemble(with_site_references(table), beside), domain=table.domain)
+
+
+def posteriors_along(model: EnsembleModel, features: FloatArray) -> FloatArray:
+    """Return what `SiteSignature` finds hop by hop along a stream, as posteriors, shape (n, classes).
+
+    Shapes: features (n, 60).
+    """
+    chosen, estimate = SiteEstimateSettings(), SiteEstimate.start(model.n_features)
+    references = np.empty((len(features), model.home.row.size))
+    for row, feature in enumerate(np.asarray(features, np.float64)):
+        references[row] = estimate.reference(model, chosen).row
+        estimate = estimate.updated(feature, HOP_S, chosen)
+    return model.posteriors(log_levels(features), references)

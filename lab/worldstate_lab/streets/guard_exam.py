@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.abduction.signature.domain_guard import DomainGuard, Foreign, WarningSignal
-from worldstate.commissioning.foreign_sounds import FOREIGN, SIGNALS, STREET, GuardRows
 from worldstate.commissioning.guard_training import fit_guard, threshold_of
+from worldstate.commissioning.sound_rows import FOREIGN, SIGNALS, STREET, SoundRows
 from worldstate.ground.typing import FloatArray
 
 # What a listener would take for one another: each left out as a whole.
@@ -35,7 +35,7 @@ class GuardShares:
     worst_site: float  # The least share not taken for the street of all sites; of a street the largest
 
 
-def guard_exam(rows: GuardRows, advance: Callable[[], object] = lambda: None) -> list[GuardShares]:
+def guard_exam(rows: SoundRows, advance: Callable[[], object] = lambda: None) -> list[GuardShares]:
     """Judge every kind by a guard that knows all kinds, by one without it, and by one without its family."""
     found = _judged(rows, "nothing", (), (*STREET, *FOREIGN, *SIGNALS), advance)
     for kind in FOREIGN:
@@ -47,7 +47,7 @@ def guard_exam(rows: GuardRows, advance: Callable[[], object] = lambda: None) ->
 
 
 def _judged(
-    rows: GuardRows,
+    rows: SoundRows,
     name: str,
     without: Collection[str],
     kinds: Collection[str],
@@ -76,7 +76,7 @@ def _judged(
     return found
 
 
-def _verdicts(rows: GuardRows, without: Collection[str], kinds: Collection[str]) -> FloatArray:
+def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str]) -> FloatArray:
     """0 for the street, else a code, by guards that never heard the site, shape (n,)."""
     sites = np.unique(rows.sites).tolist()
     guards = {

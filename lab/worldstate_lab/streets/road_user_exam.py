@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.commissioning.foreign_sounds import characters
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.road_user_training import (
     CLASSES,
@@ -20,6 +19,7 @@ from worldstate.commissioning.road_user_training import (
     cross_validated,
     fit_road_users,
 )
+from worldstate.commissioning.sound_rows import characters
 from worldstate.commissioning.stream_labels import AUDIBLE_DB, ROW_S
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND
 from worldstate.ground.typing import FloatArray
@@ -74,9 +74,9 @@ def stream_rows(stream: HeardStream) -> RoadUserRows:
     return RoadUserRows(
         measures[kept[usable]],
         vehicles.kind[loudest][kept],
+        np.full(int(kept.sum()), str(stream.hops.about["site"])),
         first[kept] >= AUDIBLE_DB,
         np.ones(int(kept.sum()), np.bool_),
-        np.full(int(kept.sum()), str(stream.hops.about["site"])),
     )
 
 

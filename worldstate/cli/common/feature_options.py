@@ -32,7 +32,7 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
         open_field_features,
         open_field_windows,
     )
-    from worldstate.commissioning.window_model import learned_beside
+    from worldstate.commissioning.stream_windows import learned_beside
     from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.operations.training.site_references import simulated_beside
