@@ -2,7 +2,7 @@
 
 import numpy as np
 from worldstate_lab.places.place_filter import PlaceFilter
-from worldstate_lab.places.place_measurements import PlaceMeasurements, SpatialSpectrum
+from worldstate_lab.places.place_measurements import PlaceMeasurements
 from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls
 
 from worldstate import WorldFilter, WorldState
@@ -20,7 +20,7 @@ def behind_the_corner(hops: int) -> WorldState:
     waves = ARRAY.steering(HZ, np.radians([-59.0, 32.0])) * [1.0, 0.3]
     heard = (np.abs(ARRAY.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1) @ waves) ** 2).sum(axis=(0, 2))
     for hop in range(1, hops + 1):
-        for found in places.measure(SpatialSpectrum(hop * 100_000_000, heard)):
+        for found in places.measure(hop * 100_000_000, heard):
             world = world.update(found)
     return world.state
 

@@ -8,14 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
-from worldstate_lab.places.estimate import KnownPlace
+from worldstate_lab.places.junctions import WALLS, place_models, simulated_pass
 from worldstate_lab.places.place_exam import followed_places
 from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter
-from worldstate_lab.places.place_measurements import PlaceMeasurements, SpatialSpectrum
-from worldstate_lab.places.simulated_passes import simulated_pass
-from worldstate_lab.places.sound_paths import sound_paths
+from worldstate_lab.places.place_measurements import PlaceMeasurements
+from worldstate_lab.places.sound_paths import StreetWalls, sound_paths
 from worldstate_lab.places.spectrum_model import SpectrumModel
-from worldstate_lab.places.street_walls import StreetWalls
 
 from worldstate.frontend import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
@@ -110,7 +108,7 @@ def test_probabilities_sum_to_one(seed: int, dt_s: float) -> None:
     rng, belief = np.random.default_rng(seed), PLACES.unknown
     for _ in range(3):
         belief = PLACES.update(PLACES.predict(belief, round(dt_s, 1)), rng.normal(size=len(AZIMUTHS)))
-        assert np.exp(belief.log_present).sum() + np.exp(belief.log_nobody) == pytest.approx(1.0, abs=1e-9)
+        assert np.exp(belief.log_present).sum() + np.exp(belief.log_empty) == pytest.approx(1.0, abs=1e-9)
 
 
 def test_a_prediction_moves_the_mean_by_its_speed() -> None:
@@ -130,15 +128,15 @@ def test_what_is_passed_on_completes_what_was_known() -> None:
     adapter, heard = PlaceMeasurements(PLACES), plane_waves(-62.0, 32.0)
     sent: list[Measurement | PositionScan] = []
     for hop in range(1, 31):
-        sent += adapter.measure(SpatialSpectrum(hop * 100_000_000, heard))
+        sent += adapter.measure(hop * 100_000_000, heard)
     scans = [one for one in sent if isinstance(one, PositionScan)]
-    assert isinstance(adapter.estimate.place, KnownPlace)
+    assert adapter.estimate.stated
     # The first scan alone is nearly the belief: before it nothing was known.
     (first,) = scans[0].positions
     assert first.position_m[1] == pytest.approx(adapter.estimate.mean_m, abs=2.0)
     assert first.position_m[1] > MODEL.walls.sight_m[1]
     with pytest.raises(InvalidArgumentError, match="stamp_ns"):
-        adapter.measure(SpatialSpectrum(1, heard))
+        adapter.measure(1, heard)
 
 
 def test_the_example_gives_an_entity_its_place() -> None:
@@ -150,8 +148,6 @@ def test_the_example_gives_an_entity_its_place() -> None:
 
 @pytest.mark.slow
 def test_a_simulated_pass_is_followed_round_the_corner() -> None:
-    from worldstate_lab.places.junctions import WALLS, place_models
-
     models = place_models()
     for seed, site in enumerate(WALLS):
         _, table = simulated_pass(site, np.random.default_rng([9, seed]))

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,14 +12,19 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.values import nanoseconds
 
-from .estimate import KnownPlace, PlaceEstimate
-from .junctions import SIMULATED, WALLS, place_models
-from .place_filter import PlaceFilter
-from .place_measurements import PlaceMeasurements, SpatialSpectrum
-from .ray_model import RayModel
-from .simulated_passes import simulated_pass
-from .spatial_spectra import AZIMUTHS_RAD, SpectrumTable, read_spectra
-from .street_walls import StreetWalls
+from .junctions import (
+    AZIMUTHS_RAD,
+    SIMULATED,
+    WALLS,
+    SpectrumTable,
+    place_models,
+    read_spectra,
+    simulated_pass,
+)
+from .place_filter import PlaceEstimate, PlaceFilter
+from .place_measurements import PlaceMeasurements
+from .sound_paths import StreetWalls
+from .spectrum_model import RayModel
 
 _NAME = re.compile(r"(Site[12])_([LR])_(\d+)_Trial\d+")
 
@@ -58,46 +63,48 @@ def place_exam(
 
     The name of a trial tells its junction to the method, and its side and speed to the scoring alone.
     """
-    models = {name: PlaceFilter(model) for name, model in place_models().items()}
+    ours = {name: PlaceFilter(model) for name, model in place_models().items()}
     plain = {
-        name: PlaceFilter(RayModel.of(walls, models[name].model.along_m)) for name, walls in WALLS.items()
+        name: PlaceFilter(RayModel.of(walls, AZIMUTHS_RAD, ours[name].model.along_m))
+        for name, walls in WALLS.items()
     }
-    real, simulated, spent_s, hops = [], [], 0.0, 0
+    found, spent_s, hops = [], 0.0, 0
+    for name, site, table, right in _recordings(trials, passes, seed):
+        began = time.process_time()
+        said = followed_places(ours[site], table)
+        spent_s, hops = spent_s + time.process_time() - began, hops + len(said)
+        figures = _figures(name, said, right)
+        if np.isfinite(table.along_m).any():
+            beside = followed_places(plain[site], table)
+            figures = _with_errors(figures, table.along_m, said, beside, WALLS[site])
+        found.append(figures)
+        on_pass()
+    return PlaceExam(tuple(found[: len(trials)]), tuple(found[len(trials) :]), 1e3 * spent_s / max(hops, 1))
+
+
+def _recordings(
+    trials: Sequence[Path], passes: int, seed: int
+) -> Iterator[tuple[str, str, SpectrumTable, FloatArray]]:
+    """Yield name, junction and spectra, and the side by hop: 1 left, -1 right, 0 where it may be in view."""
     for path in sorted(trials):
         site, side, speed = _told(path)
         table = read_spectra(path)
-        said, cost_s = _timed(models[site], table)
-        spent_s, hops = spent_s + cost_s, hops + len(said)
-        if table.has_places:
-            beside = followed_places(plain[site], table)
-            real.append(_with_truth(path.stem, table, said, beside, WALLS[site]))
-        else:
-            right = _sides(table, side, speed, WALLS[site])
-            real.append(_figures(path.stem, said, right))
-        on_pass()
+        known = np.isfinite(table.along_m).any()
+        right = _true_sides(table, site) if known else _likely_sides(table, side, speed, WALLS[site])
+        yield path.stem, site, table, right
     for one in range(passes):
         site = sorted(SIMULATED)[one % len(SIMULATED)]
         side, table = simulated_pass(site, np.random.default_rng([seed, one]))
-        said, cost_s = _timed(models[site], table)
-        spent_s, hops = spent_s + cost_s, hops + len(said)
-        beside = followed_places(plain[site], table)
-        simulated.append(_with_truth(f"{site} {side}", table, said, beside, WALLS[site]))
-        on_pass()
-    return PlaceExam(tuple(real), tuple(simulated), 1e3 * spent_s / max(hops, 1))
+        yield f"{site} {side}", site, table, _true_sides(table, site)
 
 
 def followed_places(places: PlaceFilter, table: SpectrumTable) -> list[PlaceEstimate]:
     """Return what is said after every spectrum of a recording."""
     adapter, said = PlaceMeasurements(places), []
     for time_s, spectrum in zip(table.time_s.tolist(), table.spectra, strict=True):
-        adapter.measure(SpatialSpectrum(nanoseconds(time_s), spectrum))
+        adapter.measure(nanoseconds(time_s), spectrum)
         said.append(adapter.estimate)
     return said
-
-
-def _timed(places: PlaceFilter, table: SpectrumTable) -> tuple[list[PlaceEstimate], float]:
-    began = time.process_time()
-    return followed_places(places, table), time.process_time() - began
 
 
 def _told(path: Path) -> tuple[str, str, float]:
@@ -108,8 +115,16 @@ def _told(path: Path) -> tuple[str, str, float]:
     return found[1], {"L": "left", "R": "right"}[found[2]], float(found[3]) / 3.6
 
 
-def _sides(table: SpectrumTable, side: str, speed_mps: float, walls: StreetWalls) -> FloatArray:
-    """Side by hop of a trial without places, 1 left, -1 right, 0 where the vehicle may be in view."""
+def _true_sides(table: SpectrumTable, site: str) -> FloatArray:
+    return np.asarray(np.where(_hidden(table.along_m, WALLS[site]), np.sign(table.along_m), 0.0))
+
+
+def _hidden(along_m: FloatArray, walls: StreetWalls) -> BoolArray:
+    return (along_m < walls.sight_m[0]) | (along_m > walls.sight_m[1])
+
+
+def _likely_sides(table: SpectrumTable, side: str, speed_mps: float, walls: StreetWalls) -> FloatArray:
+    """Return the sides of a trial without places."""
     # It crosses the axis where the loudest directions within the mouth change sides most clearly.
     within = np.abs(AZIMUTHS_RAD) < np.arctan2(min(walls.left_m, walls.right_m), walls.corner_ahead_m)
     loudest = AZIMUTHS_RAD[within][table.spectra[:, within].argmax(axis=1)]
@@ -123,36 +138,35 @@ def _sides(table: SpectrumTable, side: str, speed_mps: float, walls: StreetWalls
 def _figures(name: str, said: Sequence[PlaceEstimate], right: FloatArray) -> PlaceFigures:
     left = np.array([one.left_probability for one in said])
     hidden = right != 0.0
-    stated = float(np.mean([isinstance(one.place, KnownPlace) for one in said]))
+    stated = float(np.mean([one.stated for one in said]))
     as_said = np.where(left > 0.5, 1.0, -1.0) == right
     return PlaceFigures(name, len(said), int(hidden.sum()), int(as_said[hidden].sum()), stated)
 
 
-def _with_truth(
-    name: str,
-    table: SpectrumTable,
+def _with_errors(
+    figures: PlaceFigures,
+    along_m: FloatArray,
     said: Sequence[PlaceEstimate],
     beside: Sequence[PlaceEstimate],
     walls: StreetWalls,
 ) -> PlaceFigures:
-    along, known = table.along_m, np.isfinite(table.along_m)
-    hidden = known & ((along < walls.sight_m[0]) | (along > walls.sight_m[1]))
+    """Add errors and coverage; the best constants are one place, and one distance while hidden."""
+    known, hidden = np.isfinite(along_m), _hidden(along_m, walls)
     ends = np.array([one.interval_m for one in said])
-    covered = (ends[:, 0] <= along) & (along <= ends[:, 1])
-    ours, rays = (np.array([one.mean_m for one in each]) - along for each in (said, beside))
-    # The best constants: one place for the whole run, one distance on the right side while hidden.
-    whole, apart = along - along[known].mean(), np.abs(along) - np.abs(along[hidden]).mean()
+    covered = (ends[:, 0] <= along_m) & (along_m <= ends[:, 1])
+    ours, rays = (np.array([one.mean_m for one in each]) - along_m for each in (said, beside))
+    whole, apart = along_m - along_m[known].mean(), np.abs(along_m) - np.abs(along_m[hidden]).mean()
     return replace(
-        _figures(name, said, np.where(hidden, np.sign(along), 0.0)),
-        rmse_m=_rms(ours, known),
-        hidden_rmse_m=_rms(ours, hidden),
+        figures,
+        rmse_m=_rms(ours[known]),
+        hidden_rmse_m=_rms(ours[hidden]),
         coverage=float(covered[known].mean()),
-        ray_rmse_m=_rms(rays, known),
-        ray_hidden_rmse_m=_rms(rays, hidden),
-        constant_rmse_m=_rms(whole, known),
-        constant_hidden_rmse_m=_rms(apart, hidden),
+        ray_rmse_m=_rms(rays[known]),
+        ray_hidden_rmse_m=_rms(rays[hidden]),
+        constant_rmse_m=_rms(whole[known]),
+        constant_hidden_rmse_m=_rms(apart[hidden]),
     )
 
 
-def _rms(errors_m: FloatArray, chosen: BoolArray) -> float:
-    return float(np.sqrt(np.mean(errors_m[chosen] ** 2)))
+def _rms(errors_m: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors_m**2)))

@@ -1,30 +1,29 @@
-r"""Exact filter over place and speed on a grid, with a state for nobody.
+r"""Exact filter over place and speed on a grid, with a state for an empty street.
 
 .. math:: p_t(x', v') \propto L_t(x') \sum_{x, v} T_v(x' | x)\, A(v' | v)\, p_{t-1}(x, v)
 
-Places move by v dt, speeds by a random walk. Who leaves the grid is nobody; who comes may be anywhere on it.
+Places move by v dt, speeds by a random walk. A vehicle that leaves the grid leaves the street empty; one that
+comes may be anywhere on it.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
-from .estimate import KnownPlace, NearOrFar, PlaceEstimate
-from .spectrum_model import FARTHEST_M, STEP_M
-from .street_walls import StreetWalls
+from .spectrum_model import FARTHEST_M, STEP_M, RayModel, SpectrumModel
 
 # Toward the left and toward the right: streets in town, cars that creep into a junction included.
 SPEEDS_MPS = np.arange(1.0, 8.1, 0.5)
 VELOCITIES_MPS = np.concatenate([-SPEEDS_MPS[::-1], SPEEDS_MPS])
 # m/s in a second: drivers brake by .5 to 1 m/s^2 before a junction.
 SPEED_NOISE = 0.5
-TURNS_HZ = 1e-3  # Hardly anybody turns round in a street
-ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01  # The rates of `state.Rates`, both sides; who leaves without passing
+TURNS_HZ = 1e-3  # Few vehicles turn round in a street
+# The rates of `state.Rates`, both sides; departures are of vehicles that leave without passing.
+ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01
 # An axle is heard, and the middle of the vehicle is meant: half a wheelbase of 2.7 m, and some.
 EXTENT_STD_M = 1.0
 STATED_STD_M = 5.0
@@ -32,46 +31,57 @@ STATED_STD_M = 5.0
 NEAR = 2.0
 
 
-class PlaceLikelihood(Protocol):
-    """How likely a spectrum is from every place; `SpectrumModel` is one."""
+@dataclass(frozen=True, slots=True)
+class PlaceEstimate:
+    """Belief about one vehicle on the crossing street; all but its existence given that there is one.
+
+    Parameters
+    ----------
+    mean_m, std_m : float
+        Of the place along the street, left positive.
+    interval_m : (float, float)
+        From the 5 % to the 95 % quantile.
+    left_probability, near_probability, hidden_probability : float
+        That it is left of the ego's axis; that it is in view or about to be; that a corner hides it.
+    existence_probability : float
+        That there is a vehicle.
+
+    Examples
+    --------
+    >>> PlaceEstimate(7.2, 1.4, (5.0, 9.5), 1.0, 0.9, 0.98, 0.99).stated
+    True
+    """
+
+    mean_m: float
+    std_m: float
+    interval_m: tuple[float, float]
+    left_probability: float
+    near_probability: float
+    hidden_probability: float
+    existence_probability: float
 
     @property
-    def walls(self) -> StreetWalls:
-        """Walls of the junction."""
-        ...
-
-    @property
-    def along_m(self) -> FloatArray:
-        """Places along the crossing street, left positive, those of `SpectrumModel`."""
-        ...
-
-    def log_likelihood(self, spectrum: FloatArray) -> tuple[FloatArray, float]:
-        """Return the log-likelihood from every place, and without a vehicle."""
-        ...
+    def stated(self) -> bool:
+        """Whether a place can be stated; otherwise only the side, and whether the vehicle is near."""
+        return self.std_m < STATED_STD_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceBelief:
-    """Log probabilities of every velocity and place, and of nobody.
+    """Log probabilities of every velocity and place, and of an empty street.
 
     Examples
     --------
-    >>> PlaceBelief.unknown(89).log_present.shape
-    (30, 89)
+    >>> PlaceBelief(np.zeros((30, 89)), 0.0).of_places.shape
+    (89,)
     """
 
     log_present: FloatArray  # shape (V, N)
-    log_nobody: float
-
-    @classmethod
-    def unknown(cls, places: int) -> "PlaceBelief":
-        """Return the belief before anything was heard: somebody as probable as nobody, anywhere."""
-        every = np.full((len(VELOCITIES_MPS), places), -np.log(2.0 * len(VELOCITIES_MPS) * places))
-        return cls(every, -np.log(2.0))
+    log_empty: float
 
     @property
     def of_places(self) -> FloatArray:
-        """Probability of every place, given somebody, shape (N,)."""
+        """Probability of every place, given a vehicle, shape (N,)."""
         present = np.exp(self.log_present - self.log_present.max()).sum(axis=0)
         return np.asarray(present / present.sum())
 
@@ -82,14 +92,13 @@ class PlaceFilter:
 
     Parameters
     ----------
-    model : PlaceLikelihood
-        Of the spectra: a `SpectrumModel`.
+    model : SpectrumModel or RayModel
+        Likelihood of the spectra.
 
     Examples
     --------
     >>> from worldstate.frontend import MicrophoneArray
-    >>> from worldstate_lab.places.spectrum_model import SpectrumModel
-    >>> from worldstate_lab.places.street_walls import StreetWalls
+    >>> from worldstate_lab.places.sound_paths import StreetWalls
     >>> array = MicrophoneArray([[x, y, 0.0] for x in (0.0, 0.12) for y in (-0.3, -0.1, 0.1, 0.3)])
     >>> azimuths, walls = np.radians(np.linspace(90.0, -90.0, 37)), StreetWalls(4.45, 2.8, 2.8, 7.15)
     >>> frequencies = np.arange(300.0, 2000.0, 300.0)
@@ -104,30 +113,31 @@ class PlaceFilter:
     (3, True)
     """
 
-    model: PlaceLikelihood
+    model: SpectrumModel | RayModel
 
     @property
     def unknown(self) -> PlaceBelief:
-        """Belief before anything was heard."""
-        return PlaceBelief.unknown(len(self.model.along_m))
+        """Belief before anything was heard: a vehicle as probable as none, anywhere."""
+        shape = len(VELOCITIES_MPS), len(self.model.along_m)
+        return PlaceBelief(np.full(shape, -np.log(2.0 * shape[0] * shape[1])), -np.log(2.0))
 
     def predict(self, belief: PlaceBelief, dt_s: float) -> PlaceBelief:
         """Return the belief after a time, 0 to 10 s, without a spectrum."""
         in_range("dt_s", dt_s, 0.0, 10.0)
         speeds, moves = _transitions(dt_s)
-        nobody = np.exp(belief.log_nobody)
+        empty = np.exp(belief.log_empty)
         stayed = np.exp(-DEPARTURES_HZ * dt_s) * (speeds.T @ np.exp(belief.log_present))
         present = (stayed[:, None] @ moves)[:, 0]
-        come = nobody * -np.expm1(-ARRIVALS_HZ * dt_s)
-        left = max(1.0 - nobody - present.sum(), 0.0)
+        come = empty * -np.expm1(-ARRIVALS_HZ * dt_s)
+        left = max(1.0 - empty - present.sum(), 0.0)
         present = present + come / present.size
         # Underflow leaves places that nothing could ever bring back.
-        return PlaceBelief(np.log(np.maximum(present, 1e-300)), float(np.log(nobody - come + left + 1e-300)))
+        return PlaceBelief(np.log(np.maximum(present, 1e-300)), float(np.log(empty - come + left + 1e-300)))
 
     def update(self, belief: PlaceBelief, spectrum: FloatArray) -> PlaceBelief:
         """Return the belief after a spectrum; see `SpectrumModel.log_likelihood` for its errors."""
-        like, nobody = self.model.log_likelihood(spectrum)
-        present, empty = belief.log_present + like, belief.log_nobody + nobody
+        like, without = self.model.log_likelihood(spectrum)
+        present, empty = belief.log_present + like, belief.log_empty + without
         most = max(float(present.max()), empty)
         total = most + np.log(np.exp(present - most).sum() + np.exp(empty - most))
         return PlaceBelief(present - total, float(empty - total))
@@ -143,16 +153,10 @@ class PlaceFilter:
         ends = np.interp((0.05, 0.95), shares.cumsum(), along + 0.5 * STEP_M).tolist()
         on_left = float(heard[along > 0.0].sum() + 0.5 * heard[along == 0.0].sum())
         near = float(heard[(along > NEAR * right) & (along < NEAR * left)].sum())
-        side = "left" if on_left >= 0.5 else "right"
-        return PlaceEstimate(
-            KnownPlace(mean, std) if std < STATED_STD_M else NearOrFar(side, min(near, 1.0)),
-            mean,
-            std,
-            (ends[0], ends[1]),
-            min(on_left, 1.0),
-            min(float(heard[(along < right) | (along > left)].sum()), 1.0),
-            1.0 - min(float(np.exp(belief.log_nobody)), 1.0),
-        )
+        hidden = float(heard[(along < right) | (along > left)].sum())
+        exists = 1.0 - min(float(np.exp(belief.log_empty)), 1.0)
+        on_left, near, hidden = (min(chance, 1.0) for chance in (on_left, near, hidden))
+        return PlaceEstimate(mean, std, (ends[0], ends[1]), on_left, near, hidden, exists)
 
 
 @lru_cache(maxsize=4)

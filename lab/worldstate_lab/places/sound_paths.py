@@ -1,4 +1,4 @@
-"""The ways by which sound reaches the array from places on the crossing street.
+"""The walls of a junction, and the ways by which sound reaches the array from the crossing street.
 
 Facades of the crossing street mirror the source, side walls of the ego's street mirror the array. Each pair
 of images is one line through the mouth between the corners: where it misses the mouth, it bends round the
@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
-
-from .street_walls import StreetWalls
 
 SPEED_OF_SOUND_MPS = 343.0
 # Far vehicles are heard by the order whose line still meets the mouth: 2 at 11 m, 3 at 15 m, on alternating
@@ -21,6 +20,52 @@ SPEED_OF_SOUND_MPS = 343.0
 SIDE_ORDER, FACADE_ORDER = 8, 2
 # A line this far inside the mouth has lost the corner's 5 dB.
 LIT_DEPTH_M = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class StreetWalls:
+    """Two side walls that end at the corners, the street that crosses beyond them, and the wall it faces.
+
+    Parameters
+    ----------
+    corner_ahead_m : float
+        How far ahead of the array the corners stand, at the ends of the side walls.
+    left_m, right_m : float
+        Distance of the side walls to the left and to the right of the array.
+    crossing_m : float
+        How far ahead vehicles cross, beyond the corners.
+    facing_m : float or None
+        How far ahead the wall beyond the crossing street stands; None where there is none.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If a distance is out of range, or the street does not lie between corners and facing wall.
+
+    Examples
+    --------
+    >>> [round(limit, 2) for limit in StreetWalls(4.45, 2.8, 2.8, 7.15, facing_m=9.9).sight_m]
+    [-4.5, 4.5]
+    """
+
+    corner_ahead_m: float
+    left_m: float
+    right_m: float
+    crossing_m: float
+    facing_m: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("corner_ahead_m", "left_m", "right_m"):
+            in_range(name, getattr(self, name), 0.5, 100.0)
+        in_range("crossing_m", self.crossing_m, self.corner_ahead_m + 0.5, 200.0)
+        if self.facing_m is not None:
+            in_range("facing_m", self.facing_m, self.crossing_m + 0.5, 200.0)
+
+    @property
+    def sight_m(self) -> tuple[float, float]:
+        """Limits (right, left) of what is in line of sight on the crossing street, y left positive."""
+        reach = self.crossing_m / self.corner_ahead_m
+        return -self.right_m * reach, self.left_m * reach
 
 
 @dataclass(frozen=True, slots=True)
