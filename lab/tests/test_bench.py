@@ -3,10 +3,9 @@
 import json
 
 import numpy as np
-from worldstate_lab.benchmarks.bench import EVERYTHING, BenchReport, _front_end_times, _source
-from worldstate_lab.benchmarks.bench_evidence import PARTS, _adapter, _guard, _sequence, _windows
-from worldstate_lab.benchmarks.bench_stages import GOAL, MORE, RATE_HZ
-from worldstate_lab.cli.bench import _lines
+from worldstate_lab.benchmarks.cost import EVERYTHING, BenchReport, _front_end_times, _source, report_lines
+from worldstate_lab.benchmarks.cost_of_evidence import PARTS, _adapter, _guard, _sequence, _windows
+from worldstate_lab.benchmarks.cost_of_stages import GOAL, MORE, RATE_HZ
 
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
@@ -49,7 +48,7 @@ def test_text_names_kernel_threads_and_what_is_compared():
         stages={"stft": (0.25, 0.5)}, total_ms=1.0, p99_ms=2.0, peers={"published_chain": 40.0},
         ratios={"published_chain": 40.0},
     )  # fmt: skip
-    text = "\n".join(_lines(report))
+    text = "\n".join(report_lines(report))
     for part in ("openblas 0.3 Any; 1 thread; median of 5", "0.250", "40.0", "published_chain: bins 1-15"):
         assert part in text
 

@@ -1,55 +1,55 @@
 """Cost of ego-noise cancellation per 0.1-s hop, beside the transform it follows.
 
-Run: python -m worldstate_lab.benchmarks.ego_noise [--json] [--rounds 5]
-
 56 channels, 47,998 Hz, nfft 512, half overlap, SRP bins only; BLAS pinned to one thread. The sound is white
 noise and a wave from below, so that it is whitened. What is timed is the processor time of `EgoNoise.process`
 and `levelled` less the phase transform that they replace, in three states: gate open, gate shut after
 learning, and gate open with an engine whose lines are cancelled; `engine_alone` is the difference that the
-engine makes. `ego_noise_times` is for other benchmarks to call.
+engine makes.
 """
 
 import argparse
-import json
 import time
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from worldstate.cli.common.output import CommandResult
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.ego_noise.ego_noise import EgoNoise, EgoNoiseSettings
 from worldstate.frontend.ego_noise.elevation_split import ElevationSplit
 from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCanceller
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
+from worldstate.ground.blas_threads import one_blas_thread
+from worldstate.ground.typing import Complex64Array, Float32Array
+
+from .stopwatch import Milliseconds, elapsed_ms
 
 RATE, NFFT, HOPS, WARM_UP = 47_998, 512, 120, 60
 BINS, SRP = range(1, 19), slice(2, 18)
 DIRECTIONS = np.ones(181)
 
 
-def ego_noise_times(hops: int = HOPS, seed: int = 0) -> dict[str, list[float]]:
+def ego_noise_times(seed: int) -> dict[str, Milliseconds]:
     """Milliseconds of processor time per hop: the transform, and what each state of cancelling adds."""
     sound = _sound(np.random.default_rng(seed))
     stft = StreamingStft(56, NFFT, BINS)
     stft.push(sound)
-    spectra = [stft.push(np.roll(sound, 977 * k, axis=0)) for k in range(hops)]
-    times = {"stft": [_spent(lambda: stft.push(sound)) for _ in spectra]}
-    plain = [_spent(lambda heard=heard: whiten(heard[:, SRP])) for heard in spectra]
+    spectra = [stft.push(np.roll(sound, 977 * k, axis=0)) for k in range(HOPS)]
+    times = {"stft": [elapsed_ms(partial(stft.push, sound), time.process_time) for _ in spectra]}
+    plain = [elapsed_ms(partial(whiten, heard[:, SRP]), time.process_time) for heard in spectra]
     for name, engine, shut in (("learning", False, False), ("shut", False, True), ("engine", True, False)):
         ego = _ego_noise(engine)
         spent = []
         for k, heard in enumerate(spectra):
             if shut and k == WARM_UP - 10:
                 ego.weight = 0.0
-            spent.append(_spent(lambda heard=heard, ego=ego: _processed(ego, heard)))
+            spent.append(elapsed_ms(partial(_processed, ego, heard), time.process_time))
         times[f"ego_noise_{name}"] = [a - b for a, b in zip(spent, plain, strict=True)]
     return {name: spent[WARM_UP:] for name, spent in times.items()}
 
 
-def _sound(rng: np.random.Generator) -> NDArray[np.float32]:
+def _sound(rng: np.random.Generator) -> Float32Array:
     """Draw white noise and a wave of the same power from 40 degrees below the horizon, (4800, 56)."""
     late = np.round(roof_array_56().delays_s(0.3, np.radians(-40.0)) * RATE).astype(int)
     wave = rng.standard_normal(4800)
@@ -70,36 +70,28 @@ def _ego_noise(engine: bool) -> EgoNoise:
     return ego
 
 
-def _processed(ego: EgoNoise, heard: NDArray[np.complex64]) -> None:
+def _processed(ego: EgoNoise, heard: Complex64Array) -> None:
     ego.process(heard)
     ego.levelled(DIRECTIONS, len(heard))
 
 
-def _spent(call: Callable[[], object]) -> float:
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--rounds", type=int, default=5, help="the median of so many runs is reported")
-    options = parser.parse_args()
-    with threadpool_limits(1):
-        rounds = [ego_noise_times(seed=seed) for seed in range(options.rounds)]
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the benchmark; return what it found."""
+    with one_blas_thread():
+        rounds = [ego_noise_times(seed) for seed in range(arguments.rounds)]
     # The mean: one hop in four carries the eigendecomposition.
     mean = {name: float(np.median([np.mean(r[name]) for r in rounds])) for name in rounds[0]}
     p99 = {name: float(np.median([np.percentile(r[name], 99) for r in rounds])) for name in rounds[0]}
-    mean["engine_alone"] = mean["ego_noise_engine"] - mean["ego_noise_learning"]
-    p99["engine_alone"] = p99["ego_noise_engine"] - p99["ego_noise_learning"]
+    for times in (mean, p99):
+        times["engine_alone"] = times["ego_noise_engine"] - times["ego_noise_learning"]
     ratios = {name: spent / mean["stft"] for name, spent in mean.items()}
-    if options.json:
-        print(json.dumps({"mean_ms": mean, "p99_ms": p99, "of_stft": ratios}, indent=2))
-        return
-    for name, spent in mean.items():
-        print(f"  {name:20s} {spent:7.3f} ms   p99 {p99[name]:7.3f}   {ratios[name]:5.2f} of the transform")
-
-
-if __name__ == "__main__":
-    main()
+    lines = [
+        f"  {name:20s} {spent:7.3f} ms   p99 {p99[name]:7.3f}   {ratios[name]:5.2f} of the transform"
+        for name, spent in mean.items()
+    ]
+    return CommandResult({"mean_ms": mean, "p99_ms": p99, "of_stft": ratios}, table={}, lines=lines)

@@ -1,10 +1,10 @@
-"""How long the imports take, each in a fresh interpreter, best of several; wall and CPU time.
+"""How long the imports take, each in a fresh interpreter, best of several; wall and processor time."""
 
-python -m worldstate_lab.benchmarks.import_time
-"""
-
+import argparse
 import subprocess
 import sys
+
+from worldstate.cli.common.output import CommandResult
 
 STATEMENTS = (
     "import worldstate",
@@ -14,21 +14,24 @@ STATEMENTS = (
     "import worldstate; worldstate.listen",
     "import worldstate.cli.main",
 )
-REPEATS = 7
 
 
-def best_s(statement: str) -> tuple[float, ...]:
-    """Return the shortest wall and CPU time of a statement, without the interpreter's start."""
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--rounds", type=int, default=7, help="the best of so many (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the benchmark; return seconds of wall and of processor by statement."""
+    return CommandResult({statement: _best_s(statement, arguments.rounds) for statement in STATEMENTS})
+
+
+def _best_s(statement: str, rounds: int) -> list[float]:
+    """Return the shortest wall and processor time of a statement, without the interpreter's start."""
     timed = (
         f"import time; t, c = time.perf_counter(), time.process_time(); {statement}; "
         "print(time.perf_counter() - t, time.process_time() - c)"
     )
     command = [sys.executable, "-c", timed]
-    runs = [subprocess.run(command, capture_output=True, text=True, check=True) for _ in range(REPEATS)]
-    return tuple(min(float(run.stdout.split()[k]) for run in runs) for k in range(2))
-
-
-if __name__ == "__main__":
-    for statement in STATEMENTS:
-        wall_s, cpu_s = best_s(statement)
-        print(f"{wall_s:6.3f} s, CPU {cpu_s:6.3f} s  {statement}")
+    runs = [subprocess.run(command, capture_output=True, text=True, check=True) for _ in range(rounds)]
+    return [min(float(run.stdout.split()[k]) for run in runs) for k in range(2)]

@@ -1,19 +1,15 @@
 """T0 and hidden places of smoothed passes on simulated streams, beside what the filter said at the time.
 
-Run: python -m worldstate_lab.benchmarks.labels
-streams/*-approaches-*.npz [--passes 30] [--figure PNG] [--json]
-
 Boxes are drawn from the truth of the streams, with misses. T0 against that of the simulation, places of the
 front's middle against its path, in the three seconds before T0 ("hidden": all of their hops). The filter is
 `worldstate.belief`'s in modified polar coordinates from the same prior, with the same approach rates and the
-bearings that the front-end heard, as hidden ones (25 degrees): its place is the best that it could have said.
+bearings that the front-end heard, as hidden ones (25 degrees): its place is the best that it could state.
 "nees" is the squared error of azimuth and log range over the stated covariance, halved: 1 in the mean where
 deviations are stated rightly; "place_nees" that of x and y in metres, and "covered" the share of places in
 their ellipse of nine tenths. Intervals of nine tenths by 1000 draws of passes.
 """
 
 import argparse
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +19,9 @@ import numpy as np
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.belief.kinematics import motion
 from worldstate.belief.kinematics.motion import MotionBelief
+from worldstate.cli.common.output import CommandResult
 from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import RED, figure_file, legend_beside
 from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.pass_figure import draw_passes, draw_track
@@ -43,7 +41,7 @@ ELLIPSE_HALVED = math.log(10.0)  # Half the quantile of .9 of chi-square with tw
 
 
 def stream_passes(path: Path, passes: int, seed: int = 0) -> tuple[HeardStream, list[PassLabel], int]:
-    """A stream, the labels of its first passes, and how many vehicles came out of an arm until then."""
+    """Return a stream, the labels of its first passes, and how many vehicles came until then."""
     stream, camera = HeardStream.load(path), PinholeCamera()
     log = stream_detections(stream, np.random.default_rng(seed), camera)
     tracks = [one for one in box_tracks(log, camera, EVERYBODY) if one.arm is not None][:passes]
@@ -54,7 +52,7 @@ def stream_passes(path: Path, passes: int, seed: int = 0) -> tuple[HeardStream, 
 
 
 def true_track(stream: HeardStream, one: PassLabel) -> tuple[float, TrueTrack] | None:
-    """T0 and path of the vehicle that a label is of, None where none came out of that arm at that time."""
+    """Return T0 and path of the vehicle that a label is of, None where none came at that time."""
     vehicles = stream.vehicles
     near = np.where(vehicles.arm == one.arm, np.abs(vehicles.entry_s - one.t0.time_s), np.inf)
     near[~vehicles.hazard] = np.inf
@@ -69,7 +67,7 @@ def true_track(stream: HeardStream, one: PassLabel) -> tuple[float, TrueTrack] |
 
 
 def filtered_track(stream: HeardStream, one: PassLabel) -> SmoothedTrack:
-    """What a filter would have said at every hop until T0."""
+    """Return what a filter would have stated at every hop until T0."""
     hops, belief, said = stream.hops, start_of(one.arm), []
     first, last = np.searchsorted(hops.time_s, [one.track.time_s[0], one.t0.time_s]).tolist()
     for hop in range(first, last):
@@ -87,7 +85,7 @@ def filtered_track(stream: HeardStream, one: PassLabel) -> SmoothedTrack:
 
 
 def pass_errors(stream: HeardStream, one: PassLabel) -> dict[str, list[float]]:
-    """Errors of T0 and of what smoother and filter say at every lead; none where the label is of nobody."""
+    """Return errors of T0, and of smoother and filter at every lead; none for a label of no vehicle."""
     found = true_track(stream, one)
     if found is None:
         return {}
@@ -110,13 +108,13 @@ def pass_errors(stream: HeardStream, one: PassLabel) -> dict[str, list[float]]:
     return told
 
 
-def _halved(off: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _halved(off: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the squared error over the covariance, of two numbers each, halved."""
-    return 0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
+    return np.asarray(0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off))
 
 
-def _at(time_s: np.ndarray, rows: np.ndarray, entry_s: float) -> np.ndarray:
-    """Rows at every lead, linear between two, NaN beyond the first and the last by more than half a hop."""
+def _at(time_s: FloatArray, rows: FloatArray, entry_s: float) -> FloatArray:
+    """Return rows at every lead, linear between two, NaN from half a hop beyond the first and last on."""
     asked_s = entry_s - LEADS_S
     columns = [np.interp(asked_s, time_s, column) for column in rows.reshape(len(rows), -1).T]
     found = np.stack(columns, axis=1).reshape(LEADS_S.size, *rows.shape[1:])
@@ -125,6 +123,7 @@ def _at(time_s: np.ndarray, rows: np.ndarray, entry_s: float) -> np.ndarray:
 
 
 def figures(found: list[dict[str, list[float]]], came: int, rng: np.random.Generator) -> dict[str, object]:
+    """Return the figures of passes with their intervals."""
     off = np.array([one["t0_s"][0] for one in found])
     told: dict[str, object] = {
         "vehicles": came,
@@ -136,9 +135,10 @@ def figures(found: list[dict[str, list[float]]], came: int, rng: np.random.Gener
     shown = [round(lead_s / HOP_S) - 1 for lead_s in SHOWN_S]
     errors = {key: np.array([one[key] for one in found]) for key in found[0] if key[:2] != "t0"}
     for key, values in errors.items():
+        measure = _mean if key.endswith(("nees", "covered")) else _rms
         for column in shown:
-            told[f"{key} {LEADS_S[column]:g} s"] = _interval([values[:, [column]]], _measure(key), rng)
-        told[f"{key} hidden"] = _interval([values], _measure(key), rng)
+            told[f"{key} {LEADS_S[column]:g} s"] = _interval([values[:, [column]]], measure, rng)
+        told[f"{key} hidden"] = _interval([values], measure, rng)
         told[f"{key} hidden, median"] = round(float(np.nanmedian(values)), 2)
     for unit in ("m", "deg"):
         pair = [errors[f"{name}_{unit}"] for name in METHODS]
@@ -150,22 +150,18 @@ def figures(found: list[dict[str, list[float]]], came: int, rng: np.random.Gener
     return told
 
 
-def _measure(key: str) -> Callable[[np.ndarray], float]:
-    return _mean if key.endswith(("nees", "covered")) else _rms
-
-
-def _mean(values: np.ndarray) -> float:
+def _mean(values: FloatArray) -> float:
     return float(np.nanmean(values))
 
 
-def _rms(errors: np.ndarray) -> float:
+def _rms(errors: FloatArray) -> float:
     return math.sqrt(np.nanmean(errors**2))
 
 
 def _interval(
-    columns: list[np.ndarray], measure: Callable[..., float], rng: np.random.Generator
+    columns: list[FloatArray], measure: Callable[..., float], rng: np.random.Generator
 ) -> list[float]:
-    """A figure of passes, and its interval of nine tenths."""
+    """Return a figure of passes, and its interval of nine tenths."""
     known = np.all([np.isfinite(one).any(axis=1) for one in columns], axis=0)
     kept = [one[known] for one in columns]
     draws = rng.integers(0, known.sum(), (1000, known.sum()))
@@ -175,33 +171,31 @@ def _interval(
 
 def write_figure(path: Path, one: PassLabel, stream: HeardStream) -> None:
     """Draw a pass from above: smoother and filter, the edge as learned, and the true track."""
-    _, vehicle = true_track(stream, one)
-    track = filtered_track(stream, one)
+    track, found = filtered_track(stream, one), true_track(stream, one)
     with figure_file(path, 8.5, 3.4) as figure:
         axes = figure.add_subplot()
         draw_track(axes, track, np.ones(len(track.stamps_ns), bool), RED, f"{one.arm}, filter")
-        draw_passes(axes, [one], [vehicle])
+        draw_passes(axes, [one], [found[1]] if found else [])
         legend_beside(axes)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("streams", type=Path, nargs="+", metavar="NPZ")
-    parser.add_argument("--passes", type=int, default=30, help="of every stream, the first so many")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw the pass of the median hidden error")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    options = parser.parse_args()
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("streams", type=Path, nargs="+", metavar="NPZ")
+    add("--passes", type=int, default=30, help="of every stream, the first so many (default: %(default)s)")
+    add("--figure", type=Path, metavar="PNG", help="draw the pass of the median hidden error")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the benchmark; return what it found."""
     found, came = [], 0
-    for path in options.streams:
-        stream, passes, vehicles = stream_passes(path, options.passes)
+    for path in arguments.streams:
+        stream, passes, vehicles = stream_passes(path, arguments.passes)
         found += [(one, stream, errors) for one in passes if (errors := pass_errors(stream, one))]
         came += vehicles
     told = figures([errors for *_, errors in found], came, np.random.default_rng(0))
-    if options.figure:
+    if arguments.figure:
         hidden_m = [_rms(np.array(errors["smoothed_m"])) for *_, errors in found]
-        write_figure(options.figure, *found[int(np.argsort(hidden_m)[len(found) // 2])][:2])
-    print(json.dumps(told, indent=2) if options.json else "\n".join(f"{k:26s} {v}" for k, v in told.items()))
-
-
-if __name__ == "__main__":
-    main()
+        write_figure(arguments.figure, *found[int(np.argsort(hidden_m)[len(found) // 2])][:2])
+    return CommandResult(told)

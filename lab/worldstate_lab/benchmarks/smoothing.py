@@ -1,30 +1,31 @@
 """Cost of a step of the fixed-lag smoother at 10 Hz, beside filterpy's RTS smoother over the same lag.
 
-Run: python -m worldstate_lab.benchmarks.smoothing [--json] [--seconds 40]
-
 Three entities, lag 15 s, two corners, four walls. Each entity is heard by bearing and approach rate and, at
 every tenth hop, by its image in a wall; past its corner it is seen by bearing and box height, and looks say
-on which side of the edge it is. The peer filters and smooths the same lag anew at every hop, as who has no
-incremental smoother must: constant velocity in Cartesian coordinates, positions measured. Processor time of
-one thread, in ms; `smoothing_times` is for other benchmarks and tests to call.
+on which side of the edge it is. The peer, which is not incremental, filters and smooths the same lag
+anew at every hop: constant velocity in Cartesian coordinates, positions measured. Processor time of one
+thread, in ms.
 """
 
 import argparse
-import json
 import math
 import time
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from worldstate.cli.common.output import CommandResult
 from worldstate.measurement import Approach, Bearing
 from worldstate.smoothing import AngularHeight, FixedLagSmoother, PastEdge, ReflectedBearing
+from worldstate.smoothing.observations import Observation
 
-HOP_S, HOP_NS, LAG_HOPS, PASS_HOPS = 0.1, 100_000_000, 150, 160
+from .stopwatch import Milliseconds, elapsed_ms
+
+HOP_S, HOP_NS, LAG_HOPS, PASS_HOPS, ENTITIES = 0.1, 100_000_000, 150, 160, 3
 WALLS = ("opposite", "west", "back", "east")
 
 
-def smoothing_times(hops: int, rng: np.random.Generator, entities: int = 3) -> tuple[list[float], int]:
+def smoothing_times(hops: int, rng: np.random.Generator) -> tuple[Milliseconds, int]:
     """Milliseconds of processor time per step, and the factor slots at the end."""
     smoother = FixedLagSmoother()
     smoother.add_corner("left", 1, (5.0, 3.0), (1.0, 0.5))
@@ -34,20 +35,21 @@ def smoothing_times(hops: int, rng: np.random.Generator, entities: int = 3) -> t
     spent = []
     for hop in range(hops):
         seen = {}
-        for number in range(entities):
+        for number in range(ENTITIES):
             # Each comes again when it has passed, under another name: 16 s, 24 m to 40 m away at first.
             after, passes = (hop + 53 * number) % PASS_HOPS, (hop + 53 * number) // PASS_HOPS
             seen[f"{number}-{passes}"] = observed(after, number, rng)
-        spent.append(_spent(lambda hop=hop, seen=seen: smoother.update(hop * HOP_NS, seen)))
+        spent.append(elapsed_ms(partial(smoother.update, hop * HOP_NS, seen), time.process_time))
     return spent, smoother.n_factor_slots
 
 
-def observed(hop: int, number: int, rng: np.random.Generator) -> list[object]:
+def observed(hop: int, number: int, rng: np.random.Generator) -> list[Observation]:
+    """Return what one entity is measured by at a hop of its pass."""
     side = 1 if number % 2 == 0 else -1
     x, y, speed = 8.0 + number, side * (24.0 - 0.3 * hop), 3.0
     azimuth, r = math.atan2(y, x), math.hypot(x, y)
     inverse_tta = side * y * speed / r**2
-    heard: list[object] = [
+    heard: list[Observation] = [
         Bearing(azimuth + rng.normal(0.0, 0.07), 0.07),
         Approach(inverse_tta + rng.normal(0.0, 0.25), 0.25),
     ]
@@ -64,7 +66,7 @@ def observed(hop: int, number: int, rng: np.random.Generator) -> list[object]:
     return heard
 
 
-def rts_times(hops: int, rng: np.random.Generator, entities: int = 3) -> list[float]:
+def rts_times(hops: int, rng: np.random.Generator) -> Milliseconds:
     """Milliseconds of processor time per hop: filter and RTS over the lag, for every entity."""
     from filterpy.kalman import KalmanFilter
 
@@ -74,27 +76,24 @@ def rts_times(hops: int, rng: np.random.Generator, entities: int = 3) -> list[fl
     peer.Q = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
     measured = rng.standard_normal((LAG_HOPS, 2))
 
-    def smooth() -> None:
-        peer.x, peer.P = np.zeros(4), 10.0 * np.eye(4)
-        means, covariances, *_ = peer.batch_filter(measured)
-        peer.rts_smoother(means, covariances)
+    def smooth_every_entity() -> None:
+        for _ in range(ENTITIES):
+            peer.x, peer.P = np.zeros(4), 10.0 * np.eye(4)
+            means, covariances, *_ = peer.batch_filter(measured)
+            peer.rts_smoother(means, covariances)
 
-    return [_spent(lambda: [smooth() for _ in range(entities)]) for _ in range(hops)]
-
-
-def _spent(call: Callable[[], object]) -> float:
-    start = time.process_time()
-    call()
-    return 1e3 * (time.process_time() - start)
+    return [elapsed_ms(smooth_every_entity, time.process_time) for _ in range(hops)]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--seconds", type=float, default=40.0, help="of stream")
-    options = parser.parse_args()
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--seconds", type=float, default=40.0, help="of stream (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the benchmark; return what it found."""
     rng = np.random.default_rng(0)
-    spent, slots = smoothing_times(round(options.seconds / HOP_S), rng)
+    spent, slots = smoothing_times(round(arguments.seconds / HOP_S), rng)
     # The first lag is cheaper: nothing is marginalised yet.
     steady = np.array(spent[LAG_HOPS:] or spent)
     peer = float(np.mean(rts_times(10, rng)))
@@ -105,12 +104,4 @@ def main() -> None:
         "of_rts": float(steady.mean() / peer),
         "factor_slots": slots,
     }
-    print(
-        json.dumps(figures, indent=2)
-        if options.json
-        else "\n".join(f"{k:22s} {v:9.3f}" for k, v in figures.items())
-    )
-
-
-if __name__ == "__main__":
-    main()
+    return CommandResult(figures)

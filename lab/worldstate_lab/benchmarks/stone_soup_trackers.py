@@ -2,7 +2,7 @@
 
 Both get what their books ask for: detection probability and clutter of either sensor, a nearly constant rate
 of turn, and the sector that the camera searches. In Stone Soup the probability of detection is one number, so
-that whoever stands outside that sector is kept from the camera's scan.
+that a target outside that sector is kept from the camera's scan.
 """
 
 from collections.abc import Iterable
@@ -37,7 +37,7 @@ except ImportError as error:
     raise MissingExtraError("stonesoup", "oracles") from error
 
 # A peak belongs to a hidden vehicle in one of four windows, as `FilterSettings` has it; the other three, and
-# every peak of a street where nobody comes, lie anywhere ahead.
+# every peak of an empty street, lie anywhere ahead.
 PEAK_DETECTION, PEAK_CLUTTER = 0.25, 1.0 / np.pi
 BOX_DETECTION, BOX_CLUTTER = 0.94, 0.01
 TURN_PSD = 0.014  # 2 m^2/s^3 at 12 m, rad^2/s^3
@@ -58,7 +58,7 @@ class Scan:
     detections: tuple[Any, ...]
     detection_probability: float
     clutter_density: float  # Per radian
-    sector_rad: tuple[float, float]  # From right to left: outside of it nobody is searched for
+    sector_rad: tuple[float, float]  # From right to left: no target is searched for outside
 
     def searches(self, state: Any) -> bool:
         """Tell whether a target is believed in the sector."""
@@ -67,7 +67,7 @@ class Scan:
 
 def scans(measurement: Measurement, view_rad: tuple[float, float]) -> tuple[Scan, Scan]:
     """Return what the array and what the camera measured at a hop."""
-    when = stamp_of(measurement)
+    when = scan_time(measurement)
     heard = [measurement.bearing] if isinstance(measurement.bearing, Bearing) else []
     view = max(view_rad[1] - view_rad[0], 0.1)
     return (
@@ -76,7 +76,7 @@ def scans(measurement: Measurement, view_rad: tuple[float, float]) -> tuple[Scan
     )
 
 
-def stamp_of(measurement: Measurement) -> datetime:
+def scan_time(measurement: Measurement) -> datetime:
     """Return the time of a measurement as Stone Soup has times."""
     return _EPOCH + timedelta(microseconds=measurement.stamp_ns // 1000)
 
@@ -101,7 +101,7 @@ class GmPhd:
 
     def step(self, scans: Iterable[Scan], when: datetime) -> list[float]:
         """Take the scans of a hop."""
-        # Who survives is asked at every update of Stone Soup's: once a hop, not once a sensor.
+        # Stone Soup asks for survival at every update: once a hop, not once a sensor.
         for scan, survival in zip(scans, (0.99, 1.0), strict=True):
             searched = [one for one in self._components if scan.searches(one)]
             others = [one for one in self._components if not scan.searches(one)]

@@ -5,6 +5,7 @@ rounds of the median (and 99th percentile) over hops. The sound is a broadband s
 noise as loud as the source; noise alone, the worst case for MUSIC, is a row of its own.
 """
 
+import argparse
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
 
+from worldstate.cli.common.output import CommandResult
+from worldstate.cli.common.progress import progress_bar
 from worldstate.frontend.approach.tone_stage import ENGINE_BAND_HZ
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.direction.music import music_spectrum, signal_subspace
@@ -24,12 +27,13 @@ from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz
 from worldstate.frontend.stream import FrontEnd
+from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array
 
-from .bench_evidence import evidence_times
-from .bench_peers import peer_times
-from .bench_stages import AZIMUTHS_RAD, GOAL, NFFT, RATE_HZ, SRP_BINS, srp_beams, stage_times
+from .cost_of_evidence import evidence_times
+from .cost_of_peers import peer_times
+from .cost_of_stages import AZIMUTHS_RAD, GOAL, NFFT, RATE_HZ, SRP_BINS, srp_beams, stage_times
 from .stopwatch import Milliseconds, elapsed_ms
 
 SECONDS = 6
@@ -58,7 +62,7 @@ SETTINGS = {
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What `run_bench` measured; all times in milliseconds per 0.1-s hop."""
+    """What was measured; all times in milliseconds per 0.1-s hop."""
 
     blas: tuple[str, ...]  # Kernel and version of every BLAS in the process
     threads: int  # Threads that BLAS was pinned to
@@ -82,40 +86,38 @@ class BenchReport:
         return {**encode(self), "stages": stages}
 
 
-def run_bench(
-    rounds: int = 5, on_round: Callable[[], None] = lambda: None, *, seconds: int = SECONDS
-) -> BenchReport:
-    """Measure the front-end and the peers that are installed, in turn, `rounds` times.
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
 
-    Parameters
-    ----------
-    rounds : int
-        At least one; medians are taken over them.
-    on_round : callable
-        Called after each round, for progress.
-    seconds : int
-        Of sound in each round, even; the first eleven hops warm up and do not count.
 
-    Returns
-    -------
-    BenchReport
-
-    Examples
-    --------
-    >>> report = run_bench(rounds=1, seconds=2)
-    >>> report.threads, report.rounds, report.total_ms > 0
-    (1, 1, True)
-    """
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Measure the front-end and the peers that are installed, in turn, `--rounds` times."""
+    rounds = int(in_range("rounds", arguments.rounds, 1, 1000))
     rng = np.random.default_rng(0)
-    noise = rng.standard_normal((seconds * RATE_HZ, 56), dtype=np.float32)
-    street = noise + np.tile(_source(rng), (seconds // 2, 1))
+    noise = rng.standard_normal((SECONDS * RATE_HZ, 56), dtype=np.float32)
+    street = noise + np.tile(_source(rng), (SECONDS // 2, 1))
     runs: list[Mapping[str, Milliseconds]] = []
-    with threadpool_limits(1):
+    with threadpool_limits(1), progress_bar("timing", rounds, quiet=arguments.json) as bar:
         kernels = tuple(_kernel(info) for info in threadpool_info())
         for _ in range(rounds):
             runs.append(_one_round(street, noise))
-            on_round()
-    return _report(runs, kernels)
+            bar.advance()
+    report = _report(runs, kernels)
+    return CommandResult(report.to_dict(), table={}, lines=report_lines(report))
+
+
+def report_lines(report: BenchReport) -> list[str]:
+    """Return the report for people."""
+    head = f"BLAS {', '.join(report.blas)}; {report.threads} thread; median of {report.rounds} rounds"
+    rows = [*report.stages.items(), ("STFT + SRP181 + feature", (report.total_ms, report.p99_ms))]
+    return [
+        f"{head}; load {report.load:.1f}; ms per hop",
+        *(f"  {name:32s} {median:9.3f}   p99 {p99:9.3f}" for name, (median, p99) in rows),
+        *(f"  peer {name:27s} {median:9.3f}" for name, median in report.peers.items()),
+        *(f"  ratio {name:26s} {ratio:9.1f}" for name, ratio in report.ratios.items()),
+        *(f"{name}: {setting}" for name, setting in report.settings.items()),
+    ]
 
 
 def _source(rng: np.random.Generator) -> Float32Array:

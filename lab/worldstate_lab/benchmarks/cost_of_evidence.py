@@ -26,8 +26,8 @@ from worldstate.frontend.frame import AcousticFrame
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.typing import FloatArray
 
-from .bench_peers import REPEATS
-from .bench_stages import RATE_HZ
+from .cost_of_peers import REPEATS
+from .cost_of_stages import RATE_HZ
 from .stopwatch import Milliseconds, elapsed_ms
 
 PARTS = ("window_evidence", "domain_guard", "sequence_reader")

@@ -1,16 +1,12 @@
 """GOSPA on bearing of the world-state beside trackers, for vehicles that come and for vehicles in view.
 
-Run: python -m worldstate_lab.benchmarks.gospa_trackers
-streams/S??-*.npz [--model model.json] [--seconds 120] [--json]
-
 Streams that were listened to (`worldstate model make` keeps them) are followed hop by hop. Cut off at 60
-degrees, p = 1, alpha = 2. Hidden are those who will come into view within five seconds, visible those in line
-of sight and in the image. Every method states who is hidden and who is visible. The world-state says so
-itself; of a tracker, which knows no occlusion, whoever is where the stream's boxes stand is visible.
+degrees, p = 1, alpha = 2. Hidden are vehicles that come into view within five seconds, visible those in line
+of sight and in the image. Every method states both. The world-state does so itself; of a tracker, which
+models no occlusion, a track where the stream's boxes stand is visible.
 """
 
 import argparse
-import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,6 +21,7 @@ from worldstate import WorldFilter
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.cli.common.output import CommandResult
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable
@@ -37,27 +34,29 @@ from worldstate_lab.metrics.track_measures import gospa_bearing
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import stream_measurements
 
-from .stone_soup_trackers import GmPhd, Jpda, scans, stamp_of
-
 SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
 OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"
 PHASES, PARTS = ("hidden", "visible"), ("localised", "missed", "false")
 EXISTS, ALPHA = 0.5, 0.02
 Row = dict[str, float | None]
 Costs = tuple[dict[str, FloatArray], FloatArray]
-Said = dict[str, tuple[Sequence[float], Sequence[float]]]  # By method: Who is hidden and who is visible
+# By method: azimuths of hidden and of visible vehicles.
+Said = dict[str, tuple[Sequence[float], Sequence[float]]]
 
 
 def stated(
     heard: HeardStream, measured: Iterable[Measurement], start: WorldFilter
 ) -> Iterator[tuple[int, Said]]:
     """Yield the number of every hop of a stream, in tenths of a second, and what every method states."""
+    # Optional: only this benchmark needs Stone Soup.
+    from .stone_soup_trackers import GmPhd, Jpda, scan_time, scans
+
     taken = list(measured)
     view, boxes = _view(taken), _oc_sort(heard)
     world, deaf, phd, jpda = start, start, GmPhd(), Jpda()
     for one in taken:
         world, deaf = world.update(one), deaf.update(_unheard(one))
-        both, when, hop = scans(one, view), stamp_of(one), round(one.stamp_ns * 1e-9 / HOP_S)
+        both, when, hop = scans(one, view), scan_time(one), round(one.stamp_ns * 1e-9 / HOP_S)
         yield (
             hop,
             {
@@ -86,13 +85,13 @@ def _unheard(one: Measurement) -> Measurement:
 
 
 def _by_phase(state: WorldState) -> tuple[list[float], list[float]]:
-    """Return who is believed hidden, to come within five seconds, and who is believed in view."""
-    # A cue states a time where somebody is likelier than not to come within five seconds.
+    """Return the azimuths believed hidden, to come within five seconds, and those believed in view."""
+    # A cue states a time where a vehicle is likelier than not to come within five seconds.
     coming_s = {cue.direction: cue.time_to_visible_s[1] for cue in state.cues if cue.time_to_visible_s}
     there = [one for one in state.entities if one.existence_probability >= EXISTS]
     hidden = [one for one in there if one.status == "hidden"]
     soon = [one for one in hidden if coming_s.get(str(one.direction), math.inf) <= LONGEST_LEAD_S]
-    # Whoever has left the view is remembered for some seconds; the camera is not asked about him.
+    # A vehicle that has left the view is kept for some seconds; the camera is not asked about it.
     seen = [one for one in there if one.status != "hidden" and one.visibility.answer != "unqueried"]
     return [one.azimuth_rad for one in soon], [one.azimuth_rad for one in seen]
 
@@ -137,7 +136,7 @@ def _parts_deg(estimates: tuple[float, ...], truths: tuple[float, ...]) -> Float
 
 
 def costs(heard: HeardStream, measured: Iterable[Measurement], start: WorldFilter) -> Costs:
-    """Return every method's summed costs by phase and part, degrees, and the hops with anybody, by phase."""
+    """Return every method's summed costs by phase and part, degrees, and the hops with a vehicle."""
     truths, summed = true_azimuths(heard), dict[str, FloatArray]()
     hops = np.zeros(len(PHASES))
     for hop, said in stated(heard, measured, start):
@@ -177,29 +176,24 @@ def report_of(paths: Sequence[Path], model: Model, seconds: float) -> dict[str, 
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("streams", type=Path, nargs="+", metavar="NPZ")
     parser.add_argument("--model", type=Path, help="with a sequence; the one that ships otherwise")
     parser.add_argument("--seconds", type=float, default=math.inf, help="of every stream; all otherwise")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    options = parser.parse_args()
-    found = report_of(options.streams, read_model(options.model), options.seconds)
-    if options.json:
-        print(json.dumps(found, indent=1))
-        return
-    junctions = [name for name in found if name != "all"]
+
+
+def run(arguments: argparse.Namespace) -> CommandResult:
+    """Run the benchmark; return what it found."""
+    found = report_of(arguments.streams, read_model(arguments.model), arguments.seconds)
+    junctions, lines = [name for name in found if name != "all"], []
     for k, phase in enumerate(PHASES):
-        beside = (SILENCE, OC_SORT)[k]
         parts = "".join(f"{part:>12}" for part in PARTS)
-        print(f"{phase:28}{'GOSPA':>8}{parts}  of {beside}, worst")
+        lines.append(f"{phase:28}{'GOSPA':>8}{parts}  of {(SILENCE, OC_SORT)[k]}, worst")
         for method, rows in found["all"].items():
             row, shares = rows[phase], {one: found[one][method][phase]["share"] or 0.0 for one in junctions}
             worst = max(shares, key=lambda one: shares[one])
             parts = "".join(f"{row[part]:12.2f}" for part in PARTS)
-            print(f"{method:28}{row['gospa_deg']:8.2f}{parts}", end="")
-            print(f"  {row['share']:.3f}  {shares[worst]:.3f} ({worst})")
-
-
-if __name__ == "__main__":
-    main()
+            share = f"  {row['share']:.3f}  {shares[worst]:.3f} ({worst})"
+            lines.append(f"{method:28}{row['gospa_deg']:8.2f}{parts}{share}")
+    return CommandResult(found, table={}, lines=lines)
