@@ -6,10 +6,10 @@ import numpy as np
 from worldstate_lab.benchmarks.cost import EVERYTHING, BenchReport, _front_end_times, _source, report_lines
 from worldstate_lab.benchmarks.cost_of_evidence import PARTS, _adapter, _guard, _sequence, _windows
 from worldstate_lab.benchmarks.cost_of_stages import GOAL, MORE, RATE_HZ
+from worldstate_lab.cli.main import main
 
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign, WarningSignal
-from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone_stage import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56

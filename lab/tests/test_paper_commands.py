@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from tests.test_ablations import corpus
+from test_ablations import corpus
+from worldstate_lab.cli.main import main
 
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
-from worldstate.cli.main import main
 from worldstate.operations.recordings.hop_table import save_tables
 
 
@@ -33,7 +33,7 @@ def table(tmp_path):
 
 def test_no_classifier_beats_the_bound_and_the_array_is_blind_at_endfire(table, tmp_path, capsys):
     figure = tmp_path / "f.png"
-    found = told(capsys, "identifiability", "--features", table, "--method", "baseline", "--figure", figure)
+    found = told(capsys, "reach", "--features", table, "--method", "baseline", "--figure", figure)
     data, array = found["features"], found["array"]
     assert data["fano"] <= data["sharp_fano"] <= data["error"]
     assert 0.0 < data["information_lower"] <= data["information_high"] <= data["entropy_bits"]
@@ -41,12 +41,12 @@ def test_no_classifier_beats_the_bound_and_the_array_is_blind_at_endfire(table, 
     assert array["with_vision_rad"][0] == pytest.approx(np.radians(1.0))
     assert min(x for x in array["std_rad"] if x is not None) == array["std_rad"][6]
     assert figure.read_bytes()[:4] == b"\x89PNG"
-    assert main(["identifiability", "--features", str(table), "--method", "baseline"]) == 0
+    assert main(["reach", "--features", str(table), "--method", "baseline"]) == 0
     assert f"{data['sharp_fano']:.4g}" in capsys.readouterr().out
 
 
 def test_the_figure_is_refused_before_the_work(table, tmp_path, capsys):
-    assert main(["identifiability", "--features", str(table), "--figure", str(tmp_path / "f.xyz")]) == 2
+    assert main(["reach", "--features", str(table), "--figure", str(tmp_path / "f.xyz")]) == 2
     assert "f.xyz" in capsys.readouterr().err
 
 

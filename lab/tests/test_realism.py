@@ -9,6 +9,7 @@ import pytest
 import scipy.signal
 from released_data import FOLDER, TABLE, needs_released_windows
 from worldstate_lab.cli import realism as command
+from worldstate_lab.cli.main import main
 from worldstate_lab.streets.groupings import halves
 from worldstate_lab.streets.measures import MEASURES, describe_windows, spread_values
 from worldstate_lab.streets.realism import Realism, measure_realism
@@ -29,7 +30,6 @@ from worldstate_lab.streets.two_sample import measure_areas, two_sample_areas
 
 from worldstate.abduction.signature.pattern_features import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
-from worldstate.cli.main import main
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.frontend.direction.feature import published_feature
 from worldstate.ground.errors import InvalidArgumentError

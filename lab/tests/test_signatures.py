@@ -8,6 +8,7 @@ import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worldstate_lab.cli.main import main
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, signature, signature_edges_hz
 from worldstate_lab.signatures.separability import (
     area,
@@ -28,7 +29,6 @@ from worldstate_lab.trials.pass_cache import PassCache
 
 from worldstate.adapters.datasets.melaudis import KINDS
 from worldstate.adapters.datasets.traffic_clips import BACKGROUND, ClipLabels
-from worldstate.cli.main import main
 
 RECORDINGS = {TOWN_ROAD: 4, CITY_STREET: 2}
 
@@ -204,7 +204,7 @@ def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_p
     try:
         code = main(
             [
-                "evaluate-signatures",
+                "corpora",
                 "--idmt",
                 str(idmt),
                 "--melaudis",
@@ -244,12 +244,12 @@ def test_the_rows_of_a_corpus_that_is_not_there_say_what_fills_them(clips):
 
 
 def test_a_wrong_folder_is_one_line_and_exit_code_two(tmp_path, capsys):
-    assert main(["evaluate-signatures", "--idmt", str(tmp_path)]) == 2
+    assert main(["corpora", "--idmt", str(tmp_path)]) == 2
     assert "missing: annotation/idmt_traffic_all.txt" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_without_a_folder_the_command_simulates_and_says_so(tmp_path, capsys):
-    assert main(["evaluate-signatures", "--recordings", "4", "--out", str(tmp_path)]) == 0
+    assert main(["corpora", "--recordings", "4", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.startswith("SIMULATED sound")
     assert json.loads((tmp_path / "signatures.json").read_text())["simulated"]
