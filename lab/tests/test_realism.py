@@ -10,11 +10,15 @@ import scipy.signal
 from released_data import FOLDER, TABLE, needs_released_windows
 from worldstate_lab.cli import realism as command
 from worldstate_lab.cli.main import main
-from worldstate_lab.streets.groupings import halves
-from worldstate_lab.streets.measures import MEASURES, describe_windows, spread_values
 from worldstate_lab.streets.realism import Realism, measure_realism
-from worldstate_lab.streets.set_figures import set_figures
-from worldstate_lab.streets.side import odd_profiles, side_accuracy
+from worldstate_lab.streets.realism_rows import halves
+from worldstate_lab.streets.set_classifiers import (
+    measure_areas,
+    odd_profiles,
+    published_transfer,
+    side_accuracy,
+    two_sample_areas,
+)
 from worldstate_lab.streets.simulated_windows import (
     DECIMATION,
     NFFT,
@@ -25,8 +29,12 @@ from worldstate_lab.streets.simulated_windows import (
     window_features,
     windows_of_recording,
 )
-from worldstate_lab.streets.transfer import published_transfer
-from worldstate_lab.streets.two_sample import measure_areas, two_sample_areas
+from worldstate_lab.streets.window_measures import (
+    MEASURES,
+    describe_windows,
+    set_figures,
+    spread_values,
+)
 
 from worldstate.abduction.signature.pattern_features import mirror_features
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features

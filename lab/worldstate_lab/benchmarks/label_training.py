@@ -26,7 +26,6 @@ from worldstate.operations.labelling.box_tracks import box_tracks
 from worldstate.operations.labelling.label_files import window_rows
 from worldstate.operations.labelling.pass_labels import PassLabel, label_passes
 from worldstate.operations.metrics.roc import auroc, auroc_by_group
-from worldstate.operations.training.training import TrainingMethod
 from worldstate.operations.training.window_calibration import ABSENT_MISS_RATE
 from worldstate.smoothing.smoothed_track import FirstSight
 from worldstate_lab.features.methods import method_of
@@ -76,7 +75,7 @@ def _table(stream: HeardStream, passes: Sequence[PassLabel], seen: BoolArray) ->
     return FeatureTable(features, kinds, names, places, keys, known)
 
 
-def held_out_scores(train: FeatureTable, exam: FeatureTable, method: TrainingMethod, seed: int) -> FloatArray:
+def held_out_scores(train: FeatureTable, exam: FeatureTable, method: str, seed: int) -> FloatArray:
     """Return the hazard statistic of every window, by a model that did not learn its junction."""
     chosen = method_of(method)
     learned, asked = chosen.prepare(train), chosen.prepare(exam)
@@ -127,8 +126,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     for name, table in tables.items():
         told[f"{name}: recordings"] = len(np.unique(table.recording_keys))
         told[f"{name}: with a vehicle"] = int(table.hazards.sum())
-    methods: tuple[TrainingMethod, ...] = ("worldstate", "baseline")
-    for method in methods:
+    for method in ("worldstate", "baseline"):
         scores = {name: held_out_scores(one, tables["truth"], method, seed) for name, one in tables.items()}
         for key, value in compared(tables["truth"], **scores, seed=seed).items():
             told[f"{method}: {key}"] = value

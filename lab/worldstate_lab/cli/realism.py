@@ -62,9 +62,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
     import numpy as np
 
-    from worldstate_lab.streets.realism import measure_realism
+    from worldstate_lab.streets.realism import measure_realism, realism_lines
     from worldstate_lab.streets.realism_figure import write_realism_figure
-    from worldstate_lab.streets.realism_table import realism_lines
 
     if arguments.out is not None:
         output_folder(arguments.out, "realism.json", "realism.png")

@@ -14,13 +14,24 @@ import numpy as np
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
+from worldstate_lab.metrics.intervals import DRAWS
+from worldstate_lab.report.table import Cell, Table, cell_text
 
-from .asked import Span, asked_of
-from .groupings import halves, within_types
-from .realism_rows import RealismRow, median_figures, pair_rows, position_rows, set_rows, side_rows
-from .side import odd_profiles
-from .transfer import DRAWS, Transfer, published_transfer
-from .wrong_positions import position_figures
+from .realism_rows import (
+    RealismRow,
+    Span,
+    asked_of,
+    halves,
+    median_figures,
+    pair_rows,
+    position_rows,
+    set_rows,
+    side_rows,
+    within_types,
+)
+from .set_classifiers import FAR_AZIMUTHS_DEG, Transfer, odd_profiles, position_figures, published_transfer
+
+Profile = tuple[tuple[float, ...], ...]  # Halves x far azimuths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,9 +41,7 @@ class Realism:
     groupings: tuple[str, ...]
     rows: tuple[RealismRow, ...]
     transfers: Mapping[str, Transfer]
-    profiles: Mapping[
-        str, Mapping[str, tuple[tuple[float, ...], ...]]
-    ]  # By set and junction: halves x far azimuths
+    profiles: Mapping[str, Mapping[str, Profile]]  # By set and junction
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; every row says what is inside, and met."""
@@ -111,13 +120,58 @@ def measure_realism(
         }
         rows += [*side_rows(real, simulated), *position_rows(lost)]
     moving = any(name.startswith("D") for name in sites)
-    asked = [asked_of(row.figure, row.windows, row.real, moving=moving) for row in rows]
+    rows = [replace(row, asked=asked_of(row.figure, row.windows, row.real, moving=moving)) for row in rows]
     profiles = {
         name: {site: tuple(map(tuple, profile.tolist())) for site, profile in odd_profiles(table).items()}
         for name, table in {"real": real, **simulated}.items()
     }
-    return Realism(tuple(map(str, groupings[0])), tuple(map(_with_asked, rows, asked)), transfers, profiles)
+    return Realism(tuple(map(str, groupings[0])), tuple(rows), transfers, profiles)
 
 
-def _with_asked(row: RealismRow, asked: Span | None) -> RealismRow:
-    return replace(row, asked=asked)
+def realism_lines(found: Realism) -> list[str]:
+    """Return figures, transfers and profiles; `!` marks what is outside, `x` what is not as asked."""
+    names = list(dict.fromkeys(name for row in found.rows for name in row.simulated))
+    spans = "real against real", "of a type", "asked"
+    rows = [_row_cells(row, names) for row in found.rows]
+    lines = Table("figures", "Figures", ("figure", "windows", "real", *spans, *names), rows).lines()
+    for name in names:
+        inside = [row.inside.get(name) for row in found.rows]
+        met = [row.met.get(name) for row in found.rows]
+        lines.append(
+            f"{name}: inside {inside.count(True)}, outside {inside.count(False)}; "
+            f"as asked {met.count(True)}, not {met.count(False)}"
+        )
+    gains = [
+        (name, one.auroc, one.scalar, _span(one.gain), float(one.windows))
+        for name, one in found.transfers.items()
+    ]
+    if gains:
+        columns = "sets", "AUROC", "loudest direction", "gain", "windows"
+        lines += ["", *Table("transfers", "Transfers", columns, gains).lines()]
+    title = "Louder on the far side than on the vehicle's own (odd part, log), by azimuth in deg"
+    azimuths = (f"{azimuth:.0f}" for azimuth in FAR_AZIMUTHS_DEG)
+    by_site = _profile_rows(found.profiles)
+    profiles = Table("profiles", title, ("junction", "half", "set", *azimuths), by_site)
+    return [f"real against real: {'; '.join(found.groupings)}", *lines, "", *profiles.lines()]
+
+
+def _row_cells(row: RealismRow, names: list[str]) -> tuple[Cell, ...]:
+    inside, met = row.inside, row.met
+    marks = {name: "!" * (inside.get(name) is False) + "x" * (met.get(name) is False) for name in names}
+    values = (cell_text(row.simulated.get(name)) + marks[name].ljust(2) for name in names)
+    return row.figure, row.windows, row.real, *map(_span, (row.halves, row.junctions, row.asked)), *values
+
+
+def _span(span: Span | None) -> str | None:
+    return None if span is None else f"{span[0]:.3f}-{span[1]:.3f}"
+
+
+def _profile_rows(profiles: Mapping[str, Mapping[str, Profile]]) -> list[tuple[Cell, ...]]:
+    sites = sorted({site for by_site in profiles.values() for site in by_site})
+    return [
+        (site, str(half + 1), name, *(f"{value:+.2f}" for value in by_site[site][half]))
+        for site in sites
+        for half in range(2)
+        for name, by_site in profiles.items()
+        if site in by_site
+    ]

@@ -10,9 +10,9 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import BLUE, RED, figure_file
 
-from .measures import CLASS_GROUPS, MEASURES, describe_windows, of_class
 from .realism import Realism
-from .side import FAR_AZIMUTHS_DEG
+from .set_classifiers import FAR_AZIMUTHS_DEG
+from .window_measures import CLASS_GROUPS, MEASURES, describe_windows, of_class
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
