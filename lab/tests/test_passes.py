@@ -152,7 +152,7 @@ def test_a_known_edge_narrows_the_bearing_and_keeps_the_errors_of_the_time(edge_
 
 def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_boxes() -> None:
     pytest.importorskip("stonesoup", reason="the benchmark's trackers: pip install 'worldstate[oracles]'")
-    import worldstate_lab.benchmarks.gospa as bench
+    import worldstate_lab.cli.bench.gospa as bench
 
     made_up = stream([("left", "left", 8.0)], duration_s=12.0)
     costs, hops = bench.costs(made_up, heard(made_up), WorldFilter(Context()))

@@ -109,7 +109,7 @@ def test_an_entity_that_is_silent_beyond_the_lag_begins_anew():
 
 
 def test_entities_with_heights_come_and_go():
-    from worldstate_lab.benchmarks.smoothing import smoothing_times
+    from worldstate_lab.cli.bench.smoothing import smoothing_times
 
     # At the 581st step a height that had outlived its states was refused by gtsam.
     spent, _ = smoothing_times(620, np.random.default_rng(0))
@@ -224,8 +224,8 @@ def test_what_cannot_be_is_refused():
 
 
 def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
-    from worldstate_lab.benchmarks.smoothing import HOP_NS as BENCH_HOP_NS
-    from worldstate_lab.benchmarks.smoothing import observed
+    from worldstate_lab.cli.bench.smoothing import HOP_NS as BENCH_HOP_NS
+    from worldstate_lab.cli.bench.smoothing import observed
 
     def landmarks(every: int) -> list[np.ndarray]:
         monkeypatch.setattr(graph, "_SUMMED_EVERY", every)
@@ -249,7 +249,7 @@ def test_what_marginalised_entities_left_may_be_summed_at_any_time(monkeypatch):
 def test_an_hour_leaves_memory_and_graph_as_they_were():
     import tracemalloc
 
-    from worldstate_lab.benchmarks.smoothing import HOP_S, smoothing_times
+    from worldstate_lab.cli.bench.smoothing import HOP_S, smoothing_times
 
     def grown(hours: float) -> tuple[int, int, int]:
         tracemalloc.start()

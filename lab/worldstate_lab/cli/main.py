@@ -10,7 +10,8 @@ from worldstate.cli.common.command import CommandParser, Program, run_program
 from worldstate.cli.common.output import CommandResult
 from worldstate_lab.report.results import keep_results, read_results
 
-COMMANDS = {
+BENCH = "worldstate_lab.cli.bench"
+STUDIES = {
     name: f"worldstate_lab.cli.{name}"
     for name in (
         "table",
@@ -24,12 +25,23 @@ COMMANDS = {
         "foreign",
         "kinds",
         "place",
-        "bench",
     )
+}
+BENCHES = {
+    "bench": f"{BENCH}.cost",
+    "bench cost": f"{BENCH}.cost",
+    "bench ego-noise": f"{BENCH}.ego_noise",
+    "bench gospa": f"{BENCH}.gospa",
+    "bench import": f"{BENCH}.imports",
+    "bench label-training": f"{BENCH}.label_training",
+    "bench labels": f"{BENCH}.labels",
+    "bench smoothing": f"{BENCH}.smoothing",
+    "bench street": f"{BENCH}.street",
 }
 DESCRIPTION = "The evaluation of the paper, and studies of our own."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
-PROGRAM = Program("worldstate-lab", DESCRIPTION, EPILOG, COMMANDS)
+GROUPS = {"bench": "costs and accuracies of parts of the library, beside peers"}
+PROGRAM = Program("worldstate-lab", DESCRIPTION, EPILOG, STUDIES | BENCHES, GROUPS, hidden=("bench",))
 
 Run = Callable[[argparse.Namespace], CommandResult]
 

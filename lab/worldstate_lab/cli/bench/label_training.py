@@ -1,4 +1,4 @@
-"""A signature model trained on labelled streams beside one trained on the truth, scored on the same windows.
+"""`worldstate-lab bench label-training`: a model trained on labelled streams beside one trained on the truth.
 
 A recording is the second before one vehicle's T0 with one after it, or an empty second. Labels are those of
 `worldstate street label`: boxes are drawn from the truth of the streams, with misses, joined and smoothed.
@@ -33,6 +33,8 @@ from worldstate_lab.metrics.intervals import middle, recording_draws
 from worldstate_lab.paper.identifiability import reach_on_table
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import EVERYBODY
+
+EXAMPLE = "example: worldstate-lab bench label-training streams/*-approaches-*.npz"
 
 
 @dataclass(frozen=True)

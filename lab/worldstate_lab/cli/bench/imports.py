@@ -1,10 +1,15 @@
-"""How long the imports take, each in a fresh interpreter, best of several; wall and processor time."""
+"""`worldstate-lab bench import`: how long the imports take.
+
+Each statement in a fresh interpreter, best of several: seconds of wall and of processor.
+"""
 
 import argparse
 import subprocess
 import sys
 
 from worldstate.cli.common.output import CommandResult
+
+EXAMPLE = "example: worldstate-lab bench import"
 
 STATEMENTS = (
     "import worldstate",

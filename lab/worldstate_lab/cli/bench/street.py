@@ -1,4 +1,4 @@
-"""What ten passes tell of a street: corners, changes of geometry, and what the filter makes of it afterwards.
+"""`worldstate-lab bench street`: what ten passes tell of a street.
 
 Without streams only what needs no sound: vehicles at drawn junctions before a camera with misses, ten passes
 at a time. Corners are the plan's. A change is the same arm at another junction, seen after ten passes. With
@@ -44,6 +44,8 @@ from worldstate_lab.passes.followed_stream import FollowedStream, followed
 from worldstate_lab.passes.pass_outcomes import true_azimuth
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import EVERYBODY, stream_measurements, watched_stream
+
+EXAMPLE = "example: worldstate-lab bench street --junctions 20"
 
 PASSES, MINUTES, SEED, NOTICED = 10, 30.0, 7, 3
 SIDES = ("left", "right")

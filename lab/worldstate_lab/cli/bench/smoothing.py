@@ -1,4 +1,4 @@
-"""Cost of a step of the fixed-lag smoother at 10 Hz, beside filterpy's RTS smoother over the same lag.
+"""`worldstate-lab bench smoothing`: a step of the fixed-lag smoother, beside an RTS smoother over its lag.
 
 Three entities, lag 15 s, two corners, four walls. Each entity is heard by bearing and approach rate and, at
 every tenth hop, by its image in a wall; past its corner it is seen by bearing and box height, and looks say
@@ -18,8 +18,9 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.measurement import Approach, Bearing
 from worldstate.smoothing import AngularHeight, FixedLagSmoother, PastEdge, ReflectedBearing
 from worldstate.smoothing.observations import Observation
+from worldstate_lab.benchmarks.stopwatch import Milliseconds, elapsed_ms
 
-from .stopwatch import Milliseconds, elapsed_ms
+EXAMPLE = "example: worldstate-lab bench smoothing --seconds 40"
 
 HOP_S, HOP_NS, LAG_HOPS, PASS_HOPS, ENTITIES = 0.1, 100_000_000, 150, 160, 3
 WALLS = ("opposite", "west", "back", "east")

@@ -1,4 +1,4 @@
-"""T0 and hidden places of smoothed passes on simulated streams, beside what the filter said at the time.
+"""`worldstate-lab bench labels`: T0 and hidden places of smoothed passes on streams, beside the filter.
 
 Boxes are drawn from the truth of the streams, with misses. T0 against that of the simulation, places of the
 front's middle against its path, in the three seconds before T0 ("hidden": all of their hops). The filter is
@@ -31,6 +31,8 @@ from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.smoothing.smoothed_track import SmoothedTrack
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import EVERYBODY
+
+EXAMPLE = "example: worldstate-lab bench labels streams/*-approaches-*.npz --passes 30"
 
 HOP_S = 0.1
 LEADS_S, SHOWN_S = HOP_S * np.arange(1, 31), (0.5, 1.0, 2.0, 3.0)

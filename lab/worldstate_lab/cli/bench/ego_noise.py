@@ -1,4 +1,4 @@
-"""Cost of ego-noise cancellation per 0.1-s hop, beside the transform it follows.
+"""`worldstate-lab bench ego-noise`: cost of ego-noise cancellation per 0.1-s hop, beside the transform.
 
 56 channels, 47,998 Hz, nfft 512, half overlap, SRP bins only; BLAS pinned to one thread. The sound is white
 noise and a wave from below, so that it is whitened. What is timed is the processor time of `EgoNoise.process`
@@ -22,8 +22,9 @@ from worldstate.frontend.ego_noise.harmonic_cancellation import HarmonicCancelle
 from worldstate.frontend.spectra.stft import StreamingStft, bin_frequencies_hz, whiten
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import Complex64Array, Float32Array
+from worldstate_lab.benchmarks.stopwatch import Milliseconds, elapsed_ms
 
-from .stopwatch import Milliseconds, elapsed_ms
+EXAMPLE = "example: worldstate-lab bench ego-noise --rounds 5"
 
 RATE, NFFT, HOPS, WARM_UP = 47_998, 512, 120, 60
 BINS, SRP = range(1, 19), slice(2, 18)

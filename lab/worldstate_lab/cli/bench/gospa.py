@@ -1,4 +1,4 @@
-"""GOSPA on bearing of the world-state beside trackers, for vehicles that come and for vehicles in view.
+"""`worldstate-lab bench gospa`: GOSPA on bearing of the world-state beside trackers, on streams.
 
 Streams that were listened to (`worldstate model make` keeps them) are followed hop by hop. Cut off at 60
 degrees, p = 1, alpha = 2. Hidden are vehicles that come into view within five seconds, visible those in line
@@ -34,6 +34,8 @@ from worldstate_lab.metrics.track_measures import gospa_bearing
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import stream_measurements
 
+EXAMPLE = "example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120"
+
 SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
 OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"
 PHASES, PARTS = ("hidden", "visible"), ("localised", "missed", "false")
@@ -49,7 +51,7 @@ def stated(
 ) -> Iterator[tuple[int, Said]]:
     """Yield the number of every hop of a stream, in tenths of a second, and what every method states."""
     # Optional: only this benchmark needs Stone Soup.
-    from .stone_soup_trackers import GmPhd, Jpda, scan_time, scans
+    from worldstate_lab.benchmarks.stone_soup_trackers import GmPhd, Jpda, scan_time, scans
 
     taken = list(measured)
     view, boxes = _view(taken), _oc_sort(heard)

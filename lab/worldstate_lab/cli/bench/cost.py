@@ -1,4 +1,4 @@
-"""Cost of the acoustic front-end per 0.1-s hop, stage by stage, beside its peers in the same run.
+"""`worldstate-lab bench`: what the front-end costs on this machine, beside its peers.
 
 56 channels, 47,998 Hz, nfft 512, half overlap, BLAS pinned to one thread. Milliseconds are the median over
 rounds of the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in
@@ -30,11 +30,20 @@ from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import Complex64Array, Float32Array
+from worldstate_lab.benchmarks.cost_of_evidence import evidence_times
+from worldstate_lab.benchmarks.cost_of_peers import peer_times
+from worldstate_lab.benchmarks.cost_of_stages import (
+    AZIMUTHS_RAD,
+    GOAL,
+    NFFT,
+    RATE_HZ,
+    SRP_BINS,
+    srp_beams,
+    stage_times,
+)
+from worldstate_lab.benchmarks.stopwatch import Milliseconds, elapsed_ms
 
-from .cost_of_evidence import evidence_times
-from .cost_of_peers import peer_times
-from .cost_of_stages import AZIMUTHS_RAD, GOAL, NFFT, RATE_HZ, SRP_BINS, srp_beams, stage_times
-from .stopwatch import Milliseconds, elapsed_ms
+EXAMPLE = "example: worldstate-lab bench"
 
 SECONDS = 6
 # Running seconds are full after ten hops, and caches warm.

@@ -1,0 +1,1 @@
+"""Costs and accuracies of parts of the library, beside peers."""
