@@ -28,44 +28,18 @@ from .pass_by import PARAMETERS, PassBy, fit_pass_by, radial_speed_gradient, rad
 DRIFT_DEGREES = (1, 2, 3)
 # With a smaller change of the expected level the test of the level has no power: engines vary by as much.
 LEAST_SWING_DB = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class DopplerSettings:
-    """Conditions under which a Doppler shift is accepted."""
-
-    min_windows: int = 12  # Fewest windows in the track: three for each parameter of the S-curve
-    min_share: float = 0.6  # Least share of windows in which the line was found
-    # Fewest harmonics (median over windows); with 1 a single tone is accepted, without a check of agreement.
-    min_partials: int = 1
-    # Largest median reduced chi-squared of the harmonics against one fundamental.
-    max_disagreement: float = 4.0
-    # Relative standard deviation added to every frequency: the jitter of even a steady engine.
-    relative_floor: float = 3e-4
-    min_gain: float = 10.0  # Least difference in BIC to each rival; 10 is "very strong" on the usual scale
-    max_misfit: float = 4.0  # Largest reduced chi-squared of the S-curve
-    # Slope of the line's level against -20 log10 of the fitted range, 1 in free field, where that range
-    # changes by 3 dB or more. An engine that slows down at the kerb keeps its level.
-    min_level_gain: float = 0.4
-    max_level_gain: float = 2.5
-    # Least correlation of the two under the same condition; a gain in (-inf, inf) and a correlation of -1
-    # switch the test off.
-    min_level_correlation: float = 0.8
-    max_std_m_s: float = 1.0  # Largest standard deviation of the radial speed (median over the track)
-    # Highest speed. An engine whose speed falls during the pass-by looks like a faster vehicle: in town, set
-    # the speed that is driven there.
-    max_speed_m_s: float = 40.0
-
-    def __post_init__(self) -> None:
-        in_range("min_windows", self.min_windows, PARAMETERS + 2, np.inf)
-        in_range("min_share", self.min_share, 0.0, 1.0)
-        in_range("min_partials", self.min_partials, 1, np.inf)
-        in_range("max_disagreement", self.max_disagreement, 0.0, np.inf, open_low=True)
-        in_range("relative_floor", self.relative_floor, 0.0, 0.1)
-        in_range("min_gain", self.min_gain, 0.0, np.inf)
-        in_range("max_misfit", self.max_misfit, 0.0, np.inf, open_low=True)
-        in_range("max_std_m_s", self.max_std_m_s, 0.0, np.inf, open_low=True)
-        in_range("max_speed_m_s", self.max_speed_m_s, 1.0, 100.0)
+# Fewest windows in the track, three for each parameter of the S-curve, and least share of those analysed.
+_FEWEST_WINDOWS, _LEAST_SHARE = 12, 0.6
+# Largest median reduced chi-squared of the harmonics against one fundamental, and largest of the S-curve.
+_MOST_DISAGREEMENT, _MOST_MISFIT = 4.0, 4.0
+# Relative standard deviation added to every frequency: the jitter of even a steady engine.
+_JITTER = 3e-4
+# Least difference in BIC to each rival; 10 is "very strong" on the usual scale.
+_LEAST_GAIN = 10.0
+# Slope of the line's level against -20 log10 of the fitted range, 1 in free field, and least correlation of
+# the two. An engine that slows down at the kerb keeps its level.
+_LEVEL_GAINS, _LEAST_CORRELATION = (0.4, 2.5), 0.8
+_MOST_STD_M_S = 1.0  # Of the radial speed, median over the track
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,10 +82,7 @@ class RadialSpeed:
 
 
 def radial_speed(
-    track: HarmonicTrack,
-    settings: DopplerSettings | None = None,
-    *,
-    speed_of_sound_m_s: float = SPEED_OF_SOUND_M_S,
+    track: HarmonicTrack, *, min_partials: int = 1, max_speed_m_s: float = 40.0
 ) -> RadialSpeed | NotUsable:
     r"""Estimate the radial speed from a tracked engine line, or return the reason why it is not identifiable.
 
@@ -124,10 +95,12 @@ def radial_speed(
     ----------
     track : HarmonicTrack
         From `worldstate.frontend.approach.engine_line.track_fundamental`.
-    settings : DopplerSettings, optional
-        Conditions under which the shift is accepted.
-    speed_of_sound_m_s : float
-        c, m/s.
+    min_partials : int
+        Fewest harmonics (median over windows); with 1 a single tone is accepted, without a check of
+        agreement.
+    max_speed_m_s : float
+        Highest speed. An engine whose speed falls during the pass-by looks like a faster vehicle: in town,
+        set the speed that is driven there.
 
     Returns
     -------
@@ -164,23 +137,20 @@ def radial_speed(
     >>> radial_speed(HarmonicTrack(t, 100 * ones, *rest))
     NotUsable(reason='the line does not move: its frequency at rest is unknown')
     """
-    chosen = settings or DopplerSettings()
     time, frequency, variance = _checked(track)
-    insufficient = _insufficient(track, chosen)
+    in_range("max_speed_m_s", max_speed_m_s, 1.0, 100.0)
+    insufficient = _insufficient(track, min_partials)
     if insufficient is not None:
         return insufficient
-    std = np.sqrt(variance + (chosen.relative_floor * frequency) ** 2)
-    fit = fit_pass_by(time, frequency, std, chosen.max_speed_m_s, speed_of_sound_m_s)
-    rejected = _rejected(time, frequency, std, fit, chosen)
+    std = np.sqrt(variance + (_JITTER * frequency) ** 2)
+    fit = fit_pass_by(time, frequency, std, max_speed_m_s, SPEED_OF_SOUND_M_S)
+    speed = _read_out(time, fit)
+    rejected = _rejected(time, frequency, std, fit) or _wrong_level(track.level_db, speed)
     if rejected is not None:
         return rejected
-    speed = _read_out(time, fit, speed_of_sound_m_s)
-    wrong_level = _wrong_level(track.level_db, speed, chosen)
-    if wrong_level is not None:
-        return wrong_level
     typical = float(np.sqrt(np.median(speed.variance_m2_s2)))
-    if not typical <= chosen.max_std_m_s:
-        return NotUsable(f"radial speed known to {typical:.1f} m/s only, more than {chosen.max_std_m_s:g}")
+    if not typical <= _MOST_STD_M_S:
+        return NotUsable(f"radial speed known to {typical:.1f} m/s only, more than {_MOST_STD_M_S:g}")
     return speed
 
 
@@ -196,33 +166,31 @@ def _checked(track: HarmonicTrack) -> tuple[FloatArray, FloatArray, FloatArray]:
     return time, frequency, variance
 
 
-def _insufficient(track: HarmonicTrack, settings: DopplerSettings) -> NotUsable | None:
+def _insufficient(track: HarmonicTrack, min_partials: int) -> NotUsable | None:
     found = len(track.time_s)
-    if found < settings.min_windows or found < settings.min_share * track.windows:
+    if found < _FEWEST_WINDOWS or found < _LEAST_SHARE * track.windows:
         return NotUsable(f"no stable line: found in {found} of {track.windows} windows")
     count = float(np.median(track.n_partials))
-    if count < settings.min_partials:
-        return NotUsable(f"{count:g} harmonics, fewer than {settings.min_partials}")
+    if count < min_partials:
+        return NotUsable(f"{count:g} harmonics, fewer than {min_partials}")
     disagreement = float(np.median(track.misfit))
-    if disagreement > settings.max_disagreement:
+    if disagreement > _MOST_DISAGREEMENT:
         return NotUsable(f"the harmonics disagree: reduced chi-squared {disagreement:.1f}")
     return None
 
 
-def _rejected(
-    time: FloatArray, frequency: FloatArray, std: FloatArray, fit: PassBy, settings: DopplerSettings
-) -> NotUsable | None:
+def _rejected(time: FloatArray, frequency: FloatArray, std: FloatArray, fit: PassBy) -> NotUsable | None:
     """Return the reason for which the S-curve is rejected, if there is one."""
     price = np.log(len(time))
     curve = fit.chi_squared + PARAMETERS * price
     at_rest = _polynomial_chi_squared(time, frequency, std, 0) + price
-    if at_rest < curve + settings.min_gain:
+    if at_rest < curve + _LEAST_GAIN:
         return NotUsable("the line does not move: its frequency at rest is unknown")
     misfit = fit.chi_squared / (len(time) - PARAMETERS)
-    if misfit > settings.max_misfit:
+    if misfit > _MOST_MISFIT:
         return NotUsable(f"the line wanders: reduced chi-squared {misfit:.1f} against a pass-by")
     drift = min(_polynomial_chi_squared(time, frequency, std, k) + (k + 1) * price for k in DRIFT_DEGREES)
-    if drift < curve + settings.min_gain:
+    if drift < curve + _LEAST_GAIN:
         return NotUsable("a drifting engine explains the line as well as a pass-by")
     return None
 
@@ -234,7 +202,7 @@ def _polynomial_chi_squared(time: FloatArray, frequency: FloatArray, std: FloatA
     return float(np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2))
 
 
-def _wrong_level(level_db: FloatArray, speed: RadialSpeed, settings: DopplerSettings) -> NotUsable | None:
+def _wrong_level(level_db: FloatArray, speed: RadialSpeed) -> NotUsable | None:
     """Return the reason if the level of the line does not follow the range of the pass-by."""
     emission = speed.time_s - speed.closest_time_s
     expected = -20.0 * np.log10(np.hypot(speed.closest_range_m, speed.speed_m_s * emission))
@@ -244,15 +212,15 @@ def _wrong_level(level_db: FloatArray, speed: RadialSpeed, settings: DopplerSett
     measured = level_db - level_db.mean()
     gain = float(centred @ measured / (centred @ centred))
     correlation = gain * float(np.linalg.norm(centred) / max(np.linalg.norm(measured), np.finfo(float).tiny))
-    follows = settings.min_level_gain <= gain <= settings.max_level_gain
-    if follows and correlation >= settings.min_level_correlation:
+    if _LEVEL_GAINS[0] <= gain <= _LEVEL_GAINS[1] and correlation >= _LEAST_CORRELATION:
         return None
     return NotUsable(
         f"the level does not follow the range of a pass-by: gain {gain:.2f}, correlation {correlation:.2f}"
     )
 
 
-def _read_out(time: FloatArray, fit: PassBy, sound: float) -> RadialSpeed:
+def _read_out(time: FloatArray, fit: PassBy) -> RadialSpeed:
+    sound = SPEED_OF_SOUND_M_S
     f0, v, closest, d = (float(x) for x in fit.values)
     misfit = fit.chi_squared / (len(time) - PARAMETERS)
     gradient = radial_speed_gradient(time, fit.values, sound)

@@ -16,7 +16,15 @@ from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, IndexArray
 
-from .harmonic_sum import ZERO_PADDING, HarmonicSettings, best_path, spectrum_and_floor
+from .harmonic_sum import (
+    BAND_HIGH_HZ,
+    STEP_S,
+    WINDOW_S,
+    ZERO_PADDING,
+    HarmonicSettings,
+    best_path,
+    spectrum_and_floor,
+)
 from .partials import Fundamental, Windows, measure_fundamental
 
 __all__ = ["HarmonicSettings", "HarmonicTrack", "track_fundamental"]
@@ -62,7 +70,7 @@ def track_fundamental(
     sample_rate_hz : float
         Samples per second, at least three times the highest partial.
     settings : HarmonicSettings, optional
-        Range of the fundamental, windows and thresholds; the defaults suit a car's engine.
+        Range of the fundamental and number of partials; the defaults suit a car's engine.
 
     Returns
     -------
@@ -90,35 +98,33 @@ def track_fundamental(
     True
     """
     chosen = settings or HarmonicSettings()
-    x, rate = _decimated(*_checked(samples, sample_rate_hz, chosen), chosen.band_high_hz)
-    size, step = round(chosen.window_s * rate), chosen.step_s * rate
+    x, rate = _decimated(*_checked(samples, sample_rate_hz))
+    size, step = round(WINDOW_S * rate), STEP_S * rate
     starts = np.round(np.arange(0, len(x) - size + 1, step)).astype(np.intp)
     frames = x[starts[:, None] + np.arange(size)]
     shape = np.asarray(np.hanning(size + 2)[1:-1], dtype=np.float64)
-    power, floor = spectrum_and_floor(frames * shape, rate, chosen)
+    power, floor = spectrum_and_floor(frames * shape, rate)
     fundamental = best_path(power / floor, rate / (ZERO_PADDING * size), chosen)
     time = np.asarray((starts + 0.5 * (size - 1)) / rate, dtype=np.float64)
     windows = Windows(frames, shape, floor, rate)
     for _ in range(PASSES):
-        found = measure_fundamental(windows, fundamental, _slope(time, fundamental), chosen)
+        found = measure_fundamental(windows, fundamental, _slope(time, fundamental), chosen.max_harmonics)
         fundamental = np.where(found.n_partials > 0, found.frequency_hz, fundamental)
     return _track(time, found, shape)
 
 
-def _checked(
-    samples: ArrayLike, sample_rate_hz: float, settings: HarmonicSettings
-) -> tuple[FloatArray, float]:
+def _checked(samples: ArrayLike, sample_rate_hz: float) -> tuple[FloatArray, float]:
     x = finite_array("samples", samples, (None,))
-    rate = in_range("sample_rate_hz", sample_rate_hz, 3.0 * settings.band_high_hz, np.inf)
-    shortest = int(np.ceil(settings.window_s * rate)) + 1
+    rate = in_range("sample_rate_hz", sample_rate_hz, 3.0 * BAND_HIGH_HZ, np.inf)
+    shortest = int(np.ceil(WINDOW_S * rate)) + 1
     if not shortest <= len(x) <= MAX_SAMPLES:
         raise InvalidArgumentError(f"samples: expected {shortest} .. {MAX_SAMPLES} samples, got {len(x)}")
     return x, rate
 
 
-def _decimated(x: FloatArray, rate: float, highest: float) -> tuple[FloatArray, float]:
+def _decimated(x: FloatArray, rate: float) -> tuple[FloatArray, float]:
     """Decimate with zero phase to at least three times the highest partial."""
-    factor = int(rate // (3.0 * highest))
+    factor = int(rate // (3.0 * BAND_HIGH_HZ))
     if factor <= 1:
         return x, rate
     return np.asarray(signal.decimate(x, factor, ftype="fir", zero_phase=True)), rate / factor

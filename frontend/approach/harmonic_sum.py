@@ -23,11 +23,18 @@ from worldstate.ground.typing import FloatArray, IndexArray
 ZERO_PADDING = 4
 # Median of an exponential variable over its mean: from a median of powers to the noise power.
 MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
+BAND_HIGH_HZ = 1200.0  # Highest partial used
+WINDOW_S, STEP_S = 0.25, 0.1  # Analysis window (Hann) and its step
+_MOST_RATE_HZ = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
+# q, nats per partial. An empty partial has 0.6 nats of evidence on average: a lower price lets f / 2 win, a
+# much higher one 2 f where upper harmonics are missing.
+_PARTIAL_PRICE = 1.0
+_FLOOR_WIDTH_HZ = 250.0  # Width of the running median that estimates the noise floor
 
 
 @dataclass(frozen=True, slots=True)
 class HarmonicSettings:
-    """Range of the fundamental, windows and thresholds of the harmonic sum.
+    """Range of the fundamental and number of partials of the harmonic sum.
 
     Examples
     --------
@@ -37,34 +44,16 @@ class HarmonicSettings:
 
     low_hz: float = 25.0  # Range of the fundamental; a firing frequency is 20 to 200 Hz
     high_hz: float = 200.0
-    band_high_hz: float = 1200.0  # Highest partial used
     max_harmonics: int = 20  # Largest number of partials used; 1 tracks a single tone
-    # Analysis window (Hann) and its step. The fundamental must be resolved: low_hz > 4 / window_s.
-    window_s: float = 0.25
-    step_s: float = 0.1
-    max_rate_hz: float = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
-    # q, nats per partial. An empty partial has 0.6 nats of evidence on average: a lower price lets f / 2 win,
-    # a much higher one 2 f where upper harmonics are missing.
-    partial_price: float = 1.0
-    floor_width_hz: float = 250.0  # Width of the running median that estimates the noise floor
-    partial_snr: float = 15.0  # Power over the floor from which a partial enters the combined estimate
 
     def __post_init__(self) -> None:
-        in_range("low_hz", self.low_hz, 4.0 / self.window_s, np.inf)
-        in_range("high_hz", self.high_hz, self.low_hz, self.band_high_hz, open_low=True)
-        in_range("band_high_hz", self.band_high_hz, self.high_hz, np.inf)
+        # The fundamental must be resolved.
+        in_range("low_hz", self.low_hz, 4.0 / WINDOW_S, np.inf)
+        in_range("high_hz", self.high_hz, self.low_hz, BAND_HIGH_HZ, open_low=True)
         in_range("max_harmonics", self.max_harmonics, 1, 1000)
-        in_range("window_s", self.window_s, 0.0, 10.0, open_low=True)
-        in_range("step_s", self.step_s, 0.0, self.window_s, open_low=True)
-        in_range("max_rate_hz", self.max_rate_hz, 0.0, 10.0, open_low=True)
-        in_range("partial_price", self.partial_price, 0.0, np.inf)
-        in_range("floor_width_hz", self.floor_width_hz, 4.0 / self.window_s, np.inf)
-        in_range("partial_snr", self.partial_snr, 1.0, np.inf)
 
 
-def spectrum_and_floor(
-    frames: FloatArray, rate: float, settings: HarmonicSettings
-) -> tuple[FloatArray, FloatArray]:
+def spectrum_and_floor(frames: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
     r"""Return the power of zero-padded windows and its noise floor, (K, bins) each, to the highest partial.
 
     .. math:: P_k[b] = \Big| \sum_n x_k[n]\, e^{-j 2\pi b n / 4N} \Big|^2, \qquad
@@ -73,11 +62,11 @@ def spectrum_and_floor(
     Shapes: frames (K, n).
     """
     size = ZERO_PADDING * frames.shape[1]
-    keep = int(np.ceil(settings.band_high_hz * 1.02 * size / rate)) + 2
+    keep = int(np.ceil(BAND_HIGH_HZ * 1.02 * size / rate)) + 2
     power = np.abs(np.fft.rfft(frames, size)[:, :keep]) ** 2
     # A running median as the floor (ordered statistics, as in Rohling 1983): a mean would rise under a
     # partial. The padded bins are interpolations: every fourth is enough for the median.
-    width = round(settings.floor_width_hz * frames.shape[1] / rate) | 1
+    width = round(_FLOOR_WIDTH_HZ * frames.shape[1] / rate) | 1
     floor = ndimage.median_filter(power[:, ::ZERO_PADDING], size=(1, width), mode="nearest")
     grid = np.arange(keep)
     spread = np.stack([np.interp(grid, grid[::ZERO_PADDING], row) for row in floor])
@@ -96,21 +85,21 @@ def best_path(ratio: FloatArray, bin_hz: float, settings: HarmonicSettings) -> F
     Shapes: ratio (K, bins).
     """
     # Half a resolution at the highest partial, so that no partial falls between two candidates.
-    step = 0.5 / (settings.window_s * settings.band_high_hz)
+    step = 0.5 / (WINDOW_S * BAND_HIGH_HZ)
     count = int(np.log(settings.high_hz / settings.low_hz) / step) + 2
     grid = np.geomspace(settings.low_hz, settings.high_hz, count)
     evidence = _harmonic_evidence(ratio, grid, bin_hz, settings)
-    reach = max(1, int(np.ceil(settings.max_rate_hz * settings.step_s / step)))
+    reach = max(1, int(np.ceil(_MOST_RATE_HZ * STEP_S / step)))
     return np.asarray(grid[_viterbi(evidence, reach)])
 
 
 def _harmonic_evidence(
     ratio: FloatArray, grid: FloatArray, bin_hz: float, settings: HarmonicSettings
 ) -> FloatArray:
-    gain = np.log1p(ratio) - settings.partial_price
+    gain = np.log1p(ratio) - _PARTIAL_PRICE
     evidence = np.zeros((len(ratio), len(grid)))
     for h in range(1, settings.max_harmonics + 1):
-        inside = h * grid <= settings.band_high_hz
+        inside = h * grid <= BAND_HIGH_HZ
         evidence[:, inside] += gain[:, np.round(h * grid[inside] / bin_hz).astype(np.intp)]
     return evidence
 

@@ -21,10 +21,12 @@ import numpy as np
 
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
-from .harmonic_sum import ZERO_PADDING, HarmonicSettings
+from .harmonic_sum import BAND_HIGH_HZ, ZERO_PADDING
 
 # Largest correction by one Newton step, in resolutions 1 / window: beyond it lies the edge of the main lobe.
 REACH = 0.75
+# Power over the floor from which a partial enters the combined estimate.
+_LEAST_SNR = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class Windows:
 
 
 def measure_fundamental(
-    windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray, settings: HarmonicSettings
+    windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray, max_harmonics: int
 ) -> Fundamental:
     r"""Refine a track of the fundamental by all its partials.
 
@@ -64,7 +66,7 @@ def measure_fundamental(
 
     Shapes: fundamental_hz, slope_hz_s (K,).
     """
-    most = min(settings.max_harmonics, int(settings.band_high_hz / fundamental_hz.min()))
+    most = min(max_harmonics, int(BAND_HIGH_HZ / fundamental_hz.min()))
     partials = np.arange(1, most + 1)
     n, rate = windows.n, windows.rate_hz
     turn = np.outer(fundamental_hz, n / rate) + 0.5 * np.outer(slope_hz_s, (n / rate) ** 2)
@@ -73,7 +75,7 @@ def measure_fundamental(
     measured = []
     for h in partials:
         demodulated *= back
-        measured.append(_partial(windows, demodulated, h * fundamental_hz, settings))
+        measured.append(_partial(windows, demodulated, h * fundamental_hz))
     frequency, variance, power = (np.stack(part, axis=1) for part in zip(*measured, strict=True))
     return _combined(frequency, variance, power, partials)
 
@@ -82,15 +84,14 @@ def _partial(
     windows: Windows,
     demodulated: Complex128Array,
     expected_hz: FloatArray,
-    settings: HarmonicSettings,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return frequency, variance and power of a partial per window; infinite variance if too weak."""
     n, turns = windows.n, windows.rate_hz / (2 * np.pi)
     shift, peak = _newton_shift(demodulated, n)
     floor = _floor_at(windows, expected_hz)
     snr = peak / floor
-    use = (snr >= settings.partial_snr) & (np.abs(shift) < 2 * np.pi * REACH / len(n))
-    use &= expected_hz <= settings.band_high_hz
+    use = (snr >= _LEAST_SNR) & (np.abs(shift) < 2 * np.pi * REACH / len(n))
+    use &= expected_hz <= BAND_HIGH_HZ
     variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * turns**2
     return expected_hz + shift * turns, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
 

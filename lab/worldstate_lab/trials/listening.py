@@ -18,7 +18,7 @@ from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.acoustic_domain import TRAIN, feature_order
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listen import ListenSettings, Source, Step, listen_steps, measure_steps, open_source
-from worldstate.frontend.approach.doppler import DopplerSettings, radial_speed
+from worldstate.frontend.approach.doppler import radial_speed
 from worldstate.frontend.approach.engine_line import track_fundamental
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
@@ -62,7 +62,7 @@ SIDES = {"left": LEFT, "right": RIGHT}
 # An entity counts as a track where it more likely exists than not.
 LIKELY = 0.5
 # The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
-DOPPLER = DopplerSettings(min_partials=2)
+LEAST_PARTIALS = 2
 # The tone of a pass-by is looked for this long around line-of-sight entry, so that a stream of an hour is
 # not read into memory for it.
 AROUND_S = 15.0
@@ -285,7 +285,7 @@ def _doppler(audio: AudioSource, array: MicrophoneArray, t0_s: float) -> str:
     first = round(max(t0_s - AROUND_S, 0.0) * rate)
     count = min(round(2.0 * AROUND_S * rate), audio.frames - first)
     track = track_fundamental(np.ascontiguousarray(audio.span(first, count)[:, middle]), rate)
-    found = radial_speed(track, DOPPLER)
+    found = radial_speed(track, min_partials=LEAST_PARTIALS)
     return found.reason if isinstance(found, NotUsable) else ""
 
 

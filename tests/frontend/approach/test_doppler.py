@@ -8,7 +8,6 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
 from worldstate.frontend.approach.doppler import (
-    DopplerSettings,
     RadialSpeed,
     radial_speed,
 )
@@ -154,7 +153,7 @@ def test_reasons():
     assert "no stable line" in radial_speed(track_fundamental(noise, RATE)).reason
     assert "does not move" in radial_speed(track_fundamental(standing, RATE)).reason
     x, _, _ = pass_by(rng, 60.0, 12.0, 2.5, 6.0)
-    lines = radial_speed(track_fundamental(x, RATE), DopplerSettings(min_partials=100))
+    lines = radial_speed(track_fundamental(x, RATE), min_partials=100)
     assert "fewer than 100" in lines.reason
     x, _, _ = pass_by(rng, 60.0, 15.0, 5.5, 3.0, duration=3.0)
     only_coming = radial_speed(track_fundamental(x, RATE))
@@ -227,7 +226,6 @@ def test_closed_form_emission_time_equals_root_finding(time, speed, closest, dis
         lambda: track_fundamental(np.zeros(8000), 2000.0),
         lambda: HarmonicSettings(low_hz=5.0),
         lambda: HarmonicSettings(low_hz=100.0, high_hz=90.0),
-        lambda: DopplerSettings(min_windows=4),
         lambda: radial_speed(
             HarmonicTrack(*(np.zeros(20) for _ in range(6)), windows=20)  # type: ignore[arg-type]
         ),
