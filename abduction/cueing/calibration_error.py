@@ -113,27 +113,12 @@ def expected_calibration_error(risk: ArrayLike, hazards: ArrayLike, bins: int = 
     return float(curve.counts @ np.abs(curve.predicted - curve.observed) / curve.counts.sum())
 
 
-def calibration_error_floor(
-    risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
-) -> float:
-    r"""Return the mean ECE that labels drawn from these very risks would score: the sampling floor at this n.
-
-    .. math:: E[ECE(r, y)], \qquad P(y_i = 1) = r_i
-
-    Shapes: risk (n,).
-
-    References
-    ----------
-    J. Bröcker and L. A. Smith, "Increasing the reliability of reliability diagrams", Weather and Forecasting
-    22, 2007 (resampling under calibration).
-    """
-    return calibration_error_sampling(risk, rng, bins, draws)[0]
-
-
 def calibration_error_sampling(
     risk: ArrayLike, rng: np.random.Generator, bins: int = BINS, draws: int = _FLOOR_DRAWS
 ) -> tuple[float, float]:
     r"""Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
+
+    The mean is the sampling floor at this number of windows.
 
     .. math:: ECE = \frac1n \sum_b \Big| \sum_{i \in b} (y_i - r_i) \Big|, \qquad P(y_i = 1) = r_i
 
@@ -150,7 +135,6 @@ def calibration_error_sampling(
     >>> round(mean, 2), round(deviation, 3)
     (0.02, 0.016)
     """
-    # Errors are those of `calibration_error_floor`, which is the mean.
     predicted, _ = _checked_sample(risk, np.zeros(np.shape(risk)))
     index = _bin_index(predicted, bins)
     labels = rng.random((draws, predicted.size)) < predicted

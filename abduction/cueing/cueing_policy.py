@@ -76,8 +76,8 @@ class CueingPolicy:
     --------
     >>> from worldstate.abduction.cueing.risk_map import PlattMap
     >>> policy = CueingPolicy(0.8, 3, 0.02, (0.25, 0.25, 0.25, 0.25), PlattMap(-1.0, 0.0))
-    >>> policy.exceeded(0.9), round(policy.risk_map(0.9), 2)
-    (True, 0.9)
+    >>> policy.gamma, round(policy.risk_map(0.9), 2)
+    (0.8, 0.9)
     """
 
     gamma: float
@@ -96,25 +96,6 @@ class CueingPolicy:
         prior = finite_array("reference_prior", self.reference_prior, (None,))
         if prior.size < 3 or (prior <= 0).any() or not np.isclose(prior.sum(), 1.0, atol=1e-6):
             raise InvalidArgumentError("reference_prior: expected 3 or more positive numbers, sum one")
-
-    def exceeded(self, statistic: float) -> bool:
-        """Whether a statistic is at or above the threshold, ``s >= gamma``.
-
-        Parameters
-        ----------
-        statistic : float
-            s(t).
-
-        Returns
-        -------
-        bool
-            True at the threshold itself.
-
-        References
-        ----------
-        "Evidence of Absence", section VII.
-        """
-        return statistic >= self.gamma
 
     def gamma_at(self, shift_nats: float) -> float:
         r"""Return the threshold once it has moved by so much; gamma itself where nothing moves it.

@@ -5,7 +5,7 @@ them, already holds what they said together. Multiplied at every hop, or onto th
 counts them again (detection .94 becomes .76 to .90). Instead the belief moves as q moves:
 
 .. math:: q^c_t \propto q_t\, c / \pi, \qquad m_t = p_{t-1} A^n, \qquad n_t = q^c_{t-1} A^n, \qquad
-          p_t \propto q^c_t \Big( \frac{m_t}{n_t} \Big)^{b} \prod_j l_j
+          p_t \propto q^c_t \Big( \frac{m_t}{n_t} \Big) \prod_j l_j
 
 with the context's prior c in place of pi, at which the model was trained, the chain A of the hops since the
 last evidence, and the likelihoods l of everything else. Without any of these p = q^c, whatever the chain: m
@@ -54,7 +54,6 @@ def next_belief(
     posterior: FloatArray | None,
     chain: FloatArray,
     log_likelihoods: FloatArray | float = 0.0,
-    memory: float = 1.0,
 ) -> SequenceBelief:
     """Return the belief one step on; without sound (None) the sequence is carried on by its chain.
 
@@ -71,7 +70,7 @@ def next_belief(
     alone = carried if posterior is None else posterior
     log_ratio = np.log(np.maximum(predicted, _SMALLEST)) - np.log(np.maximum(carried, _SMALLEST))
     # The largest exponent is taken off first: likelihoods of many nats would overflow.
-    exponent = memory * log_ratio + log_likelihoods
+    exponent = log_ratio + log_likelihoods
     weight = np.exp(exponent - exponent.max(axis=-1, keepdims=True))
     return SequenceBelief(_normed(alone * weight), alone)
 

@@ -11,7 +11,7 @@ are their own mirror images: see `window_classes`.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Annotated, ClassVar
 
@@ -126,21 +126,6 @@ class EnsembleModel:
     def reference_prior(self) -> tuple[float, ...]:
         """Training prior in the order of the explanations (left, right, visible, none)."""
         return tuple(self._explained_prior[list(EXPLANATION_COLUMNS)].tolist())
-
-    def at_site(self, reference: SiteReference) -> "EnsembleModel":
-        """Return the model with another reference in place of the training sites' mean.
-
-        Parameters
-        ----------
-        reference : SiteReference
-            What the site is like.
-
-        Raises
-        ------
-        InvalidArgumentError
-            If the reference is of another length.
-        """
-        return replace(self, home=reference)
 
     def predict_proba(self, X: ArrayLike) -> FloatArray:
         r"""Return the posteriors of the model's classes at the training prior, shape (n, classes).

@@ -16,6 +16,9 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import wrap_angle
 
+# Thresholds of a curve, evenly spread over the coverage.
+_MOST_POINTS = 200
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatingCurve:
@@ -74,7 +77,7 @@ class GatingCurve:
         return float(self.threshold[last]), float(self.median_error_rad[last])
 
 
-def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int = 200) -> GatingCurve:
+def gating_curve(prominence: ArrayLike, error_rad: ArrayLike) -> GatingCurve:
     r"""Compute coverage and median error over the prominence threshold from bearings with known errors.
 
     .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
@@ -86,8 +89,6 @@ def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int
         Peak-to-median ratios; n >= 1.
     error_rad : array_like, shape (n,)
         Bearing minus truth, wrapped here.
-    max_points : int
-        At most so many thresholds, evenly spread over the coverage.
 
     Returns
     -------
@@ -114,14 +115,13 @@ def gating_curve(prominence: ArrayLike, error_rad: ArrayLike, *, max_points: int
     """
     ratios = finite_array("prominence", prominence, (None,))
     errors = np.abs(wrap_angle(finite_array("error_rad", error_rad, ratios.shape)))
-    in_range("max_points", max_points, 1, np.inf)
     if not len(ratios):
         raise InvalidArgumentError("prominence: expected at least one bearing, got none")
     order = np.argsort(ratios, kind="stable")
     ratios, errors = ratios[order], errors[order]
     # Equal prominences are kept or dropped together.
     starts = np.flatnonzero(np.diff(ratios, prepend=-np.inf))
-    if len(starts) > max_points:
-        starts = starts[np.linspace(0, len(starts) - 1, max_points).round().astype(np.intp)]
+    if len(starts) > _MOST_POINTS:
+        starts = starts[np.linspace(0, len(starts) - 1, _MOST_POINTS).round().astype(np.intp)]
     medians = np.array([np.median(errors[start:]) for start in starts])
     return GatingCurve(ratios[starts], 1.0 - starts / len(ratios), medians)

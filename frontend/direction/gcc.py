@@ -21,8 +21,8 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 
-Weighting = Literal["none", "phat", "scot", "ml"]
-WEIGHTINGS: tuple[Weighting, ...] = ("none", "phat", "scot", "ml")
+Weighting = Literal["phat", "ml"]
+WEIGHTINGS: tuple[Weighting, ...] = ("phat", "ml")
 
 # Lags per period of the highest frequency: the nearest one is then pi/8 rad from the peak at most.
 LAGS_PER_PERIOD = 8
@@ -70,7 +70,6 @@ def gcc_delays(
     frequencies_hz: ArrayLike,
     max_delay_s: ArrayLike,
     *,
-    pairs: ArrayLike | None = None,
     weighting: Weighting = "phat",
 ) -> PairDelays:
     r"""Estimate the delay of every pair, between samples, by generalised cross-correlation.
@@ -80,9 +79,7 @@ def gcc_delays(
 
     Cross-spectra are averaged over frames first and weighted afterwards:
 
-    - ``none``: :math:`\Psi = 1`;
     - ``phat``: :math:`1 / |G_{ij}|`; with a flat coherence it is maximum likelihood;
-    - ``scot``: :math:`1 / \sqrt{G_{ii} G_{jj}}`;
     - ``ml``: :math:`C / (|G_{ij}| (1 - C))` of Hannan and Thomson, with the coherence estimated from the same
       frames.
 
@@ -94,9 +91,7 @@ def gcc_delays(
         Centre of each bin, Hz, ascending.
     max_delay_s : float or array_like, shape (P,)
         Largest delay to search, seconds; for microphones at distance d this is d / c.
-    pairs : array_like of int, shape (P, 2), optional
-        Microphone indices; every pair i < j if not given.
-    weighting : {"phat", "none", "scot", "ml"}
+    weighting : {"phat", "ml"}
         As above.
 
     Returns
@@ -125,7 +120,7 @@ def gcc_delays(
     """
     X = finite_complex("spectra", spectra, (None, None, None))
     frequencies = _checked_frequencies(frequencies_hz, X.shape[1])
-    index = all_pairs(X.shape[2]) if pairs is None else _checked_pairs(pairs, X.shape[2])
+    index = all_pairs(X.shape[2])
     limit = _checked_limit(max_delay_s, len(index), frequencies)
     if weighting not in WEIGHTINGS:
         raise InvalidArgumentError(f"weighting: expected one of {WEIGHTINGS}, got {weighting!r}")
@@ -153,11 +148,9 @@ def _coherence(cross: ComplexArray, first: FloatArray, second: FloatArray) -> Fl
 def _weighted(
     cross: ComplexArray, first: FloatArray, second: FloatArray, weighting: Weighting
 ) -> ComplexArray:
-    if weighting == "none":
-        return cross
-    magnitude = np.sqrt(first * second) if weighting == "scot" else np.abs(cross)
+    magnitude = np.abs(cross)
     whitened = np.divide(cross, magnitude, out=np.zeros_like(cross), where=magnitude > 0)
-    if weighting != "ml":
+    if weighting == "phat":
         return whitened
     coherence = np.minimum(_coherence(cross, first, second), LARGEST_COHERENCE)
     return np.asarray(whitened * (coherence / (1.0 - coherence)))
@@ -196,13 +189,6 @@ def _checked_frequencies(frequencies_hz: ArrayLike, bins: int) -> FloatArray:
     if bins == 0 or frequencies[0] < 0 or frequencies[-1] <= 0 or np.any(np.diff(frequencies) <= 0):
         raise InvalidArgumentError("frequencies_hz: expected ascending values >= 0, at least one > 0")
     return frequencies
-
-
-def _checked_pairs(pairs: ArrayLike, microphones: int) -> IndexArray:
-    index = finite_array("pairs", pairs, (None, 2)).astype(np.intp)
-    if len(index) == 0 or index.min() < 0 or index.max() >= microphones:
-        raise InvalidArgumentError(f"pairs: expected at least one pair of indices in [0, {microphones})")
-    return index
 
 
 def _checked_limit(max_delay_s: ArrayLike, pairs: int, frequencies: FloatArray) -> FloatArray:

@@ -36,9 +36,7 @@ class Peak:
     prominence: float
 
 
-def find_peaks(
-    spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int = 4, min_prominence: float = 1.0
-) -> tuple[Peak, ...]:
+def find_peaks(spectrum: ArrayLike, azimuths_rad: ArrayLike, *, max_peaks: int = 4) -> tuple[Peak, ...]:
     r"""Find the highest local maxima, interpolated by a parabola through three grid points.
 
     With P at the grid point i of a maximum and at its neighbours,
@@ -57,8 +55,6 @@ def find_peaks(
         Ascending, evenly spaced, radians; A >= 3.
     max_peaks : int
         Largest number of peaks.
-    min_prominence : float
-        Smallest peak-to-median ratio.
 
     Returns
     -------
@@ -86,12 +82,10 @@ def find_peaks(
     values = finite_array("spectrum", spectrum, azimuths.shape)
     if len(values) < 3:
         raise InvalidArgumentError(f"azimuths_rad: expected at least three points, got {len(values)}")
-    return highest_peaks(values, azimuths, max_peaks, min_prominence)
+    return highest_peaks(values, azimuths, max_peaks)
 
 
-def highest_peaks(
-    values: FloatArray, azimuths: FloatArray, max_peaks: int, min_prominence: float = 1.0
-) -> tuple[Peak, ...]:
+def highest_peaks(values: FloatArray, azimuths: FloatArray, max_peaks: int) -> tuple[Peak, ...]:
     """Return what `find_peaks` finds in arrays that are finite and fit each other.
 
     Shapes: values (A,), azimuths (A,).
@@ -102,7 +96,7 @@ def highest_peaks(
     candidates = _local_maxima(values)
     highest = candidates[np.argsort(-values[candidates], kind="stable")][:max_peaks]
     peaks = (_interpolate(values, azimuths, int(index), median) for index in highest)
-    return tuple(peak for peak in peaks if peak.prominence >= min_prominence)
+    return tuple(peak for peak in peaks if peak.prominence >= 1.0)
 
 
 def _local_maxima(values: FloatArray) -> IndexArray:

@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 
 # Distance, bins, at which a line outside the band no longer leaks into it through the window.
@@ -34,6 +33,8 @@ _FREQUENCY_GAIN, _RATE_GAIN, _SETTLING_HOPS = 0.5, 0.1, 6
 _ORDER_STEPS = (1, 2, 4, 8)
 # Evidence of a line against noise at which nothing of it is subtracted; noise alone has 1 on average.
 _NO_LINE = 2.0
+# Memory of the amplitudes: the engine's speed changes within a second.
+_MEMORY_S = 0.4
 # Ridge relative to the diagonal: close harmonics of a slow engine are nearly collinear in a hop.
 _RIDGE = 1e-3
 _TINY = 1e-30
@@ -86,16 +87,11 @@ class EngineState:
 class HarmonicCanceller:
     """Subtract the harmonics of an engine from the spectra of a stream."""
 
-    def __init__(
-        self, bins: range, sample_rate_hz: float, nfft: int, *, harmonics: int = 40, memory_s: float = 0.4
-    ) -> None:
-        rate = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
-        in_range("harmonics", harmonics, 1, 1000)
-        self._memory_s = in_range("memory_s", memory_s, 0.01, 100.0)
-        self._frame_s = 0.5 * nfft / rate
-        self._bin_hz = rate / nfft
+    def __init__(self, bins: range, sample_rate_hz: float, nfft: int, *, harmonics: int = 40) -> None:
+        self._frame_s = 0.5 * nfft / sample_rate_hz
+        self._bin_hz = sample_rate_hz / nfft
         self._bins = np.arange(bins.start, bins.stop)
-        self._all_orders = np.arange(1, int(harmonics) + 1)
+        self._all_orders = np.arange(1, harmonics + 1)
         self._fit: _Fit | None = None
         self._evident: ComplexArray = np.empty((0, 0), np.complex64)
         self._engine: EngineState | None = None
@@ -129,10 +125,6 @@ class HarmonicCanceller:
         """
         if self._engine is None or not len(spectra):
             return spectra
-        if spectra.ndim != 3 or spectra.shape[1] != len(self._bins):
-            raise InvalidArgumentError(
-                f"spectra: expected shape (frames, {len(self._bins)}, M), got {spectra.shape}"
-            )
         orders = self._orders(self._engine.frequency_hz)
         if not len(orders):
             return spectra
@@ -143,7 +135,7 @@ class HarmonicCanceller:
         error = 0.0
         if self._fit is not None:
             error = now.phase_ahead(self._fit, self._evident)
-            now = now.turned(error).joined(self._fit, float(np.exp(-time[-1] / self._memory_s)))
+            now = now.turned(error).joined(self._fit, float(np.exp(-time[-1] / _MEMORY_S)))
         self._fit, self._evident = now, now.evident_amplitudes()
         self._engine = self._engine.after(float(time[-1]), error).within(*self._limits_hz)
         turn = np.exp(1j * orders * error).astype(np.complex64)

@@ -15,7 +15,7 @@ from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
 from worldstate.abduction.cueing.calibration_error import (
-    calibration_error_floor,
+    calibration_error_sampling,
     expected_calibration_error,
 )
 from worldstate.frontend.direction.gating import gating_curve
@@ -120,7 +120,7 @@ def test_figures_of_windows_are_those_of_other_formulas():
     assert figures["hazard_share"] == pytest.approx(labels.mean())
     skill = 1 - brier_score_loss(labels, risk) / brier_score_loss(labels, np.full(len(labels), labels.mean()))
     assert figures["brier_skill"] == pytest.approx(skill)
-    floor = calibration_error_floor(risk, np.random.default_rng(0))
+    floor = calibration_error_sampling(risk, np.random.default_rng(0))[0]
     assert figures["ece_floor"] == pytest.approx(floor, rel=0.03)
     pairs = [
         (said.bearing_rad[use] - 0.3, trial.hops.prominence[use])
@@ -181,7 +181,7 @@ def test_a_time_to_visible_stands_beside_the_best_constant():
 def test_the_floor_of_few_windows_stays_near_its_own(risk):
     trials = [made_up("a", "left", t0_s=1.6), made_up("b", hops=9)]
     answers = [alarmed(one, [], risk=np.full(len(one.hops), risk)) for one in trials]
-    floor = calibration_error_floor(np.full(16, risk), np.random.default_rng(5), draws=40000)
+    floor = calibration_error_sampling(np.full(16, risk), np.random.default_rng(5), draws=40000)[0]
     assert Score.of(trials, [answers]).figures()["ece_floor"] == pytest.approx(floor, rel=0.2)
 
 

@@ -38,7 +38,7 @@ def test_alone_it_is_what_the_sequence_says_whatever_the_chain(seed: int) -> Non
     said = rng.dirichlet(np.full(5, 0.3), (30, 2))
     belief = first_belief(said[0])
     for one in said[1:]:
-        belief = next_belief(belief, one, chain, memory=rng.uniform(0.5, 1.0))
+        belief = next_belief(belief, one, chain)
         np.testing.assert_allclose(belief.belief, one, rtol=1e-6, atol=1e-12)
 
 

@@ -163,7 +163,7 @@ def test_a_part_of_a_simulated_hazard_says_the_other_side(other_side):
 
 def test_the_reference_of_another_site_matters(trained):
     X, _, model = trained
-    moved = model.at_site(model.home.shifted(np.full(60, 0.5)))
+    moved = replace(model, home=model.home.shifted(np.full(60, 0.5)))
     assert np.abs(moved.predict_proba(X[:, :60]) - model.predict_proba(X[:, :60])).max() > 0.05
     behind = np.hstack([X[:, :60], np.tile(moved.home.row, (len(X), 1))])
     np.testing.assert_allclose(model.predict_proba(behind), moved.predict_proba(X[:, :60]), rtol=1e-12)

@@ -7,7 +7,7 @@ import numpy as np
 
 from worldstate.abduction.cueing.calibration_error import (
     brier_score,
-    calibration_error_floor,
+    calibration_error_sampling,
     expected_calibration_error,
 )
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
@@ -255,7 +255,7 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
         false_alarms_per_hour=found["onsets_per_hour"],
         window_rate=found["hazard_free_share"],
         ece=expected_calibration_error(risk, hazards) if both else None,
-        ece_floor=calibration_error_floor(risk, rng) if both else None,
+        ece_floor=calibration_error_sampling(risk, rng)[0] if both else None,
         brier=brier_score(risk, hazards) if both else None,
         awareness=_share_in_sight(approaches, [one.aware for one in approaches]),
         vision_only=_share_in_sight(approaches, [one.stream.seen for one in approaches]),

@@ -37,8 +37,9 @@ def test_every_point_is_what_its_threshold_keeps(pairs: list[tuple[float, float]
 
 def test_points_are_spread_over_the_coverage() -> None:
     rng = np.random.default_rng(0)
-    curve = gating_curve(1 + rng.exponential(1, 5000), rng.standard_normal(5000), max_points=11)
-    np.testing.assert_allclose(curve.coverage[:-1], np.linspace(1, 0, 11)[:-1], atol=1e-3)
+    curve = gating_curve(1 + rng.exponential(1, 5000), rng.standard_normal(5000))
+    assert len(curve.coverage) == 200 and curve.coverage[0] == 1.0
+    np.testing.assert_allclose(np.diff(curve.coverage), -1.0 / 200, atol=1e-3)
 
 
 @pytest.mark.parametrize(

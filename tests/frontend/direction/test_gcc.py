@@ -1,4 +1,4 @@
-"""Pair delays: exact between samples, at the bound, and with the weightings of the literature."""
+"""Pair delays: exact between samples, at the bound, and with either weighting."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def delayed(delays, rng, frames=40, noise=0.0, level=None):
 @settings(max_examples=50, deadline=None)
 @given(
     arrivals=st.lists(st.floats(-1e-3, 1e-3), min_size=2, max_size=5),
-    weighting=st.sampled_from(["none", "phat", "scot", "ml"]),
+    weighting=st.sampled_from(["phat", "ml"]),
 )
 def test_noiseless_delays_are_exact_between_samples(arrivals, weighting):
     X = delayed(arrivals, np.random.default_rng(0))
@@ -116,7 +116,6 @@ def test_a_dead_microphone_has_no_peak():
         {"weighting": "roth"},
         {"max_delay_s": 0.011},
         {"max_delay_s": -1e-3},
-        {"pairs": [[0, 2]]},
         {"frequencies_hz": FREQUENCIES[::-1]},
         {"spectra": np.full((3, 30, 2), np.nan)},
         {"spectra": np.ones((1, 30, 2)), "weighting": "ml"},
