@@ -32,7 +32,6 @@ from .signature.domain_guard import WarningSignal as WarningSignal
 from .signature.ensemble import EnsembleModel as EnsembleModel
 from .signature.ensemble_training import SiteEnsembleClassifier as SiteEnsembleClassifier
 from .signature.published_signature import SignatureModel as SignatureModel
-from .signature.published_training import PublishedClassifier as PublishedClassifier
 from .signature.site_estimate import SiteEstimate as SiteEstimate
 from .signature.site_estimate import SiteEstimateSettings as SiteEstimateSettings
 from .signature.site_signature import SiteSignature as SiteSignature

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -74,24 +74,6 @@ class SimulatedWindows:
     def joined(cls, parts: Sequence["SimulatedWindows"]) -> "SimulatedWindows":
         """Return the windows of all parts."""
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
-
-
-class Classifier(Protocol):
-    """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
-
-    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Learn from features, class names and, where it takes notice of them, names of sites.
-
-        Shapes: X (n, features), y, groups (n,).
-        """
-        ...
-
-    def predict_proba(self, X: ArrayLike) -> FloatArray:
-        """Return posteriors of front, left, none, right, shape (n, 4).
-
-        Shapes: X (n, features).
-        """
-        ...
 
 
 class SiteEnsembleClassifier:

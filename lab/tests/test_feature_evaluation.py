@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 from worldstate_lab.cli.main import main as lab
 from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate
+from worldstate_lab.features.published_classifier import PublishedClassifier
 
-from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
 from worldstate.adapters.files.model_file import load_model, read_model
 from worldstate.cli.main import main

@@ -6,8 +6,8 @@ from released_data import FOLDER, TABLE, needs_released_windows
 from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate
 from worldstate_lab.features.feature_report import report
 from worldstate_lab.features.held_out import check_unseen, predict_held_out
+from worldstate_lab.features.published_classifier import PublishedClassifier
 
-from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError

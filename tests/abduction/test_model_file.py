@@ -10,8 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.published_training import PublishedClassifier
-from worldstate.abduction.signature.window_classes import CLASSES
+from worldstate.abduction.signature.published_signature import SignatureModel
 from worldstate.adapters.files.model_file import (
     Model,
     load_model,
@@ -25,9 +24,10 @@ from worldstate.ground.errors import InputFileError, SchemaVersionError, Worldst
 
 def published():
     """The model that ships with the published classifier in its signature's place."""
-    rng, y = np.random.default_rng(0), np.repeat(CLASSES, 10)
-    X = rng.normal(size=(40, 60)) + np.arange(60) * np.repeat(np.arange(4), 10)[:, None]
-    return replace(read_model(), signature=PublishedClassifier(rng).fit(X, y).model_)
+    rng = np.random.default_rng(0)
+    mean, scale, coefficients = rng.normal(size=60), np.ones(60), rng.normal(size=(6, 60))
+    signature = SignatureModel(mean, scale, coefficients, *rng.normal(size=(3, 6)), np.full(4, 0.25))
+    return replace(read_model(), signature=signature)
 
 
 DEFAULT = model_to_dict(published())

@@ -16,7 +16,7 @@ from scipy.special import expit, logit
 
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.ensemble_training import Classifier, SiteEnsembleClassifier
+from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
@@ -30,6 +30,7 @@ from worldstate.operations.training.window_calibration import (
     between,
     calibrate_windows,
 )
+from worldstate_lab.features.published_classifier import Classifier
 
 Protocol = Literal["cv", "lojo", "transfer"]
 Reference = Literal["run", "cold", "curated"]
@@ -214,7 +215,7 @@ def cross_validate(
 
     Examples
     --------
-    >>> from worldstate.abduction.signature.published_training import PublishedClassifier
+    >>> from worldstate_lab.features.published_classifier import PublishedClassifier
     >>> rng = np.random.default_rng(0)
     >>> labels = np.repeat(["left", "none", "right", "front"], 20)
     >>> keys = np.array([str(i) for i in range(80)])

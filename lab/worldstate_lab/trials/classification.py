@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.signature.ensemble import AnySignature, EnsembleModel
-from worldstate.abduction.signature.published_training import PublishedClassifier
 from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.datasets.sample_windows import FRONT, FRONT_LATER_S
@@ -15,6 +14,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.training.site_references import with_site_references
 from worldstate.operations.training.training import fit_ensemble
+from worldstate_lab.features.published_classifier import PublishedClassifier
 
 from .trial import Trial
 

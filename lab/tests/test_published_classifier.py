@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
+from worldstate_lab.features.published_classifier import PublishedClassifier, mirror_hazards
 
 from worldstate.abduction.co_evidence import Absent, Unqueried
 from worldstate.abduction.posterior import abduce, statistic
 from worldstate.abduction.signature.pattern_features import mirror_features
 from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel, couple
-from worldstate.abduction.signature.published_training import PublishedClassifier, mirror_hazards
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError

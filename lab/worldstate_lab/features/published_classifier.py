@@ -4,7 +4,7 @@ scikit-learn's own ``SVC(probability=True)`` is deprecated, and it couples proba
 they cannot be taken out as plain numbers. The recipe is repeated here on top of the machine itself.
 """
 
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,15 +12,32 @@ from sklearn import config_context
 from sklearn.svm import SVC
 
 from worldstate.abduction.cueing.platt import fit_sigmoid
+from worldstate.abduction.signature.ensemble_training import checked_labels, standardisation
+from worldstate.abduction.signature.pattern_features import mirror_features
+from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel
+from worldstate.abduction.signature.window_classes import CLASSES, LEFT, RIGHT
 from worldstate.ground.checks import finite_array
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, TextArray
 
-from .ensemble_training import checked_labels, standardisation
-from .pattern_features import mirror_features
-from .published_signature import PAIRS, SignatureModel
-from .window_classes import CLASSES, LEFT, RIGHT
-
 PLATT_FOLDS = 5
+
+
+class Classifier(Protocol):
+    """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
+
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Learn from features, class names and, where it takes notice of them, names of sites.
+
+        Shapes: X (n, features), y, groups (n,).
+        """
+        ...
+
+    def predict_proba(self, X: ArrayLike) -> FloatArray:
+        """Return posteriors of front, left, none, right, shape (n, 4).
+
+        Shapes: X (n, features).
+        """
+        ...
 
 
 class PublishedClassifier:
@@ -30,8 +47,6 @@ class PublishedClassifier:
     ----------
     rng : numpy.random.Generator
         Draws the folds from which the sigmoids are fitted.
-    penalty : float
-        C of the machine.
 
     Attributes
     ----------
@@ -49,14 +64,13 @@ class PublishedClassifier:
 
     model_: SignatureModel
 
-    def __init__(self, rng: np.random.Generator, penalty: float = 1.0) -> None:
+    def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
-        self.penalty = penalty
 
     def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         r"""Fit on features, shape (n, features), and class names, shape (n,).
 
-        .. math:: \min_{w, b} \tfrac12 \|w\|^2 + C \sum_n \max\big(0,\; 1 - y_n (w^T z_n + b)\big), \qquad
+        .. math:: \min_{w, b} \tfrac12 \|w\|^2 + \sum_n \max\big(0,\; 1 - y_n (w^T z_n + b)\big), \qquad
                   z = (x - \mu) / \sigma
 
         for each pair of classes, then a sigmoid a pair by `fit_sigmoid` on samples held out.
@@ -92,7 +106,7 @@ class PublishedClassifier:
         codes = np.searchsorted(CLASSES, labels)
         # Thirty machines of a few dozen windows: checking what is checked above takes as long as they do.
         with config_context(assume_finite=True, skip_parameter_validation=True):
-            machine = SVC(kernel="linear", C=self.penalty, decision_function_shape="ovo").fit(standard, codes)
+            machine = SVC(kernel="linear", decision_function_shape="ovo").fit(standard, codes)
             slopes, offsets = self._fit_sigmoids(standard, codes)
         self.model_ = SignatureModel(
             mean=mean,
@@ -133,7 +147,7 @@ class PublishedClassifier:
             if is_first[train].all() or not is_first[train].any():
                 decisions[test] = 1.0 if is_first[train].all() else -1.0
                 continue
-            machine = SVC(kernel="linear", C=self.penalty).fit(standard[train], is_first[train])
+            machine = SVC(kernel="linear").fit(standard[train], is_first[train])
             # The plane itself: scikit-learn checks its input again for as long as it has fitted.
             decisions[test] = standard[test] @ machine.coef_[0] + machine.intercept_[0]
         return decisions
