@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from worldstate_lab.report.table import Cell, Table
     from worldstate_lab.signatures.signature_study import SignatureStudy
     from worldstate_lab.trials.classification import Classifiers
-    from worldstate_lab.trials.takes import TakeList
+    from worldstate_lab.trials.takes import Take, TakeList
 
 EXAMPLE = """\
 examples:
@@ -178,15 +178,13 @@ def _degradation(
     It listens with --model, else with the model that ships, and where that was not made for this sound with
     one that is trained on the training windows.
     """
-    from worldstate.adapters.files.model_file import read_model
     from worldstate_lab.degradation.degradation_study import DegradationSettings
     from worldstate_lab.degradation.looks import StagedDetector, motion_detectors
     from worldstate_lab.evaluation.camera_failure import whole_sweep
-    from worldstate_lab.trials.listening import model_refusal
     from worldstate_lab.trials.training_windows import model_from_windows
 
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
-    foreign = any(model_refusal(take, read_model(None)) for take in takes.static if take.filmed)
+    foreign = any(_is_foreign(take) for take in takes.static if take.filmed)
     if foreign and model is None and classifiers.windows is not None and not arguments.smoke:
         model = model_from_windows(classifiers.windows, arguments.out / "cache", seed)
     if arguments.smoke:
@@ -197,6 +195,19 @@ def _degradation(
         detectors = detectors[0], StagedDetector(*second)
     settings = DegradationSettings(detectors, model, seed=seed)
     return whole_sweep(takes, settings) if arguments.full else settings
+
+
+def _is_foreign(take: "Take") -> bool:
+    """Tell whether the model that ships was not made for the sound of a recording."""
+    from worldstate.adapters.files.model_file import read_model
+    from worldstate.ground.errors import InputFileError
+    from worldstate_lab.trials.listening import model_refusal
+
+    try:
+        return model_refusal(take, read_model(None)) is not None
+    except InputFileError:
+        # What cannot be heard is named and left out when all recordings are listened to.
+        return False
 
 
 def _check(arguments: argparse.Namespace) -> None:
