@@ -50,19 +50,20 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     import numpy as np
 
     from worldstate.adapters.camera.miss_rates import save_miss_rates
-    from worldstate.operations.detectors.labelled_videos import find_videos
-    from worldstate.operations.detectors.miss_rate_figure import write_absence_figure
-    from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, measure_absence
+    from worldstate.operations.detectors.miss_rate_measurement import (
+        find_videos,
+        measure_absence,
+        write_absence_figure,
+    )
 
     check_outputs(arguments, "out", figures=("figure",))
-    make, settings = detector_maker(arguments), AbsenceSettings()
+    make = detector_maker(arguments)
     scenes = [_scene(arguments, make, *found) for found in find_videos(arguments.input, arguments.most)]
     with progress_bar("measuring", sum(scene.video.count for scene in scenes)) as bar:
         rates = measure_absence(
             scenes,
             make,
             np.random.default_rng(arguments.seed),
-            settings,
             provenance=_provenance(arguments, len(scenes)),
             on_frame=bar.advance,
         )

@@ -1,7 +1,8 @@
-"""Miss rates of a camera's detector, measured by re-detection on degraded frames."""
+"""Miss rates of a camera's detector, measured by re-detection on degraded frames, and their figure."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -12,11 +13,14 @@ from worldstate.adapters.camera.detector import Detector, overlaps
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.static_boxes import ParkedRule, kept_and_parked
-from worldstate.adapters.camera.video import Video
+from worldstate.adapters.camera.video import VIDEO_NAME, Video
+from worldstate.adapters.datasets.ovad import OvadDataset, Recording
+from worldstate.adapters.datasets.ovad_layout import LOG_NAME
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray
 from worldstate.measurement.sector import Sector
+from worldstate.operations.figure_style import figure_file, legend_beside
 
 MakeDetector = Callable[[], Detector]
 
@@ -181,82 +185,65 @@ def measure_absence(
 class AbsenceTally:
     """Counts of looks and misses, family by family, of what a detector found on staged frames."""
 
-    def __init__(self, camera: PinholeCamera, settings: AbsenceSettings | None = None) -> None:
-        self._camera, self._settings = camera, settings or AbsenceSettings()
-        self.edges_deg = self._settings.edges_deg(camera)
-        self._clean, *tallies = (
-            _Tally(self.edges_deg, self._settings) for _ in (0, *self._settings.families)
-        )
-        self._tallies = dict(zip(self._settings.families, tallies, strict=True))
+    def __init__(self, camera: PinholeCamera, settings: AbsenceSettings) -> None:
+        self._camera, self._settings = camera, settings
+        self.edges_deg = settings.edges_deg(camera)
+        by_level = len(settings.families), len(LEVELS)
+        by_bin = len(settings.families), len(self.edges_deg) - 1, len(LEVELS)
+        self._looks, self._misses = np.zeros(by_bin), np.zeros(by_bin)
+        self._sectors, self._clutter = np.zeros(by_level), np.zeros(by_level)
 
     @property
     def looks(self) -> float:
         """Reference objects on clean frames."""
-        return float(self._clean.looks[:, 0].sum())
+        return float(self._looks[0, :, 0].sum())
 
     def count(
         self, reference: DetectionLog, number: int, found: DetectionFrame, family: Family, level: int
     ) -> None:
         """Count what was found in a frame at a level; level 0 is the clean frame of every family."""
-        tally = self._tallies[family] if level else self._clean
-        tally.count(self._camera, reference, number, found, level)
-
-    def counts(self) -> dict[str, FamilyCounts]:
-        """Return the counts so far by family."""
-        return {family: tally.counts(self._clean) for family, tally in self._tallies.items()}
-
-
-class _Tally:
-    """Counts of one family, level by level."""
-
-    def __init__(self, edges_deg: Sequence[float], settings: AbsenceSettings) -> None:
-        self._edges_deg = np.array(edges_deg)
-        self._settings = settings
-        shape = (len(edges_deg) - 1, len(LEVELS))
-        self.looks, self.misses = np.zeros(shape), np.zeros(shape)
-        self.sectors, self.clutter = np.zeros(len(LEVELS)), np.zeros(len(LEVELS))
-
-    def counts(self, clean: "_Tally") -> FamilyCounts:
-        """Return the counts, those of the clean frames in the first column."""
-        for mine, theirs in zip(self._all(), clean._all(), strict=True):
-            mine[..., 0] = theirs[..., 0]
-        return FamilyCounts(_rows(self.looks), _rows(self.misses), tuple(self.sectors), tuple(self.clutter))
-
-    def _all(self) -> tuple[FloatArray, ...]:
-        return self.looks, self.misses, self.sectors, self.clutter
-
-    def count(
-        self, camera: PinholeCamera, reference: DetectionLog, number: int, found: DetectionFrame, level: int
-    ) -> None:
-        """Count what was found in a frame at a level."""
         if not self._settings.warm_up <= number < len(reference):
             return
+        families = slice(None) if level == 0 else self._settings.families.index(family)
         there = reference.frames[number]
         boxes = there.boxes_px[_counted(reference, number, self._settings)]
         hit = overlaps(boxes, found.boxes_px) >= self._settings.min_overlap
-        middles = (boxes[:, 0] + boxes[:, 2]) / 2.0
-        off_axis_deg = np.degrees(np.abs(camera.off_axis(camera.azimuth(middles))))
-        bins = np.clip(
-            np.searchsorted(self._edges_deg, off_axis_deg, side="right") - 1, 0, len(self.looks) - 1
-        )
-        np.add.at(self.looks[:, level], bins, 1.0)
-        np.add.at(self.misses[:, level], bins, ~hit.any(axis=1))
+        bins = self._bins(boxes)
+        n_bins = len(self.edges_deg) - 1
+        self._looks[families, :, level] += np.bincount(bins, minlength=n_bins)
+        self._misses[families, :, level] += np.bincount(bins, ~hit.any(axis=1), n_bins)
         false = ~(overlaps(found.boxes_px, there.boxes_px) >= self._settings.min_overlap).any(axis=1)
         false &= ~_inside(found.boxes_px, there.boxes_px)
-        self._count_clutter(camera, there.boxes_px, found.boxes_px[false], level)
+        sectors, clutter = self._empty_sectors(there.boxes_px, found.boxes_px[false])
+        self._sectors[families, level] += sectors
+        self._clutter[families, level] += clutter
 
-    def _count_clutter(
-        self, camera: PinholeCamera, there_px: FloatArray, false_px: FloatArray, level: int
-    ) -> None:
+    def counts(self) -> dict[str, FamilyCounts]:
+        """Return the counts so far by family."""
+        every = zip(self._looks, self._misses, self._sectors, self._clutter, strict=True)
+        return {
+            family: FamilyCounts(_rows(looks), _rows(misses), tuple(sectors), tuple(clutter))
+            for family, (looks, misses, sectors, clutter) in zip(self._settings.families, every, strict=True)
+        }
+
+    def _bins(self, boxes_px: FloatArray) -> IntArray:
+        """Return the bin of azimuth off the optical axis of the middle of each box, shape (n,)."""
+        azimuths = self._camera.azimuth((boxes_px[:, 0] + boxes_px[:, 2]) / 2.0)
+        off_axis_deg = np.degrees(np.abs(self._camera.off_axis(azimuths)))
+        found = np.searchsorted(self.edges_deg, off_axis_deg, side="right") - 1
+        return np.asarray(np.clip(found, 0, len(self.edges_deg) - 2))
+
+    def _empty_sectors(self, there_px: FloatArray, false_px: FloatArray) -> tuple[int, int]:
         """Count the sectors without a reference object, and those of them that a false detection touches."""
-        objects, false = _azimuths(camera, there_px), _azimuths(camera, false_px)
-        right, left = camera.view_rad
-        half = self._settings.half_width_rad
+        objects, false = _azimuths(self._camera, there_px), _azimuths(self._camera, false_px)
+        right, left = self._camera.view_rad
+        half, sectors, clutter = self._settings.half_width_rad, 0, 0
         for centre in np.arange(right + half, left - half + 1e-9, _SECTOR_STEP_RAD):
             sector = Sector(float(centre), half)
             if not any(sector.touches(azimuth, width) for azimuth, width in objects):
-                self.sectors[level] += 1.0
-                self.clutter[level] += any(sector.touches(azimuth, width) for azimuth, width in false)
+                sectors += 1
+                clutter += any(sector.touches(azimuth, width) for azimuth, width in false)
+        return sectors, clutter
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,3 +302,45 @@ def reference_by(detector: Detector, video: Video) -> DetectionLog:
 
 def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in values.tolist())
+
+
+def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:
+    """Return videos with the files of their reference boxes, None for a video that stands alone."""
+    # Of a data set the recordings with a vehicle count that have both.
+    if path.is_file():
+        return [(path, None)]
+    if not path.is_dir():
+        raise InputFileError(path, "expected a video, a recording folder or a data set")
+    if not (path / LOG_NAME).is_file():
+        return [_of_recording(Recording.open(path))]
+    approaches = [r for r in OvadDataset(path).recordings if r.label != "none"]
+    found = [_of_recording(r) for r in approaches if (r.path / VIDEO_NAME).is_file() and r.detections_path]
+    if not found:
+        raise InputFileError(path, f"expected recordings of a vehicle with {VIDEO_NAME} and detections")
+    return found[:most]
+
+
+def _of_recording(recording: Recording) -> tuple[Path, Path | None]:
+    video = recording.path / VIDEO_NAME
+    if not video.is_file():
+        raise InputFileError(recording.path, f"expected a recording with {VIDEO_NAME}")
+    return video, recording.detections_path
+
+
+def write_absence_figure(rates: MissRates, path: Path) -> None:
+    """Draw `rates` and write the figure as PNG, SVG or PDF, by the ending of `path`."""
+    names = list(rates.families)
+    with figure_file(path, 3.0 * len(names) + 1.0, 3.2) as figure:
+        panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+        for axes, name in zip(panels, names, strict=True):
+            counts = rates.families[name]
+            beta, (low, high) = counts.miss_rates(rates.repeats), counts.interval(rates.repeats)
+            for i, row in enumerate(beta):
+                label = f"{rates.azimuth_deg[i]:.0f}-{rates.azimuth_deg[i + 1]:.0f}°"
+                (line,) = axes.plot(LEVELS, row, marker="o", label=label)
+                if np.sum(counts.looks[i]):
+                    axes.fill_between(LEVELS, low[i], high[i], color=line.get_color(), alpha=0.12, lw=0)
+            axes.plot(LEVELS, counts.clutter_rates, color="grey", linestyle=":", label="clutter")
+            axes.set(title=name, xlabel="degradation $d$", ylim=(0.0, 1.0))
+        panels[0].set_ylabel(r"miss rate $\beta(\theta, d)$")
+        legend_beside(panels[-1], "off the optical axis")
