@@ -25,7 +25,7 @@ from worldstate.ground.serialisation import encode
 from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Measurement, Sighting
 from worldstate.operations.calibration.cueing_calibration import CueingSettings, calibrate_cueing
-from worldstate.operations.calibration.false_alarm_map import false_alarm_rate
+from worldstate.operations.metrics.approach_table import ApproachTable
 from worldstate.operations.recordings.hop_stream import hop_stream, load_streams
 from worldstate.operations.recordings.hop_table import save_tables
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
@@ -93,12 +93,12 @@ def test_a_stream_keeps_what_was_measured():
 def test_the_interval_of_the_rate_is_the_exact_one_of_a_poisson_count(onsets, windows):
     stream = np.zeros(max(windows, 2 * onsets + 1))
     stream[1 : 2 * onsets : 2] = 1.0
-    rate = false_alarm_rate([stream], 0.5, hop_s=36.0)
-    assert rate.onsets == onsets
-    assert poisson.cdf(onsets, rate.high_per_hour * rate.hours) == pytest.approx(0.025, abs=1e-6)
+    counted = ApproachTable([], [stream > 0.5])
+    assert counted.onsets == onsets
+    rates, hours = counted.false_alarms(), counted.hours
+    assert poisson.cdf(onsets, rates["onsets_high"] * hours) == pytest.approx(0.025, abs=1e-6)
     if onsets:
-        assert poisson.sf(onsets - 1, rate.low_per_hour * rate.hours) == pytest.approx(0.025, abs=1e-6)
-    assert rate.quantum_per_hour == pytest.approx(1 / rate.hours)
+        assert poisson.sf(onsets - 1, rates["onsets_low"] * hours) == pytest.approx(0.025, abs=1e-6)
 
 
 def test_few_samples_get_two_numbers_and_many_a_curve():
@@ -120,7 +120,7 @@ def test_calibration_keeps_its_budget_on_fresh_recordings_of_the_same_street():
         fresh = [
             stream_statistic(street(rng), PRIOR, StatisticSwitches(fixed_miss_rate=0.0)) for _ in range(40)
         ]
-        rates.append(false_alarm_rate(fresh, gamma, 3).window_rate)
+        rates.append(np.mean([np.mean(sustained_statistic(one, 3) >= gamma) for one in fresh]))
         assert done.risk == "kept"
         assert done.policies.for_alpha(0.05, 0.0).risk_map == kept.for_alpha(0.02, 0.0).risk_map
         assert [b.held_out_rate for b in done.budgets] == pytest.approx([0.04, 0.04], abs=0.03)

@@ -90,12 +90,12 @@ def _result(arguments: argparse.Namespace, done: "CueingCalibration") -> Command
         "risk_map": done.risk,
     }
     detail = {"budgets": [report.to_dict() for report in done.budgets], "warnings": list(done.warnings)}
-    lines = {
-        f"alpha {report.alpha:g}, beta {report.miss_rate:g}": (
-            f"gamma {report.gamma:.4f}  {report.counted.per_hour:.3g} false alarms/h "
-            f"[{report.counted.low_per_hour:.3g}, {report.counted.high_per_hour:.3g}], "
-            f"one is {report.counted.quantum_per_hour:.3g}/h"
+    lines = {}
+    for report in done.budgets:
+        rates = report.counted.false_alarms()
+        lines[f"alpha {report.alpha:g}, beta {report.miss_rate:g}"] = (
+            f"gamma {report.gamma:.4f}  {rates['onsets_per_hour']:.3g} false alarms/h "
+            f"[{rates['onsets_low']:.3g}, {rates['onsets_high']:.3g}], "
+            f"one is {1.0 / report.counted.hours:.3g}/h"
         )
-        for report in done.budgets
-    }
     return CommandResult(summary | detail, table=summary | lines)

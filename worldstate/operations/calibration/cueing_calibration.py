@@ -17,16 +17,16 @@ from worldstate.abduction.cueing.thresholds import (
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.metrics.approach_table import caution
+from worldstate.operations.metrics.approach_table import ApproachTable, caution, poisson_interval
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.stream_statistic import StatisticSwitches, stream_statistic
 from worldstate.operations.training.window_calibration import MISS_RATES
 
-from .false_alarm_map import FalseAlarmRate, false_alarm_rate
-
 ThresholdKind = Literal["conformal", "plain"]
 
+# Of the recording-level folds that the achieved rate is measured by.
+N_FOLDS = 5
 # With fewer false alarms in all the hours than this, their rate is not known to a factor of two.
 ENOUGH_ONSETS = 10
 
@@ -48,8 +48,6 @@ class CueingSettings:
     block_s : float
         Hazard-free hours are cut into pieces of this length, which the guarantee takes for exchangeable: it
         should be longer than the correlation time of the statistic.
-    folds : int
-        Of the recording-level folds that the achieved rate is measured by, >= 2.
     keep_per_hour : float, optional
         False alarms per hour that the filter is to keep while it runs, by moving the threshold. With
         approaches at hand it never moves beyond the level that half of them reach: those are announced come
@@ -71,7 +69,6 @@ class CueingSettings:
     method: ThresholdKind = "conformal"
     confidence: float | None = None
     block_s: float = 10.0
-    folds: int = 5
     keep_per_hour: float | None = None
 
     def __post_init__(self) -> None:
@@ -82,7 +79,6 @@ class CueingSettings:
         if self.confidence is not None:
             in_range("confidence", self.confidence, 0.0, 1.0, open_low=True, open_high=True)
         in_range("block_s", self.block_s, 1.0, 3600.0)
-        in_range("folds", self.folds, 2, 1000)
         if self.keep_per_hour is not None:
             AdaptiveBudget(self.keep_per_hour)
         if self.method not in ("conformal", "plain"):
@@ -111,7 +107,7 @@ class BudgetReport:
     alpha: float  # The budget, and the beta of the statistic
     miss_rate: float
     gamma: float  # The threshold
-    counted: FalseAlarmRate  # Its false alarms on the recordings that it was set on
+    counted: ApproachTable  # Its false alarms on the recordings that it was set on
     # Share of windows in alarm by recording-level folds: set on the others, counted on each. None with a
     # single recording.
     held_out_rate: float | None
@@ -119,15 +115,15 @@ class BudgetReport:
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON-able values."""
-        counted = self.counted
+        rates = self.counted.false_alarms()
         return {
             "alpha": self.alpha,
             "miss_rate": self.miss_rate,
             "gamma": self.gamma,
-            "window_rate": counted.window_rate,
-            "false_alarms_per_hour": counted.per_hour,
-            "false_alarms_per_hour_95": [counted.low_per_hour, counted.high_per_hour],
-            "quantum_per_hour": counted.quantum_per_hour,
+            "window_rate": rates["hazard_free_share"],
+            "false_alarms_per_hour": rates["onsets_per_hour"],
+            "false_alarms_per_hour_95": [rates["onsets_low"], rates["onsets_high"]],
+            "quantum_per_hour": 1.0 / self.counted.hours,
             "held_out_window_rate": self.held_out_rate,
             "held_out_false_alarms_per_hour": self.held_out_per_hour,
         }
@@ -284,24 +280,29 @@ def _hazards(approaches: Sequence[HopTable], prior: tuple[float, ...], beta: flo
 
 def _budget(calm: list[FloatArray], alpha: float, beta: float, settings: CueingSettings) -> BudgetReport:
     gamma = settings.threshold(calm, alpha)
-    counted = false_alarm_rate(calm, gamma, settings.sustain_hops, HOP_S)
     rate, per_hour = _held_out(calm, alpha, settings)
-    return BudgetReport(alpha, beta, gamma, counted, rate, per_hour)
+    return BudgetReport(alpha, beta, gamma, _counted(calm, gamma, settings), rate, per_hour)
+
+
+def _counted(calm: Sequence[FloatArray], gamma: float, settings: CueingSettings) -> ApproachTable:
+    return ApproachTable([], [sustained_statistic(one, settings.sustain_hops) >= gamma for one in calm])
 
 
 def _held_out(
     calm: list[FloatArray], alpha: float, settings: CueingSettings
 ) -> tuple[float, float] | tuple[None, None]:
     """Achieved rates by folds that never part a recording."""
-    folds = min(settings.folds, len(calm))
+    folds = min(N_FOLDS, len(calm))
     if folds < 2:
         return None, None
     found = []
     for fold in range(folds):
         gamma = settings.threshold([s for i, s in enumerate(calm) if i % folds != fold], alpha)
-        found.append(false_alarm_rate(calm[fold::folds], gamma, settings.sustain_hops, HOP_S))
+        found.append(_counted(calm[fold::folds], gamma, settings))
     hours = sum(one.hours for one in found)
-    return sum(one.window_rate * one.hours for one in found) / hours, sum(one.onsets for one in found) / hours
+    shares = [float(np.mean(np.concatenate(one.hazard_free))) for one in found]
+    share = sum(share * one.hours for share, one in zip(shares, found, strict=True)) / hours
+    return share, sum(one.onsets for one in found) / hours
 
 
 def _risk_map(calm: list[FloatArray], hazards: list[FloatArray], time_hops: float, kept: RiskMap) -> RiskMap:
@@ -345,9 +346,10 @@ def _warnings(
         count = report.counted
         if report.miss_rate == 0.0 and count.onsets < ENOUGH_ONSETS:
             enough_h = count.hours * ENOUGH_ONSETS / max(count.onsets, 1)
+            low, high = poisson_interval(count.onsets, count.hours)
             yield (
                 f"alpha {report.alpha:g}: {count.onsets} false alarms in {count.hours:.3g} h put their rate "
-                f"between {count.low_per_hour:.3g} and {count.high_per_hour:.3g} an hour; "
+                f"between {low:.3g} and {high:.3g} an hour; "
                 f"{enough_h:.2g} h would tell it to a factor of two"
             )
     if conformal and correlation_s > settings.block_s / 2:
