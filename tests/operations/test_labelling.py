@@ -20,8 +20,8 @@ from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
 from worldstate.operations.labelling.box_tracks import BoxTrack, box_tracks
 from worldstate.operations.labelling.label_files import file_below, open_label, window_rows
-from worldstate.operations.labelling.pass_figure import draw_passes
 from worldstate.operations.labelling.pass_labels import label_passes
+from worldstate.operations.labelling.street_figure import draw_passes
 from worldstate.operations.recordings.true_track import TrueTrack
 
 

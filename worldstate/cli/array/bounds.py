@@ -95,7 +95,7 @@ def _as_table(
 
 def _try_estimators(array: "MicrophoneArray", arguments: argparse.Namespace) -> dict[str, object]:
     """Measure, draw, write; return the numbers."""
-    from worldstate.operations.arrays.efficiency_figure import write_efficiency_figure, write_endfire_figure
+    from worldstate.operations.arrays.efficiency import write_efficiency_figure, write_endfire_figure
 
     output_folder(arguments.out, "efficiency.png", "endfire.png", "bounds.json")
     over_snr, endfire = _measure(array, arguments)

@@ -53,8 +53,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
     from worldstate.operations.labelling.box_tracks import box_tracks
     from worldstate.operations.labelling.label_files import file_below, write_open_label, write_window_labels
-    from worldstate.operations.labelling.pass_figure import write_pass_figure
     from worldstate.operations.labelling.pass_labels import label_passes
+    from worldstate.operations.labelling.street_figure import write_pass_figure
     from worldstate.operations.recordings.true_track import read_true_tracks
 
     check_outputs(arguments, "out", "windows", figures=("figure",))

@@ -51,15 +51,13 @@ class Alignment:
     median_error_deg: float  # Of these
 
 
-def align(passes: Sequence[HeardPass], seed: int = 0) -> Alignment:
+def align(passes: Sequence[HeardPass]) -> Alignment:
     """Return the alignment that most bearings agree with; the interval is a bootstrap over the passes.
 
     Parameters
     ----------
     passes : sequence of HeardPass
         Vehicles that turned through the view; those that came from both sides tell the yaw from the offset.
-    seed : int
-        Of the bootstrap.
 
     Returns
     -------
@@ -76,7 +74,7 @@ def align(passes: Sequence[HeardPass], seed: int = 0) -> Alignment:
     support = np.stack([_support(one) for one in passes])
     offset_s, yaw_deg = _best(support.sum(axis=0))
     _check_inside(offset_s, yaw_deg)
-    draws = np.random.default_rng(seed).integers(0, len(passes), (_DRAWS, len(passes)))
+    draws = np.random.default_rng(0).integers(0, len(passes), (_DRAWS, len(passes)))
     counts = np.stack([np.bincount(draw, minlength=len(passes)) for draw in draws])
     drawn = np.array([_best(np.tensordot(count, support, 1)) for count in counts])
     low, high = np.percentile(drawn, (2.5, 97.5), axis=0)

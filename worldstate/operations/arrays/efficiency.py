@@ -7,6 +7,7 @@ by the functions that the front-end is made of.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -14,13 +15,20 @@ from scipy.special import gammaincinv
 from worldstate.frontend.approach.tone import estimate_tone
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, broadside_rad, delay_crb_s2, tone_crb_hz2
+from worldstate.frontend.bounds.cramer_rao import (
+    bearing_crb_rad2,
+    broadside_rad,
+    delay_crb_s2,
+    endfire_information,
+    tone_crb_hz2,
+)
 from worldstate.frontend.direction.gcc import gcc_delays
 from worldstate.frontend.direction.peaks import find_peaks
 from worldstate.frontend.direction.srp import srp_phat
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import ComplexArray, FloatArray
+from worldstate.operations.figure_style import GREEN, figure_file, legend_beside
 
 Generator = np.random.Generator
 
@@ -32,6 +40,12 @@ PAIR_DELAY_S = 1.37e-4
 GRID_RAD = np.radians(np.arange(-90.0, 91.0))
 # Truths are spread over one step of the grid, so that its interpolation is tried where it is worst, too.
 SPREAD_RAD = float(GRID_RAD[1] - GRID_RAD[0])
+
+# What the library promises of its estimators at high SNR.
+PROMISED_DB = 1.5
+_INSIDE = 0.9973  # Share of the ratios inside `Efficiency.sampling_db`
+# Below its threshold SNR an estimator fails by tens of decibels; the figure is about what lies above.
+_MOST_DB = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +90,13 @@ class Efficiency:
         """Mean squared error over the bound, dB, shape (n,)."""
         return np.asarray(10.0 * np.log10(self.mean_square / self.bound))
 
-    def sampling_db(self, level: float = 0.9973) -> tuple[float, float]:
-        """Return the interval in which the ratio of an efficient Gaussian estimator falls, dB.
+    def sampling_db(self) -> tuple[float, float]:
+        """Return the interval that holds .9973 of the ratios of an efficient Gaussian estimator, dB.
 
-        Parameters
-        ----------
-        level : float
-            Its probability; three standard deviations by default.
-
-        Returns
-        -------
-        low, high : float
-            From the chi-square distribution with `trials` degrees of freedom.
+        Three standard deviations, by the chi-square distribution with `trials` degrees of freedom.
         """
         # A chi-square with n degrees of freedom is twice a Gamma(n / 2), whose inverse needs no scipy.stats.
-        tails = np.array([1.0 - level, 1.0 + level]) / 2.0
+        tails = np.array([1.0 - _INSIDE, 1.0 + _INSIDE]) / 2.0
         low, high = 2.0 * gammaincinv(self.trials / 2.0, tails) / self.trials
         return float(10.0 * np.log10(low)), float(10.0 * np.log10(high))
 
@@ -234,3 +240,43 @@ def _mean_square(trial: NoisyEstimate, snr: float, trials: int, rng: Generator) 
 def _circular(rng: Generator, *shape: int) -> ComplexArray:
     """Circular complex noise of unit power."""
     return np.asarray(np.sqrt(0.5) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)))
+
+
+def write_efficiency_figure(measured: Sequence[Efficiency], path: Path) -> None:
+    """Draw mean squared error over bound, dB against dB, and write it by the ending of `path`."""
+    with figure_file(path, 9.5, 4.4) as figure:
+        axes = figure.subplots()
+        low, high = measured[0].sampling_db()
+        sampling = f"99.7 % of an efficient estimator,\n{measured[0].trials} trials"
+        axes.axhspan(low, high, color="grey", alpha=0.2, lw=0, label=sampling)
+        axes.axhline(0.0, color="black", linewidth=0.8, label="Cramer-Rao bound")
+        promised = f"promised at high SNR, {PROMISED_DB:g} dB"
+        axes.axhline(PROMISED_DB, color="black", linewidth=0.8, linestyle=":", label=promised)
+        for one in measured:
+            axes.plot(one.at, one.ratio_db, marker="o", markersize=4, label=one.name)
+        least = min(low, *(float(np.min(one.ratio_db)) for one in measured))
+        axes.set(xlabel="SNR (dB)", ylabel="mean squared error over bound (dB)", ylim=(least - 0.5, _MOST_DB))
+        axes.set_title("efficiency of the estimators")
+        legend_beside(axes)
+
+
+def write_endfire_figure(measured: Efficiency, array: MicrophoneArray, title: str, path: Path) -> None:
+    """Draw the loss of bearing information toward endfire beside what does not depend on the bearing."""
+    fine = np.radians(np.linspace(0.0, 90.0, 181))
+    shape = endfire_information(array.positions_m, broadside_rad(array.positions_m) + fine)
+    azimuth_deg = np.degrees(measured.at)
+    with figure_file(path, 9.0, 5.6) as figure:
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        upper.plot(azimuth_deg, np.degrees(np.sqrt(measured.bound)), color="black", label="Cramer-Rao bound")
+        upper.plot(azimuth_deg, np.degrees(np.sqrt(measured.mean_square)), "o", label=measured.name)
+        upper.set(ylabel="bearing error,\nrms (deg)", yscale="log", title=title)
+        # A decade is seldom filled: without labels between the powers of ten there would be one or none.
+        for axis in ("major", "minor"):
+            getattr(upper.yaxis, f"set_{axis}_formatter")("{x:.2g}")
+        lower.plot(np.degrees(fine), shape, color="black", label="bearing, bound")
+        lower.plot(azimuth_deg, measured.bound.min() / measured.mean_square, "o", label="bearing, achieved")
+        lower.axhline(1.0, color=GREEN, linestyle="--", label="radial speed, presence")
+        lower.set(ylabel="information,\nshare of the best bearing", ylim=(0.0, None))
+        lower.set_xlabel("azimuth from broadside (deg)")
+        for axes in (upper, lower):
+            legend_beside(axes)

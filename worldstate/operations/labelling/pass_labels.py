@@ -18,7 +18,7 @@ from worldstate.state.context import blind_corner
 
 from .box_tracks import BoxTrack
 
-# Who comes is heard for some three seconds; longer ago the motion since T0 says nothing of the place.
+# A vehicle is heard for some three seconds; longer ago the motion since T0 says nothing of the place.
 HIDDEN_S, HOP_S = 5.0, 0.1
 # Height and width of the body by the detector's classes, m, and how widely the height varies, relative.
 _BODIES = {
@@ -37,6 +37,11 @@ _CORNER_M, _LEAST_EDGE_STD_RAD = 6.0, math.radians(0.5)
 # of 1 the stated variance of hidden places was four times the squared error. In the grid of densities and
 # scales of docs/smoothing.md these have one of the least errors, and state it rightly.
 _ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
+# Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
+# runs off and the system is indeterminate.
+_SMOOTHING = SmoothingSettings(
+    lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
+)
 # At the earliest hop: beyond the corner, at a walk to 15 m/s, from some 10 to 100 m away.
 _START_STD = (math.radians(25.0), 0.25, 0.3, 0.6)
 _START_RAD, _START_M = math.radians(55.0), 30.0
@@ -56,23 +61,17 @@ class PassLabel:
 def label_passes(
     tracks: Sequence[BoxTrack],
     camera_ahead_m: float = 0.0,
-    settings: SmoothingSettings | None = None,
     on_pass: Callable[[], None] = lambda: None,
 ) -> list[PassLabel]:
     """Return the labels of all vehicles that came out of an arm, in the order of their boxes.
 
     By the factor graph; where gtsam is not installed, by the RTS smoother of filterpy.
     """
-    # Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
-    # runs off and the system is indeterminate.
-    chosen = settings or SmoothingSettings(
-        lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
-    )
     coming = [one for one in tracks if one.arm is not None]
     edges = {arm: _edge(coming, arm) for arm in ("left", "right")}
     found = []
     for number, one in enumerate(coming):
-        label = _smoothed(f"{number}", one, edges, camera_ahead_m, chosen)
+        label = _smoothed(f"{number}", one, edges, camera_ahead_m)
         on_pass()
         found += [] if label is None else [label]
     return found
@@ -103,12 +102,11 @@ def _smoothed(
     one: BoxTrack,
     edges: dict[str, tuple[float, float]],
     camera_ahead_m: float,
-    settings: SmoothingSettings,
 ) -> PassLabel | None:
     observed = _observations(one, camera_ahead_m)
     stamped = {nanoseconds(at * HOP_S): observed[at] for at in sorted(observed)}
     smooth = _by_rts if find_spec("gtsam") is None else _by_graph
-    track, t0 = smooth(name, one.arm or "", edges[one.arm or ""], stamped, settings)
+    track, t0 = smooth(name, one.arm or "", edges[one.arm or ""], stamped)
     return None if t0 is None else PassLabel(one.arm or "", one.label, t0, track, one.edge_rad)
 
 
@@ -117,9 +115,8 @@ def _by_graph(
     arm: str,
     edge: tuple[float, float],
     observed: dict[int, list[Observation]],
-    settings: SmoothingSettings,
 ) -> tuple[SmoothedTrack, FirstSight | None]:
-    smoother = FixedLagSmoother(settings)
+    smoother = FixedLagSmoother(_SMOOTHING)
     place = _CORNER_M * np.array([math.cos(edge[0]), math.sin(edge[0])])
     smoother.add_corner("edge", 1 if arm == "left" else -1, place.tolist(), (_CORNER_M * edge[1],) * 2)
     smoother.begin(name, min(observed), start_of(arm))
@@ -133,7 +130,6 @@ def _by_rts(
     arm: str,
     edge: tuple[float, float],
     observed: dict[int, list[Observation]],
-    settings: SmoothingSettings,
 ) -> tuple[SmoothedTrack, FirstSight | None]:
     track = rts_track(name, start_of(arm), observed)
     return track, rts_first_sight(track, 1 if arm == "left" else -1, *edge)

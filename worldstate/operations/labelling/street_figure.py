@@ -1,13 +1,22 @@
-"""Bird's-eye of a street as it was learned: lines of sight past its edges, and where who comes is."""
+"""Bird's-eye of a street as it was learned, and of the passes of a recording with their smoothed tracks."""
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate.operations.figure_style import BLUE, GREEN, figure_file
-from worldstate.smoothing.learned_street import LearnedStreet, context_of
-from worldstate.state.context import Context, Occluder
+import numpy as np
+
+from worldstate.ground.typing import BoolArray
+from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, figure_file, legend_beside
+from worldstate.operations.recordings.true_track import TrueTrack
+from worldstate.smoothing.learned_street import LearnedStreet, context_of, with_pass
+from worldstate.smoothing.smoothed_track import SmoothedTrack
+from worldstate.state.context import Occluder
+
+from .pass_labels import PassLabel
+from .street_passes import street_pass
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,15 +25,17 @@ if TYPE_CHECKING:
 _LANE_M = 9.0
 _BEFORE_S, _APART_M = (1.0, 2.0, 3.0), 1.3  # Rows of the drawing, so that their bars do not hide one another
 _WIDEST_M, _COLUMNS = 26.0, 2
+_EVERY = 5  # Half a second apart, they can still be told from one another
+_FARTHEST_M = 40.0
+_COLOURS = {"left": BLUE, "right": ORANGE}
+_SAME_PASS_S = 2.0  # Of T0: vehicles nearer to one another are mostly not seen apart
 
 
-def write_street_figure(
-    stages: Sequence[tuple[str, LearnedStreet]], path: Path, truth: Context | None = None
-) -> None:
+def write_street_figure(stages: Sequence[tuple[str, LearnedStreet]], path: Path) -> None:
     """Draw a street at some stages side by side, the ego at the origin and looking up.
 
     Filled is where the edge is believed, two deviations either way; the dots of a row are the median driver
-    1, 2 or 3 s before line of sight, bars one deviation of pace. True edges are green and dashed.
+    1, 2 or 3 s before line of sight, bars one deviation of pace.
     """
     columns = min(len(stages), _COLUMNS)
     rows = math.ceil(len(stages) / columns)
@@ -33,9 +44,6 @@ def write_street_figure(
             axes = figure.add_subplot(rows, columns, number)
             for occluder, arm in zip(context_of(street).occluders, street.arms, strict=True):
                 _draw_learned(axes, occluder, arm.pace_spread)
-            for occluder in () if truth is None else truth.occluders:
-                end_m = _aside_m(occluder.edge_azimuth_rad)
-                axes.plot([0.0, end_m], [0.0, _LANE_M], "--", color=GREEN)
             axes.plot(0.0, 0.0, "k^", markersize=8)
             axes.set(xlim=(_WIDEST_M, -_WIDEST_M), ylim=(-1.0, 15.0), title=title, aspect="equal")
             axes.set(
@@ -66,6 +74,59 @@ def _aside_m(azimuth_rad: float) -> float:
 
 
 def _place_m(one: Occluder, factor: float, time_s: float) -> float:
-    """Return where somebody is so long before line of sight, metres to the left on the drawn lane."""
+    """Return where a vehicle is so long before line of sight, metres to the left on the drawn lane."""
     slope = math.tan(abs(one.edge_azimuth_rad)) + factor * one.pace_hz * time_s
     return math.copysign(_LANE_M * slope, one.edge_azimuth_rad)
+
+
+def write_pass_figure(
+    passes: Sequence[PassLabel], path: Path, title: str, truth: Sequence[TrueTrack] = ()
+) -> None:
+    """Draw every pass seen from above, the ego at the origin and looking up; hidden parts are dashed."""
+    with figure_file(path, 8.5, 3.4) as figure:
+        axes = figure.add_subplot(title=title)
+        draw_passes(axes, passes, truth)
+        legend_beside(axes)
+
+
+def draw_passes(axes: "Axes", passes: Sequence[PassLabel], truth: Sequence[TrueTrack] = ()) -> None:
+    """Draw smoothed tracks, the edges that these passes tell, and the true tracks of the same vehicles."""
+    street = reduce(with_pass, map(street_pass, passes), LearnedStreet())
+    for occluder in context_of(street).occluders:
+        # Of an arm that no vehicle came out of, nothing is known.
+        if not occluder.assumed:
+            draw_edge(axes, occluder, "0.5")
+    for one in passes:
+        draw_track(
+            axes, one.track, one.track.time_s < one.t0.time_s, _COLOURS[one.arm], f"{one.arm}, smoothed"
+        )
+        _draw_truth(axes, one, truth)
+    axes.plot(0.0, 0.0, "k^", markersize=9)
+    span = {"xlim": (_FARTHEST_M, -_FARTHEST_M), "ylim": (-4.0, 25.0)}
+    axes.set(**span, xlabel="left, m", ylabel="ahead, m", aspect="equal")
+
+
+def draw_track(axes: "Axes", track: SmoothedTrack, hidden: BoolArray, color: str, label: str) -> None:
+    """Draw a track with an ellipse of two deviations every half second; hidden parts are dashed."""
+    from matplotlib.patches import Ellipse
+
+    states = track.states
+    # The first state in view ends the hidden part, too: it is one vehicle.
+    for part, style in ((hidden | np.roll(hidden, 1), "--"), (~hidden, "-")):
+        axes.plot(*states[part, 1::-1].T, style, color=color, label=label)
+    for place, spread in zip(states[::_EVERY], track.covariance[::_EVERY], strict=True):
+        lengths, axis = np.linalg.eigh(spread[:2, :2])
+        angle = np.degrees(np.arctan2(axis[0, 1], axis[1, 1]))
+        # Four deviations from end to end hold .86 of a Gaussian of two dimensions.
+        sides = 4.0 * np.sqrt(lengths[::-1])
+        axes.add_patch(Ellipse((place[1], place[0]), *sides, angle=angle, fill=False, color=color, alpha=0.3))
+
+
+def _draw_truth(axes: "Axes", one: PassLabel, truth: Sequence[TrueTrack]) -> None:
+    seen = [(abs(true.visible_s[0] - one.t0.time_s), i) for i, true in enumerate(truth) if true.visible_s]
+    off_s, nearest = min(seen, default=(np.inf, 0))
+    if off_s > _SAME_PASS_S:
+        return
+    true = truth[nearest]
+    during = (true.time_s >= one.track.time_s[0]) & (true.time_s <= one.track.time_s[-1])
+    axes.plot(*true.position_m[during, ::-1].T, ":", color=GREEN, linewidth=2.0, label="truth")

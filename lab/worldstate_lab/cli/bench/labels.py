@@ -24,8 +24,8 @@ from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.figure_style import RED, figure_file, legend_beside
 from worldstate.operations.labelling.box_tracks import box_tracks
-from worldstate.operations.labelling.pass_figure import draw_passes, draw_track
 from worldstate.operations.labelling.pass_labels import PassLabel, label_passes, start_of
+from worldstate.operations.labelling.street_figure import draw_passes, draw_track
 from worldstate.operations.recordings.true_track import TrueTrack
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.smoothing.smoothed_track import SmoothedTrack
