@@ -18,5 +18,5 @@ from .scene.route import EgoMotion as EgoMotion
 from .scene.settings import SimulationSettings as SimulationSettings
 from .scene.settings import VehicleSettings as VehicleSettings
 from .scene.settings import draw_settings as draw_settings
-from .scene.sound_kinds import SOUNDS as SOUNDS
+from .scene.sound_settings import SOUNDS as SOUNDS
 from .scene.sound_settings import SoundSettings as SoundSettings

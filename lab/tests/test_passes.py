@@ -22,7 +22,7 @@ from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.site_geometry import SideGeometry
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.stream_labels import stream_truth
+from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.operations.recordings.hop_table import HopTable
 
 Vehicle = tuple[str, str, float]  # flow, arm, T0; "from_ahead" comes along the ego's own street

@@ -5,9 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
-from worldstate_lab.planner.believed_stream import BelievedStream, with_chances
 from worldstate_lab.planner.closed_loop import drive_through
-from worldstate_lab.planner.encounters import FROM_STANDING, STEP_S, EgoVehicle, Encounters
+from worldstate_lab.planner.encounters import (
+    FROM_STANDING,
+    STEP_S,
+    BelievedStream,
+    EgoVehicle,
+    Encounters,
+    with_chances,
+)
 from worldstate_lab.planner.planner_exam import (
     CHANCE,
     FULL,

@@ -11,7 +11,7 @@ from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_be
 
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import wrap_angle
-from worldstate.operations.metrics.time_to_visible import visible_errors
+from worldstate.operations.metrics.approach_table import visible_errors
 
 few = settings(max_examples=40)
 bearings = st.lists(st.floats(-4, 4), max_size=4)

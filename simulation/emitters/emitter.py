@@ -7,14 +7,11 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA, smooth_step
-from worldstate.simulation.scene.sound_kinds import SoundKind
+from worldstate.simulation.scene.sound_settings import SoundKind
 
-from .birds import birds
-from .machines import drill, saw, tone
-from .music import bell, bicycle_bell, music
 from .people import steps, voice
 from .signals import gate
-from .warning_signals import beeper, horn, siren, wail
+from .tonal_sounds import beeper, bell, bicycle_bell, birds, drill, horn, music, saw, siren, tone, wail
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 

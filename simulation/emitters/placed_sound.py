@@ -8,8 +8,7 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, split_octaves
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.sound_kinds import SoundKind, sound_kind
-from worldstate.simulation.scene.sound_settings import SoundSettings
+from worldstate.simulation.scene.sound_settings import SoundKind, SoundSettings, sound_kind
 from worldstate.simulation.scene.vehicle import Trajectory
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import screen_attenuation_db

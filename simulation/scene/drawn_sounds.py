@@ -7,8 +7,7 @@ import numpy as np
 
 from .junction import Site
 from .settings import SimulationSettings
-from .sound_kinds import VEHICLE, sound_kind
-from .sound_settings import SoundSettings
+from .sound_settings import VEHICLE, SoundSettings, sound_kind
 
 # How long one of them is heard, of the recording; rain and music last.
 SHARE, LASTING = (0.3, 0.8), ("rain", "music", "bell")

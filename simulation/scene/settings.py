@@ -12,8 +12,7 @@ from .kinds import VehicleKind, vehicle_kind
 from .places import Way, place_of
 from .presets import Preset, preset
 from .route import EgoMotion
-from .sound_kinds import SIGNALS
-from .sound_settings import SoundSettings
+from .sound_settings import SIGNALS, SoundSettings
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
 MANOEUVRES = ("pass", "turn")

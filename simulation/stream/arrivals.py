@@ -15,8 +15,7 @@ from worldstate.simulation.scene.settings import EGO_STOPS_AFTER_S, SimulationSe
 from worldstate.simulation.scene.sound_settings import SoundSettings
 
 from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
-from .settings import StreamSettings
-from .traffic import HAZARDS, Traffic
+from .settings import HAZARDS, StreamSettings, Traffic
 
 HEADWAY_S = (1.5, 4.0)
 TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once

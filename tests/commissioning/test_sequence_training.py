@@ -8,11 +8,11 @@ from worldstate.abduction.sequence.sequence_inputs import HopEvidence
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S
 from worldstate.commissioning.sequence_training import (
     LabelledStream,
+    StreamTruth,
     calibrated_margin_s,
     exported,
     train_sequence,
 )
-from worldstate.commissioning.stream_labels import StreamTruth
 
 
 @pytest.mark.parametrize("seed", [0, 1])

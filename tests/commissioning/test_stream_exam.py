@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.plan import CommissionSettings, exam_streams, learned_streams
+from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import (
     LOUDEST,
     ExaminedStream,
@@ -18,7 +19,6 @@ from worldstate.commissioning.stream_exam import (
     examine,
     warned_before,
 )
-from worldstate.commissioning.stream_labels import stream_truth
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.hop_table import HopTable
 

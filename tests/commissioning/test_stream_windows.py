@@ -11,13 +11,16 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, write_featu
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.open_field import (
+from worldstate.commissioning.simulated_windows import (
+    WEIGHT,
     OpenSource,
+    hop_labels,
     open_feature,
     open_field_features,
     open_field_windows,
+    posteriors_along,
+    stream_windows,
 )
-from worldstate.commissioning.stream_windows import WEIGHT, hop_labels, posteriors_along, stream_windows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.recordings.hop_table import HopTable
 

@@ -18,8 +18,7 @@ from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
 from worldstate.simulation.stream.drawn_stream import draw_stream
 from worldstate.simulation.stream.event_sound import event_sound, loudness_db
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
-from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.traffic import traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
 RATE_HZ = 3000.0

@@ -32,7 +32,7 @@ from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, d
 from worldstate.simulation.scene.drawn_sounds import with_sounds
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import split_octaves
-from worldstate.simulation.scene.sound_kinds import SIGNALS, sound_kind
+from worldstate.simulation.scene.sound_settings import SIGNALS, sound_kind
 from worldstate.simulation.scene.vehicle import drive
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.receiver import Receiver

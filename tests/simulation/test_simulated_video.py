@@ -29,7 +29,7 @@ from worldstate.simulation import (
 from worldstate.simulation.camera.rays import Panel, Patch, View, cast_panels, cast_solid
 from worldstate.simulation.camera.street_view import ROAD_Z_M, paint_street
 from worldstate.simulation.camera.vehicle_view import Car, add_car
-from worldstate.simulation.dataset.rendered_video import (
+from worldstate.simulation.dataset.dataset import (
     camera_frames,
     parked_lane_m,
     parked_middle_m,

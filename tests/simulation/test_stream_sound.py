@@ -39,9 +39,8 @@ from worldstate.simulation.stream.rendering import (
     render_piece,
     row_times,
 )
-from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.sight import visible_s
-from worldstate.simulation.stream.traffic import TRAFFICS, traffic_named
+from worldstate.simulation.stream.settings import TRAFFICS, StreamSettings, traffic_named
+from worldstate.simulation.stream.truth import visible_s
 from worldstate.simulation.stream.writing import write_stream
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])

@@ -23,17 +23,16 @@ from worldstate.simulation.stream.arrivals import (
     draw_events,
     draw_sounds,
 )
-from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, emerges
-from worldstate.simulation.stream.motion import SpeedLimit, drive_along
-from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.sight import (
+from worldstate.simulation.stream.manoeuvres import MANOEUVRES, Driver, SpeedLimit, drive_along, emerges
+from worldstate.simulation.stream.settings import FLOWS, HAZARDS, StreamSettings, Traffic, traffic_named
+from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
     CLUTTER_PER_HOUR,
+    describe_events,
     detected_frames,
+    vehicle_truth,
     visible_s,
 )
-from worldstate.simulation.stream.traffic import FLOWS, HAZARDS, Traffic, traffic_named
-from worldstate.simulation.stream.truth import describe_events, vehicle_truth
 
 NEVER_SEEN = {"turns_away", "parks", "far"}
 

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import nanoseconds, seconds
     from worldstate.operations.recordings.evidence_report import common_lines, evidence_report
-    from worldstate.operations.recordings.told_advisories import told_advisories
+    from worldstate.operations.recordings.warning import told_advisories
 
     listed, told = list[str](), {}
     if arguments.time is None:

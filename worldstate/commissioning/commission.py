@@ -30,13 +30,18 @@ from worldstate.simulation.stream.settings import StreamSettings
 
 from .guard_training import train_guard
 from .heard_stream import HeardStream, hear_recording, hear_stream
-from .open_field import N_OPEN, open_field_features, open_field_windows
 from .plan import HAZARD_FREE, CommissionSettings, exam_streams, learned_streams, mounting_streams, mountings
 from .road_user_training import train_road_users
-from .sequence_training import LabelledStream, calibrated_margin_s, train_sequence
+from .sequence_training import LabelledStream, calibrated_margin_s, stream_truth, train_sequence
+from .simulated_windows import (
+    N_OPEN,
+    learned_beside,
+    open_field_features,
+    open_field_windows,
+    posteriors_along,
+    window_model,
+)
 from .stream_exam import ExaminedStream, alarm_elsewhere, alarm_for
-from .stream_labels import stream_truth
-from .stream_windows import learned_beside, posteriors_along, window_model
 
 FOLDS = 4
 LEARNING_STEPS = 2 * FOLDS + 2

@@ -11,8 +11,8 @@ from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate.operations.metrics.approach_table import Figures
 
 from .heard_stream import HeardStream
+from .sequence_training import ROW_S
 from .stream_exam import ExaminedStream, auroc_before, examine, warned_before
-from .stream_labels import ROW_S
 
 # What OVAD's 56 microphones reach with the model that ships, in 395 loud approaches and six hours without
 # hazards (seeds 1 to 3 of the exam; docs/commission.md). Its window model knows real windows of these

@@ -9,8 +9,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.checks import in_range
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES, Site, drawn_site, site
 from worldstate.simulation.scene.settings import rate_for
-from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.traffic import traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
 APPROACHES, HAZARD_FREE = "approaches", "no-hazard"
 # Seeds of streams that are learned from and of those that examine; neither is ever the other. Every

@@ -22,7 +22,7 @@ from worldstate.simulation.sound.receiver import standing_m
 from worldstate.simulation.stream.arrivals import VehicleEvent
 from worldstate.simulation.stream.manoeuvres import LEFT, draw_driver, emerges
 from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.sight import visible_s
+from worldstate.simulation.stream.truth import visible_s
 
 from .plan import junction_named
 from .sound_rows import SoundRows, characters, event_and_ambience, fit_softmax, loudness

@@ -26,7 +26,7 @@ from worldstate.simulation.stream.settings import StreamSettings
 
 from .heard_stream import HeardStream
 from .plan import junction_named
-from .stream_windows import hop_labels
+from .simulated_windows import hop_labels
 
 # What the guard says of the simulator's kinds. Gusts blow at microphones that it does not hear: the monitor
 # of the channels finds them.

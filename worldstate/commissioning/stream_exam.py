@@ -34,13 +34,13 @@ from worldstate.operations.metrics.approach_table import (
     hop_outcome,
     mean_of,
     rising_edges,
+    visible_errors,
 )
 from worldstate.operations.metrics.roc import auroc
-from worldstate.operations.metrics.time_to_visible import visible_errors
 from worldstate.operations.recordings.hop_stream import HOP_S
 
 from .heard_stream import HeardStream
-from .stream_labels import QUIET_KINDS, StreamTruth
+from .sequence_training import QUIET_KINDS, StreamTruth
 
 TOGETHER_S, FOLLOWING_S = 4.0, 6.0
 # A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at

@@ -16,7 +16,7 @@ from worldstate.cli.common.outputs import check_outputs
 from worldstate.cli.common.progress import progress_bar
 
 if TYPE_CHECKING:
-    from worldstate_lab.planner.believed_stream import BelievedStream
+    from worldstate_lab.planner.encounters import BelievedStream
 
 EXAMPLE = """\
 examples:
@@ -60,8 +60,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         every_planner,
         planner_figures,
         safe_threshold,
+        write_planner_figure,
     )
-    from worldstate_lab.planner.planner_figure import write_planner_figure
 
     check_outputs(arguments, "report", figures=("figure",))
     count = int(in_range("--count", arguments.count, 10, 100_000))
@@ -98,7 +98,7 @@ def _believed(arguments: argparse.Namespace, paths: list[Path]) -> "list[Believe
 
     from worldstate.adapters.files.model_file import read_model
     from worldstate.adapters.parallel import in_processes
-    from worldstate_lab.planner.believed_stream import believed_stream
+    from worldstate_lab.planner.encounters import believed_stream
 
     follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)
     found = []

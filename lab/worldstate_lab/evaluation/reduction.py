@@ -9,8 +9,13 @@ from worldstate.ground.checks import check_shape, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import wrap_angle
-from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, SLACK_S, onset_outcome, rising_edges
-from worldstate.operations.metrics.time_to_visible import visible_errors
+from worldstate.operations.metrics.approach_table import (
+    LONGEST_LEAD_S,
+    SLACK_S,
+    onset_outcome,
+    rising_edges,
+    visible_errors,
+)
 from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures

@@ -13,8 +13,8 @@ import numpy as np
 from worldstate.abduction.cueing.calibration_error import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
 from worldstate.commissioning.heard_stream import HeardStream
+from worldstate.commissioning.sequence_training import StreamTruth
 from worldstate.commissioning.stream_exam import alarm_outcomes, approaches, time_figures
-from worldstate.commissioning.stream_labels import StreamTruth
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
     SLACK_S,

@@ -17,7 +17,7 @@ from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
-from worldstate.commissioning.stream_labels import stream_truth
+from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.core.filter import WorldFilter
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.labelling.street_passes import WatchedRecording, watched_recording

@@ -19,8 +19,8 @@ from worldstate.commissioning.road_user_training import (
     cross_validated,
     fit_road_users,
 )
+from worldstate.commissioning.sequence_training import AUDIBLE_DB, ROW_S
 from worldstate.commissioning.sound_rows import characters
-from worldstate.commissioning.stream_labels import AUDIBLE_DB, ROW_S
 from worldstate.frontend.spectra.sound_character import HOPS_A_SECOND
 from worldstate.ground.typing import FloatArray
 

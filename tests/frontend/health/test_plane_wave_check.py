@@ -25,8 +25,7 @@ from worldstate.frontend.health.order_check import sharpness_gains
 from worldstate.frontend.stream import FrontEnd
 from worldstate.operations.recordings.channel_report import HealthLog
 from worldstate.simulation import draw_settings, simulate_recording, site
-from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.traffic import traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.writing import write_stream
 
 RATE = 6000

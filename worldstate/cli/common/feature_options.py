@@ -27,12 +27,12 @@ def read_beside(arguments: argparse.Namespace, table: "FeatureTable") -> "Simula
 
     from worldstate.adapters.datasets.feature_table import read_features
     from worldstate.commissioning.heard_stream import HeardStream
-    from worldstate.commissioning.open_field import (
+    from worldstate.commissioning.simulated_windows import (
         N_OPEN,
+        learned_beside,
         open_field_features,
         open_field_windows,
     )
-    from worldstate.commissioning.stream_windows import learned_beside
     from worldstate.frontend.array.microphone_array import MicrophoneArray
     from worldstate.frontend.array.ovad_array import ovad_array
     from worldstate.operations.training.site_references import simulated_beside

@@ -157,9 +157,8 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.simulation.scene.junction import site
     from worldstate.simulation.scene.presets import preset
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, rate_for
-    from worldstate.simulation.scene.sound_kinds import SIGNALS
-    from worldstate.simulation.stream.settings import StreamSettings
-    from worldstate.simulation.stream.traffic import traffic_named
+    from worldstate.simulation.scene.sound_settings import SIGNALS
+    from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
     band = arguments.bandwidth
     return StreamSettings(

@@ -23,8 +23,8 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.commissioning.heard_stream import HeardStream, vehicle_rows, vehicle_table
 from worldstate.commissioning.plan import junction_named
+from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import alarm_outcomes, approaches
-from worldstate.commissioning.stream_labels import stream_truth
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.values import wrap_angle
@@ -35,8 +35,7 @@ from worldstate.operations.recordings.hop_stream import HOP_S
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.settings import rate_for
 from worldstate.simulation.stream.drawn_stream import draw_stream
-from worldstate.simulation.stream.settings import StreamSettings
-from worldstate.simulation.stream.traffic import traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.smoothing.learned_edge import LearnedEdge
 from worldstate.smoothing.learned_street import LearnedStreet, context_of
 from worldstate.state.context import Context
