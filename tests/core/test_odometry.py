@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.files.odometry_file import read_odometry
-from worldstate.belief.ego_motion import EgoBelief, driven
+from worldstate.belief.kinematics.cartesian import EgoBelief, driven
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.measurement import Position, PositionScan

@@ -10,8 +10,16 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
-from worldstate.belief.kinematics.motion import MotionBelief, predict, relax, update_approach, update_azimuth
-from worldstate.belief.kinematics.polar import jacobian, process_noise, propagate
+from worldstate.belief.kinematics.motion import (
+    MotionBelief,
+    jacobian,
+    predict,
+    process_noise,
+    propagate,
+    relax,
+    update_approach,
+    update_azimuth,
+)
 from worldstate.ground.values import wrap_angle
 
 states = st.tuples(st.floats(-3.0, 3.0), st.floats(-0.8, 0.8), st.floats(-0.8, 0.8), st.floats(1.5, 4.5)).map(

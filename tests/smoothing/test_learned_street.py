@@ -7,7 +7,7 @@ import pytest
 
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.smoothing.learned_edge import LearnedEdge
+from worldstate.smoothing.learned_edge import LearnedEdge, Moments, NormalPrior
 from worldstate.smoothing.learned_street import (
     DAY_S,
     LearnedStreet,
@@ -18,7 +18,6 @@ from worldstate.smoothing.learned_street import (
     with_looks,
     with_pass,
 )
-from worldstate.smoothing.running_moments import Moments, NormalPrior
 from worldstate.state.context import Context, Rates
 
 LEFT, RIGHT = math.radians(24.0), math.radians(-29.0)

@@ -10,7 +10,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Approach, Bearing, Position
 from worldstate.smoothing import AngularHeight, PastEdge, Range, ReflectedBearing, SmoothingSettings
 from worldstate.smoothing import factors as f
-from worldstate.smoothing.vector_factor import key_of, vector_factor
+from worldstate.smoothing.factors import key_of, vector_factor
 
 SETTINGS = SmoothingSettings(robust_k=1e6, edge_std_rad=0.2)
 X, Y, EGO, EDGE, WALL, TALL = (key_of(kind, n) for n, kind in enumerate("xxecwh"))

@@ -8,10 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from worldstate.abduction.road_users import SEEN_AS
-from worldstate.ground.typing import BoolArray, FloatArray, IntArray
-from worldstate.ground.values import wrap_angle
-from worldstate.measurement.measurement import Sighting
-from worldstate.measurement.sector import Sector
+from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
+from worldstate.measurement import Sector, Sighting
 
 from .settings import FilterSettings
 from .site_geometry import SiteGeometry, normal_share

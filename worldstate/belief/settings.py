@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass, fields
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import Probability
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.values import wrap_angle
-from worldstate.measurement.measurement import CameraLook, Look
-from worldstate.measurement.sector import Sector
+from worldstate.measurement import CameraLook, Look, Sector
 
 from .settings import FilterSettings
 

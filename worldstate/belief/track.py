@@ -10,8 +10,7 @@ import numpy as np
 
 from worldstate.abduction.road_users import ClassShares
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, predict_place
-from worldstate.belief.kinematics.motion import MotionBelief, predict, relax
-from worldstate.belief.kinematics.polar import AZIMUTH_RATE
+from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief, predict, relax
 from worldstate.ground.serialisation import ADDED, FLAT, Count, Keys, Probability
 from worldstate.ground.values import Answer
 

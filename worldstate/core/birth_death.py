@@ -1,17 +1,21 @@
-"""Birth and death of hidden entities, one at most on each side; entities that have become one."""
+"""Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 
 from worldstate.abduction.road_users import UNKNOWN
+from worldstate.belief.association import Association
 from worldstate.belief.explanation import ExplanationBelief
-from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
+from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
-from worldstate.belief.track import Track, entity_id, heard_as
+from worldstate.belief.track import Track, entity_id, heard_as, hidden_share
 from worldstate.ground.values import NANOSECONDS_PER_SECOND, nanoseconds, wrap_angle
 from worldstate.measurement.measurement import Measurement
+from worldstate.state import Event
+from worldstate.state.entity import EventKind
 
 from .memory import Memory
 
@@ -141,4 +145,99 @@ def _born(k: int, number: int, existence: float, measurement: Measurement, site:
         created_ns=measurement.stamp_ns,
         updated_ns=measurement.stamp_ns,
         was_hidden=True,
+    )
+
+
+# Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
+MOST_EVENTS = 64
+# A window of sound, and the second for which an advisory holds an entity that is no longer heard.
+_HALF_NS = nanoseconds(2.0)
+HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
+
+
+def published(tracks: tuple[Track, ...], settings: FilterSettings) -> tuple[Track, ...]:
+    """Return the tracks that a snapshot names."""
+    # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
+    return tuple(one for one in tracks if not one.place or one.existence >= settings.delete_existence)
+
+
+def events_between(
+    before: tuple[Track, ...], after: tuple[Track, ...], stamp_ns: int, into: Mapping[str, str]
+) -> tuple[Event, ...]:
+    """Return what became of every entity, those that were there before first; `into` by merged ids."""
+    known, left = {track.id: track for track in before}, {track.id: track for track in after}
+    kinds = {name: "merged" if name in into else _became(one, left.get(name)) for name, one in known.items()}
+    kinds |= {name: "born" for name in left if name not in known}
+    events = (Event(stamp_ns, kind, name, into.get(name)) for name, kind in kinds.items() if kind is not None)
+    return tuple(events)[:MOST_EVENTS]
+
+
+def halves_of_one(before: Memory, after: Memory) -> dict[str, str]:
+    """Return as whom those go on who were heard on the other side of one that has just come into view.
+
+    Within two seconds of that they have ended, or sound as if they were in view.
+    """
+    still = {one.id for one in after.tracks if one.detected or hidden_share(one, after.sides) >= HIDDEN}
+    halves = [one for one in before.tracks if not one.detected and one.id not in still]
+    sides = {k for k, ns in enumerate(after.handover_ns) if ns and after.stamp_ns - ns <= _HALF_NS}
+    seen = [one for one in after.tracks if one.seen and one.was_hidden]
+    latest = max(seen, key=lambda one: one.last_seen_ns or 0, default=None)
+    return {} if latest is None else {one.id: latest.id for one in halves if sides - {one.side}}
+
+
+def _became(before: Track, after: Track | None) -> EventKind | None:
+    if after is None:
+        return "died"
+    if before.seen != after.seen:
+        return "handed_over" if after.seen else "hidden_again"
+    return "coasting" if after.seen and before.answer == "visible" != after.answer else None
+
+
+def after_look(
+    memory: Memory, tracks: Sequence[Track], whose: Association, stamp_ns: int, site: SiteGeometry
+) -> Memory:
+    """Return the memory with the tracks after a look: those of before in their order, then the new ones."""
+    before, settings = memory.tracks, site.settings
+    handed_over = whose.handed_over(before, tracks[: len(before)], settings)
+    explanation = memory.explanation
+    for side, residual in handed_over.items():
+        explanation = explanation.emerge(side, residual)
+    # First seen near an edge, it came past it unheard.
+    unheard = {
+        track.side
+        for track in tracks[len(before) :]
+        if track.seen and track.moving
+        if site.sides[track.side].distance_rad(track.motion.azimuth_rad) <= 2.0 * settings.edge_std_rad
+    }
+    memory = replace(memory, tracks=surviving(tracks, settings), explanation=explanation)
+    return past_edges(memory, handed_over, {*handed_over, *unheard}, stamp_ns)
+
+
+def past_edges(
+    memory: Memory, handed_over: Mapping[int, float], emerged: Collection[int], stamp_ns: int
+) -> Memory:
+    """Return the memory after vehicles came past the edges of some sides.
+
+    `handed_over` is the share of P(hidden) that is left on the sides on which a vehicle was believed hidden.
+    """
+    # The lagged beliefs are what the next windows build on: they have to know of the hand-over, too.
+    lag = memory.lag
+    for side, residual in handed_over.items():
+        lag = lag.map(partial(ExplanationBelief.emerge, direction=side, residual=residual))
+    before = enumerate(memory.handover_ns)
+    return replace(
+        memory,
+        lag=lag,
+        handover_ns=tuple(stamp_ns if k in handed_over else before_ns for k, before_ns in before),
+        sequence=memory.sequence and memory.sequence.emerged(emerged, stamp_ns),
+    )
+
+
+def surviving(tracks: Sequence[Track], settings: FilterSettings) -> tuple[Track, ...]:
+    """Return the tracks without seen entities of too little existence or too uncertain azimuth."""
+    least, widest_rad = settings.delete_existence, settings.lost_std_rad
+    return tuple(
+        track
+        for track in tracks
+        if not track.seen or (track.existence >= least and track.motion.azimuth_std_rad <= widest_rad)
     )

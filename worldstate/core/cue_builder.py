@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
-from worldstate.belief.announced import announced
+from worldstate.belief.hidden_bearing import announced
 from worldstate.state import Advisory, EvidenceTerms, RiskCue, SensorHealth
 
 from .birth_death import hidden_on

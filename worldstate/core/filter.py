@@ -1,10 +1,10 @@
-"""The filter: predict and update of the whole world-state."""
+"""The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Sized
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,19 +16,23 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.explanation import ExplanationBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.core import step
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import decode, encode
-from worldstate.ground.values import NotUsable, integer_ns, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, CameraLook, Look, Measurement, Sighting
-from worldstate.measurement.odometry import Odometry
-from worldstate.measurement.position import PositionScan
+from worldstate.ground import InvalidArgumentError, NotUsable, in_range, integer_ns, nanoseconds
+from worldstate.ground.serialisation import ADDED, Layout, decode, encode
+from worldstate.measurement import (
+    Approach,
+    Bearing,
+    CameraLook,
+    Look,
+    Measurement,
+    Odometry,
+    PositionScan,
+    Sighting,
+)
 from worldstate.state import Context, WorldState
 
-from .checkpoint import FilterRecord, LagRecord
+from .birth_death import published
 from .cue_builder import cues_of, hidden_risks
-from .entity_events import published
-from .fixed_lag import FixedLag, Timed, restored
+from .fixed_lag import FixedLag, LagRecord, Timed, restored
 from .memory import Memory, first_memory, priors_of
 from .relations import relations_at
 from .snapshot_builder import ego_of, entities_of, searched_views, sensors_of
@@ -265,8 +269,7 @@ class WorldFilter:
         world = cls(kept.context, kept.policy, kept.settings, kept.start_ns, latest)
         if past is None:
             return world
-        lag = restored(latest, past.base, past.measurements, past.delivery, past.late_since_ns)
-        world = replace(world, lag=lag)
+        world = replace(world, lag=restored(latest, past, world._step))
         return world if past.stamp_ns <= latest.stamp_ns else world.predict_to(past.stamp_ns)
 
     @cached_property
@@ -280,6 +283,51 @@ class WorldFilter:
     @cached_property
     def _model(self) -> step.FilterModel:
         return step.FilterModel(self.context, self.policy, step.site_geometry_of(self.context, self.settings))
+
+
+@dataclass(frozen=True, slots=True)
+class FilterRecord:
+    """All of a filter, as it is written."""
+
+    LAYOUT: ClassVar = Layout("worldstate.Filter", "2.4.0")
+
+    context: Context
+    policy: CueingPolicy
+    settings: FilterSettings
+    start_ns: int
+    memory: Memory
+    past: LagRecord | None = field(default=None, metadata=ADDED)
+
+    def __post_init__(self) -> None:
+        self._check(self.memory)
+        if self.past is not None:
+            self._check(self.past.base)
+
+    def _check(self, memory: Memory) -> None:
+        k = len(self.context.directions)
+        beliefs = [belief.log_probabilities for _, belief in memory.lag.beliefs]
+        lengths: dict[str, tuple[Sequence[Sized], int]] = {
+            "log_explanations": ([memory.explanation.log_probabilities, *beliefs], 2 * k + 2),
+            "trail.heard": ([heard.log_likelihoods for heard in memory.lag.heard], k + 2),
+            "births": ([memory.births], k),
+            "handover_ns": ([memory.handover_ns], k),
+            "advised_ns": ([memory.advised_ns], k),
+            "instant": ([memory.instant.log_probabilities] if memory.instant else [], k + 2),
+        }
+        for name, (rows, length) in lengths.items():
+            for row in rows:
+                if len(row) != length:
+                    raise InvalidArgumentError(f"memory.{name}: expected {length} numbers, got {len(row)}")
+        if memory.sequence is not None:
+            memory.sequence.check()
+        if not beliefs:
+            raise InvalidArgumentError("memory.trail.beliefs: expected at least one")
+        if any(one.run > self.policy.sustain_hops for one in memory.rules):
+            raise InvalidArgumentError("memory.rules: expected runs within the policy's rule")
+        if any(side >= k for one in memory.rules for side in one.announced):
+            raise InvalidArgumentError("memory.rules: expected known sides")
+        if any(track.side >= k for track in memory.tracks):
+            raise InvalidArgumentError("memory.tracks: expected known sides")
 
 
 def _checked(measurement: Timed, context: Context) -> Timed:

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 from worldstate.ground.values import nanoseconds
-from worldstate.measurement.measurement import Measurement
-from worldstate.measurement.odometry import Odometry
-from worldstate.measurement.position import PositionScan
+from worldstate.measurement import Measurement, Odometry, PositionScan
 from worldstate.state import Delivery
 
 from .memory import Memory
@@ -29,10 +27,10 @@ Step: TypeAlias = Callable[[Memory, Timed], Memory]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
-    """A measurement, and the memory that it was added to; None where that is still to be computed."""
+    """A measurement, and the memory that it was added to."""
 
     measurement: Timed
-    before: Memory | None
+    before: Memory
 
     @property
     def key(self) -> tuple[int, str]:
@@ -52,8 +50,7 @@ class FixedLag:
     @property
     def base(self) -> Memory:
         """The memory before the first arrival, from which all others follow."""
-        first = self.arrivals[0].before if self.arrivals else None
-        return first or self.latest
+        return self.arrivals[0].before if self.arrivals else self.latest
 
     def add(self, measurement: Timed, step: Step) -> "FixedLag | None":
         """Return the buffer with one more measurement; None where all have been too late for a second."""
@@ -62,34 +59,17 @@ class FixedLag:
         if at < len(keys) and keys[at] == (stamp_ns, measurement.source):
             delivery = replace(self.delivery, repeated=self.delivery.repeated + 1)
             return replace(self, delivery=delivery)
-        oldest_ns = self.latest.stamp_ns - LAG_NS
-        if self.arrivals and self.arrivals[0].before is not None:
-            oldest_ns = max(oldest_ns, self.arrivals[0].before.stamp_ns)
-        if stamp_ns < oldest_ns or (not self.arrivals and stamp_ns < self.latest.stamp_ns):
+        if stamp_ns < max(self.latest.stamp_ns - LAG_NS, self.base.stamp_ns):
             return self._too_late(stamp_ns)
-        memory, known = self.latest, self.arrivals
-        if at < len(keys):
-            known = self._computed(step)
-            memory = known[at].before or self.latest
-        moved = [one.measurement for one in known[at:]]
-        kept = list(known[:at])
+        memory = self.arrivals[at].before if at < len(keys) else self.latest
+        moved = [one.measurement for one in self.arrivals[at:]]
+        kept = list(self.arrivals[:at])
         for one in (measurement, *moved):
             kept.append(Arrival(one, memory))
             memory = step(memory, one)
         delivery = replace(self.delivery, replayed=self.delivery.replayed + bool(moved))
-        return FixedLag(memory, _recent(kept, memory.stamp_ns - LAG_NS), delivery)
-
-    def _computed(self, step: Step) -> tuple[Arrival, ...]:
-        """Return the arrivals with the memory before each: those of a checkpoint know only the first."""
-        found: list[Arrival] = []
-        for one in self.arrivals:
-            before = one.before
-            if before is None:
-                last = found[-1]
-                assert last.before is not None
-                before = step(last.before, last.measurement)
-            found.append(Arrival(one.measurement, before))
-        return tuple(found)
+        oldest_ns = memory.stamp_ns - LAG_NS
+        return FixedLag(memory, tuple(one for one in kept if one.measurement.stamp_ns >= oldest_ns), delivery)
 
     def _too_late(self, stamp_ns: int) -> "FixedLag | None":
         since_ns = stamp_ns if self.late_since_ns is None else self.late_since_ns
@@ -99,20 +79,21 @@ class FixedLag:
         return replace(self, delivery=delivery, late_since_ns=min(since_ns, stamp_ns))
 
 
-def _recent(arrivals: list[Arrival], oldest_ns: int) -> tuple[Arrival, ...]:
-    """Return the arrivals from a time on, and those before it that the memory must be computed from."""
-    first = next(
-        (i for i, one in enumerate(arrivals) if one.measurement.stamp_ns >= oldest_ns), len(arrivals)
-    )
-    while 0 < first < len(arrivals) and arrivals[first].before is None:
-        first -= 1
-    return tuple(arrivals[first:])
+@dataclass(frozen=True, slots=True)
+class LagRecord:
+    """Measurements of the last two seconds, and the memory before the first of them."""
+
+    stamp_ns: int  # Of the belief, predicted since the last measurement
+    base: Memory
+    measurements: tuple[Timed, ...]
+    delivery: Delivery
+    late_since_ns: int | None
 
 
-def restored(
-    latest: Memory, base: Memory, measurements: tuple[Timed, ...], delivery: Delivery, since_ns: int | None
-) -> FixedLag:
-    """Return the buffer of a checkpoint: the memory before the first measurement, and after the last."""
-    befores = (base, *[None] * max(len(measurements) - 1, 0))
-    arrivals = tuple(Arrival(*pair) for pair in zip(measurements, befores, strict=False))
-    return FixedLag(latest, arrivals, delivery, since_ns)
+def restored(latest: Memory, past: LagRecord, step: Step) -> FixedLag:
+    """Return the buffer of a checkpoint, with the memory before each of its measurements computed anew."""
+    arrivals, memory = list[Arrival](), past.base
+    for one in past.measurements:
+        arrivals.append(Arrival(one, memory))
+        memory = step(memory, one)
+    return FixedLag(latest, tuple(arrivals), past.delivery, past.late_since_ns)

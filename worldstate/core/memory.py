@@ -11,9 +11,8 @@ from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.cueing.adaptive_threshold import AdaptiveThreshold
 from worldstate.abduction.posterior import Posterior
 from worldstate.abduction.signature.domain_guard import DomainVerdict
-from worldstate.belief.belief_lag import BeliefLag
-from worldstate.belief.ego_motion import EgoBelief
-from worldstate.belief.explanation import AsLogs, ExplanationBelief, HiddenBelief
+from worldstate.belief.explanation import AsLogs, BeliefLag, ExplanationBelief, HiddenBelief
+from worldstate.belief.kinematics.cartesian import EgoBelief
 from worldstate.belief.track import Track
 from worldstate.ground.serialisation import ADDED, Count, Keys, written_as
 from worldstate.ground.values import NotUsable

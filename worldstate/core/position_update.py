@@ -15,7 +15,7 @@ from worldstate.belief.kinematics.cartesian import (
     update_bearing,
     update_position,
 )
-from worldstate.belief.kinematics.polar import AZIMUTH, LOG_RANGE
+from worldstate.belief.kinematics.motion import AZIMUTH, LOG_RANGE
 from worldstate.belief.site_geometry import SiteGeometry, normal_share
 from worldstate.belief.track import (
     Track,
@@ -26,11 +26,10 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import NANOSECONDS_PER_SECOND, wrap_angle
+from worldstate.ground import NANOSECONDS_PER_SECOND, FloatArray, wrap_angle
 from worldstate.measurement.position import Position, PositionScan, SearchedSector
 
-from .hand_over import after_look
+from .birth_death import after_look
 from .memory import Memory
 
 # m/s, of a velocity that was not measured: wide, so that it decides nothing.

@@ -9,8 +9,7 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_model import STATED
 from worldstate.belief.site_geometry import normal_share
 from worldstate.belief.track import Track, hidden_share
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import nanoseconds
+from worldstate.ground import FloatArray, nanoseconds
 from worldstate.state import Context, Relation
 from worldstate.state.entity import EGO
 

@@ -23,11 +23,8 @@ from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.explanation import HiddenBelief
-from worldstate.ground.checks import finite_array
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, seconds
 from worldstate.ground.serialisation import ADDED, Probability
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
 from worldstate.measurement.measurement import Look, Measurement
 from worldstate.state import Context
 

@@ -8,17 +8,23 @@ import numpy as np
 
 from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import UNKNOWN
-from worldstate.belief.announced import time_to_visible
-from worldstate.belief.ego_motion import EgoBelief
 from worldstate.belief.explanation import HiddenBelief
-from worldstate.belief.hidden_bearing import hidden_bearing
-from worldstate.belief.kinematics.motion import FARTHEST_M, NEAREST_M, MotionBelief
-from worldstate.belief.kinematics.polar import AZIMUTH, AZIMUTH_RATE, LEAST_Q, LOG_RANGE, RADIAL_RATE
+from worldstate.belief.hidden_bearing import hidden_bearing, time_to_visible
+from worldstate.belief.kinematics.cartesian import EgoBelief
+from worldstate.belief.kinematics.motion import (
+    AZIMUTH,
+    AZIMUTH_RATE,
+    FARTHEST_M,
+    LEAST_Q,
+    LOG_RANGE,
+    NEAREST_M,
+    RADIAL_RATE,
+    MotionBelief,
+)
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import PARKED_ACCELERATION, Track, hidden_share
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
+from worldstate.ground import FloatArray, seconds
 from worldstate.state import Classification, Context, Entity, SearchedView, SensorHealth, Visibility
 from worldstate.state.sensor import Ego
 

@@ -16,26 +16,28 @@ from worldstate.abduction.posterior import posterior_of
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.abduction.signature.domain_guard import Foreign
-from worldstate.belief.announced import announced
-from worldstate.belief.belief_lag import SourceEvidence
-from worldstate.belief.ego_motion import EgoBelief, corrected, driven
-from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief
-from worldstate.belief.hidden_bearing import hidden_motion
+from worldstate.belief.explanation import LOG_FLOOR, ExplanationBelief, SourceEvidence
+from worldstate.belief.hidden_bearing import announced, hidden_motion
+from worldstate.belief.kinematics.cartesian import EgoBelief, corrected, driven
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.track import Track, hidden_share, predict_tracks, turned
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
-from worldstate.measurement.measurement import CameraLook, Measurement
-from worldstate.measurement.odometry import Odometry
-from worldstate.measurement.position import PositionScan
-from worldstate.measurement.sector import Sector
+from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sector
 from worldstate.state import Context
 from worldstate.state.context import seen_from
 
 from .acoustic_update import acoustic_update
-from .birth_death import birth_death, merged_tracks
-from .entity_events import HIDDEN, events_between, halves_of_one, published
-from .hand_over import past_edges, surviving
+from .birth_death import (
+    HIDDEN,
+    birth_death,
+    events_between,
+    halves_of_one,
+    merged_tracks,
+    past_edges,
+    published,
+    surviving,
+)
 from .memory import CountedLook, Instant, Memory, SourceRule, priors_of
 from .position_update import position_update
 from .relations import relations_at

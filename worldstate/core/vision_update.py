@@ -11,8 +11,13 @@ import numpy as np
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.belief.association import associated
 from worldstate.belief.kinematics.cartesian import update_bearing
-from worldstate.belief.kinematics.motion import MotionBelief, update_azimuth
-from worldstate.belief.kinematics.polar import AZIMUTH_RATE, LOG_RANGE, RADIAL_RATE
+from worldstate.belief.kinematics.motion import (
+    AZIMUTH_RATE,
+    LOG_RANGE,
+    RADIAL_RATE,
+    MotionBelief,
+    update_azimuth,
+)
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import (
@@ -24,12 +29,10 @@ from worldstate.belief.track import (
     merged,
     relabelled,
 )
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
-from worldstate.measurement.measurement import CameraLook, Look, Measurement, Sighting
-from worldstate.measurement.sector import Sector
+from worldstate.ground import FloatArray, seconds
+from worldstate.measurement import CameraLook, Look, Measurement, Sector, Sighting
 
-from .hand_over import after_look
+from .birth_death import after_look
 from .memory import Memory
 
 # Of (theta_dot rad/s, rho 1/s) at the first sighting: a car at 50 km/h passing at 15 m has .9 rad/s, two

@@ -1,10 +1,12 @@
 from .measurement import Approach as Approach
 from .measurement import Bearing as Bearing
+from .measurement import CameraLook as CameraLook
 from .measurement import CoEvidenceChannel as CoEvidenceChannel
 from .measurement import Look as Look
 from .measurement import Measurement as Measurement
 from .measurement import MeasurementAdapter as MeasurementAdapter
 from .measurement import Sighting as Sighting
+from .odometry import Odometry as Odometry
 from .position import Position as Position
 from .position import PositionScan as PositionScan
 from .position import SearchedSector as SearchedSector

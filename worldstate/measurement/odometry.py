@@ -3,9 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from worldstate.ground.checks import in_range, named
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import integer_ns
+from worldstate.ground import InvalidArgumentError, in_range, integer_ns, named
 
 _FARTHEST_M = 1e6
 _MOST = {"speed_mps": 100.0, "yaw_rate_rad_s": 10.0, "speed_std_mps": 100.0, "yaw_rate_std_rad_s": 10.0}

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.road_users import ClassShares
-from worldstate.ground.checks import finite_array, in_range, named
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import integer_ns, nanoseconds
+from worldstate.ground import InvalidArgumentError, finite_array, in_range, integer_ns, named, nanoseconds
 
 from .sector import Sector
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import wrap_angle
+from worldstate.ground import FloatArray, wrap_angle
 
 from .measurement import Side
 

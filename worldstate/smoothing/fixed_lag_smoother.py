@@ -10,27 +10,25 @@ import numpy as np
 
 from worldstate.belief.kinematics.cartesian import CartesianBelief
 from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.ground.checks import finite_array, in_range
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
-from worldstate.measurement.measurement import Approach, Bearing
-from worldstate.measurement.position import Position
+from worldstate.ground import FloatArray, InvalidArgumentError, finite_array, in_range, seconds
+from worldstate.measurement import Approach, Bearing, Position
 from worldstate.smoothing import factors as f
 
+from .factors import CORNER, EGO, ENTITY, HEIGHT, WALL, Factor, key_of
 from .geometry import moved, polar
 from .graph import FactorGraph, Refined
 from .observations import (
     AngularHeight,
     EgoStep,
+    FirstSight,
     Observation,
     PastEdge,
     Range,
     ReflectedBearing,
+    SmoothedTrack,
     SmoothingSettings,
+    crossing,
 )
-from .smoothed_track import FirstSight, SmoothedTrack, crossing
-from .vector_factor import CORNER, EGO, ENTITY, HEIGHT, WALL, Factor, key_of
 
 # Of (theta, theta_dot, rho) of an entity that nobody has told anything of: anywhere, passing or closing at
 # up to the rates of a vehicle some ten metres away.

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from worldstate.belief.kinematics.polar import LEAST_Q
+from worldstate.belief.kinematics.motion import LEAST_Q
 from worldstate.ground.typing import FloatArray
 
 # Nobody comes nearer to the ego than this; at 0 bearings have no derivative.

@@ -7,8 +7,8 @@ import numpy as np
 
 from worldstate.ground.typing import FloatArray
 
+from .factors import CORNER, EGO, WALL, Factor, kind_of
 from .observations import SmoothingSettings
-from .vector_factor import CORNER, EGO, WALL, Factor, kind_of
 
 # Updates between two sums of what marginalised entities left: a minute at ten a second.
 _SUMMED_EVERY = 600

@@ -9,13 +9,11 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 from worldstate.abduction.sequence.side_patterns import PassSound, SidePatterns
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import ADDED, Layout
 from worldstate.state.context import Context, Occluder, Rates
 
-from .learned_edge import LearnedEdge
-from .running_moments import Moments, NormalPrior
+from .learned_edge import LearnedEdge, Moments, NormalPrior
 
 Arm = Literal["left", "right"]
 ARMS: tuple[Arm, Arm] = ("left", "right")

@@ -14,16 +14,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from worldstate.belief.kinematics.cartesian import CartesianBelief, constant_velocity, polar_motion
-from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.belief.kinematics.polar import AZIMUTH
+from worldstate.belief.kinematics.motion import AZIMUTH, MotionBelief
+from worldstate.ground import FloatArray, seconds, wrap_angle
 from worldstate.ground.extras import optional
-from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing
 
 from .geometry import cartesian
-from .observations import AngularHeight, Observation
-from .smoothed_track import FirstSight, SmoothedTrack, crossing
+from .observations import AngularHeight, FirstSight, Observation, SmoothedTrack, crossing
 
 # m^2/s^3; hidden places of 259 simulated passes are off by 1.87 m with it, and by 1.34 m with robust losses.
 _ACCELERATION_PSD = 1.0

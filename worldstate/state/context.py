@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
 _LEAST_STD_RAD, _FASTEST_HZ, _FASTEST_EGO_MPS = 1e-4, 100.0, 100.0

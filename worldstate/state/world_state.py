@@ -6,10 +6,9 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from worldstate.abduction.signature.domain_guard import DomainVerdict
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, NotUsable
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
-from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context

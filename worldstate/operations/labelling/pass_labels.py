@@ -11,9 +11,14 @@ from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 from worldstate.smoothing.fixed_lag_smoother import FixedLagSmoother
-from worldstate.smoothing.observations import AngularHeight, Observation, SmoothingSettings
+from worldstate.smoothing.observations import (
+    AngularHeight,
+    FirstSight,
+    Observation,
+    SmoothedTrack,
+    SmoothingSettings,
+)
 from worldstate.smoothing.rts import rts_first_sight, rts_track
-from worldstate.smoothing.smoothed_track import FirstSight, SmoothedTrack
 from worldstate.state.context import blind_corner
 
 from .box_tracks import BoxTrack

@@ -12,7 +12,7 @@ from worldstate.ground.typing import BoolArray
 from worldstate.operations.figure_style import BLUE, GREEN, ORANGE, figure_file, legend_beside
 from worldstate.operations.recordings.true_track import TrueTrack
 from worldstate.smoothing.learned_street import LearnedStreet, context_of, with_pass
-from worldstate.smoothing.smoothed_track import SmoothedTrack
+from worldstate.smoothing.observations import SmoothedTrack
 from worldstate.state.context import Occluder
 
 from .pass_labels import PassLabel

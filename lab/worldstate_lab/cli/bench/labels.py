@@ -28,7 +28,7 @@ from worldstate.operations.labelling.pass_labels import PassLabel, label_passes,
 from worldstate.operations.labelling.street_figure import draw_passes, draw_track
 from worldstate.operations.recordings.true_track import TrueTrack
 from worldstate.simulation.scene.kinds import vehicle_kind
-from worldstate.smoothing.smoothed_track import SmoothedTrack
+from worldstate.smoothing.observations import SmoothedTrack
 from worldstate_lab.passes.stream_camera import stream_detections
 from worldstate_lab.passes.world_exam import EVERYBODY
 
