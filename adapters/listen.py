@@ -29,9 +29,8 @@ from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.acoustic_domain import array_of, states_budget
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint
-from worldstate.adapters.files.engine_file import EngineSpeed, read_engine
 from worldstate.adapters.files.model_file import Model, read_model
-from worldstate.adapters.files.odometry_file import OdometryLog
+from worldstate.adapters.files.odometry_file import EngineSpeed, OdometryLog, read_engine
 from worldstate.core.filter import WorldFilter
 from worldstate.core.fixed_lag import Timed
 from worldstate.frontend.array.microphone_array import MicrophoneArray

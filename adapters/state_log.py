@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from worldstate.adapters.export.mcap_file import read_snapshot_lines
-from worldstate.adapters.files.json_file import refused_as_file
 from worldstate.adapters.files.states_file import state_lines
+from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.adapters.ros.bag_reader import is_bag
 from worldstate.adapters.ros.state_bag import bag_snapshot_lines
 from worldstate.ground.errors import InputFileError

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from worldstate.adapters.files.json_file import read_json, refused_as_file
-from worldstate.adapters.files.text_file import read_text
+from worldstate.adapters.files.text_file import read_json, read_text, refused_as_file
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import Check, Probability, decode
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.adapters.files.text_file import read_json, refused_as_file
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import Count, Probability, decode

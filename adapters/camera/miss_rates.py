@@ -13,7 +13,7 @@ from scipy.special import betaincinv
 from worldstate.abduction.absence import MissRateTable
 from worldstate.abduction.cueing.isotonic_grid import isotonic_grid
 from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.json_file import read_record
+from worldstate.adapters.files.text_file import read_record
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, Layout, encode

@@ -17,8 +17,7 @@ import numpy as np
 from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.files.atomic import atomic_path, write_text
-from worldstate.adapters.files.csv_rows import number, read_rows
-from worldstate.adapters.files.json_file import read_record
+from worldstate.adapters.files.text_file import number, read_record, read_rows
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray

@@ -13,7 +13,7 @@ from typing import Literal, final, get_args
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
-from worldstate.adapters.files.csv_rows import read_rows
+from worldstate.adapters.files.text_file import read_rows
 from worldstate.ground.errors import InputFileError
 
 from .ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME

@@ -13,7 +13,7 @@ from worldstate.core.filter import WorldFilter
 from worldstate.ground.serialisation import decode, encode
 
 from .atomic import write_text
-from .json_file import read_json, refused_as_file
+from .text_file import read_json, refused_as_file
 
 T = TypeVar("T")
 

@@ -8,7 +8,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode
 from worldstate.state.context import Context, Occluder, Priors, Rates, corner_at, open_side
 
-from .json_file import read_json, refused_as_file
+from .text_file import read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)

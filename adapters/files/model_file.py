@@ -17,7 +17,7 @@ from worldstate.abduction.signature.model_domain import ModelDomain
 from worldstate.ground.serialisation import ADDED, Layout, Via, decode, encode
 
 from .atomic import write_text
-from .json_file import read_json, refused_as_file
+from .text_file import read_json, refused_as_file
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,18 +1,23 @@
-"""Odometry of a drive: read from CSV, or taken out of a bag."""
+"""Odometry of a drive and speed of its engine, from CSV."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import ADDED
+from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.odometry import EgoPose, Odometry
 
-from .csv_rows import number, read_rows
+from .text_file import number, read_rows, refused_as_file
 
 # Odometry of a standing vehicle scatters by some centimetres a second.
 STANDING_MPS = 0.2
-_POSE = ("x_m", "y_m", "yaw_rad")
+# What a front-end follows of an engine, Hz.
+LOWEST_HZ, HIGHEST_HZ = 10.0, 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +43,28 @@ class OdometryLog:
         return max(abs(one.speed_mps) for one in self.told) > STANDING_MPS
 
 
+@dataclass(frozen=True, slots=True)
+class OdometryRecord:
+    """One line of an odometry file, or one datagram, without its time."""
+
+    speed_mps: float
+    yaw_rate_rad_s: float = field(default=0.0, metadata=ADDED)
+    x_m: float | None = field(default=None, metadata=ADDED)
+    y_m: float | None = field(default=None, metadata=ADDED)
+    yaw_rad: float | None = field(default=None, metadata=ADDED)
+
+    def at(self, stamp_ns: int) -> Odometry:
+        """Return it as a measurement."""
+        return Odometry("odometry", stamp_ns, self.speed_mps, self.yaw_rate_rad_s, pose=self._pose())
+
+    def _pose(self) -> EgoPose | None:
+        if self.x_m is None and self.y_m is None and self.yaw_rad is None:
+            return None
+        if self.x_m is None or self.y_m is None or self.yaw_rad is None:
+            raise InvalidArgumentError("odometry: expected x_m, y_m and yaw_rad together")
+        return EgoPose((self.x_m, self.y_m), self.yaw_rad)
+
+
 def read_odometry(path: Path | str) -> OdometryLog:
     r"""Read CSV: time_s, speed_mps; optional yaw_rate_rad_s, and x_m, y_m, yaw_rad in the map.
 
@@ -54,26 +81,60 @@ def read_odometry(path: Path | str) -> OdometryLog:
     ...     read_odometry(Path(folder) / "ego.csv").told[0].yaw_rate_rad_s
     0.1
     """
-    name = Path(path)
-    rows = read_rows(name, ("time_s", "speed_mps"), ("yaw_rate_rad_s", *_POSE))
-    told = []
-    for line, row in rows:
+    name, told = Path(path), []
+    for line, row in read_rows(name, ("time_s", "speed_mps"), ("yaw_rate_rad_s", "x_m", "y_m", "yaw_rad")):
         known = {column: number(name, line, row, column) for column in row}
-        try:
-            told.append(_odometry(known))
-        except InvalidArgumentError as error:
-            raise InputFileError(name, f"line {line}: {error}") from error
-    try:
+        stamp_ns = nanoseconds(known.pop("time_s"))
+        with refused_as_file(name, f"line {line}: "):
+            told.append(OdometryRecord(**known).at(stamp_ns))
+    with refused_as_file(name):
         return OdometryLog(tuple(told))
-    except InvalidArgumentError as error:
-        raise InputFileError(name, str(error)) from error
 
 
-def _odometry(row: dict[str, float]) -> Odometry:
-    pose = None
-    if any(column in row for column in _POSE):
-        if missing := [column for column in _POSE if column not in row]:
-            raise InvalidArgumentError(f"expected {', '.join(missing)} beside the rest of the pose")
-        pose = EgoPose((row["x_m"], row["y_m"]), row["yaw_rad"])
-    stamp_ns, turning = nanoseconds(row["time_s"]), row.get("yaw_rate_rad_s", 0.0)
-    return Odometry("odometry", stamp_ns, row["speed_mps"], turning, pose=pose)
+@dataclass(frozen=True, slots=True, eq=False)
+class EngineSpeed:
+    """Fundamental of the engine over time, linear in between.
+
+    Examples
+    --------
+    >>> speed = EngineSpeed(np.array([0.0, 10.0]), np.array([30.0, 60.0]))
+    >>> speed.at(5.0), speed.at(11.0)
+    (45.0, None)
+    """
+
+    time_s: FloatArray  # Increasing, on the clock of the sound
+    fundamental_hz: FloatArray
+
+    def at(self, time_s: float) -> float | None:
+        """Return the fundamental, Hz; None outside the record, or where the engine stands."""
+        if not self.time_s[0] <= time_s <= self.time_s[-1]:
+            return None
+        found = float(np.interp(time_s, self.time_s, self.fundamental_hz))
+        return found if LOWEST_HZ <= found <= HIGHEST_HZ else None
+
+
+def read_engine(path: str | Path, lines_per_turn: float = 2.0) -> EngineSpeed:
+    r"""Read CSV with the columns time_s and rpm; the fundamental is rpm / 60 times the lines of a turn.
+
+    Raises
+    ------
+    InputFileError
+        If columns are missing, a number is none, or the times do not increase.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = (Path(folder) / "rpm.csv").write_text("time_s,rpm\n0,900\n10,1800\n")
+    ...     read_engine(Path(folder) / "rpm.csv").fundamental_hz.tolist()
+    [30.0, 60.0]
+    """
+    name = Path(path)
+    times_and_rpm = [
+        [number(name, line, row, column) for column in ("time_s", "rpm")]
+        for line, row in read_rows(name, ("time_s", "rpm"))
+    ]
+    table = np.array(times_and_rpm, dtype=np.float64).reshape(-1, 2)
+    if not len(table) or (np.diff(table[:, 0]) <= 0.0).any():
+        raise InputFileError(name, "expected at least one line, and increasing times")
+    return EngineSpeed(table[:, 0], table[:, 1] * lines_per_turn / 60.0)

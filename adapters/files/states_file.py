@@ -11,7 +11,7 @@ from worldstate.ground.values import nanoseconds, seconds
 from worldstate.state import WorldState
 
 from .atomic import atomic_path
-from .json_file import refused_as_file
+from .text_file import refused_as_file
 
 # A hop: the last decision of a recording ends up to so long before it does.
 _SLACK_NS = nanoseconds(0.1)

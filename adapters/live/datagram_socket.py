@@ -1,4 +1,4 @@
-"""What another program sends as UDP datagrams: each with the time of its capture."""
+"""UDP datagrams of other programs: detections image by image, and odometry, each with its age."""
 
 import socket
 import threading
@@ -6,9 +6,12 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Generic, Self, TypeVar
 
+from worldstate.adapters.camera.detections import DetectionFrame, frame_of
+from worldstate.adapters.files.odometry_file import OdometryRecord
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import decode_json
+from worldstate.ground.serialisation import decode, decode_json
+from worldstate.measurement.odometry import Odometry
 
 from .bounded_channel import BoundedChannel
 
@@ -62,7 +65,7 @@ class DatagramSocket(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Datagrams that nobody took in time."""
+        """Datagrams that were not taken in time."""
         return self._datagrams.dropped
 
     @property
@@ -105,6 +108,42 @@ class DatagramSocket(Generic[T]):
             except TimeoutError:
                 continue
             self._datagrams.put((time.monotonic(), datagram))
+
+
+class DetectionSocket(DatagramSocket[DetectionFrame]):
+    """Looks of another program's detector: OVAD's record of one image, and the age of the image when sent.
+
+    ``{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}``; an image
+    without detections is sent, too: it was searched. A datagram that is lost is an image not asked.
+    """
+
+    def __init__(self, address: str, stamp_ns: Callable[[float], int]) -> None:
+        super().__init__(address, stamp_ns, lambda record: frame_of(record, "datagram"), "--detections")
+
+
+class OdometrySocket(DatagramSocket[OdometryRecord]):
+    """Odometry of a running vehicle, which `Source.told` takes.
+
+    ``{"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}``, with a localiser "x_m", "y_m" and "yaw_rad"
+    in the map, too. The last one holds until the next. The filter puts what is up to two seconds late where
+    it belongs.
+    """
+
+    def __init__(self, address: str, stamp_ns: Callable[[float], int]) -> None:
+        super().__init__(address, stamp_ns, _checked_odometry, "--odometry")
+        self._ahead: list[Odometry] = []  # Captured after the last hop, whose sound takes a while to be heard
+
+    def until(self, stamp_ns: int) -> Iterator[Odometry]:
+        """Yield what was captured up to a time and has not been yielded before."""
+        told = sorted([*self._ahead, *(one.at(at_ns) for at_ns, one in self())], key=lambda one: one.stamp_ns)
+        self._ahead = [one for one in told if one.stamp_ns > stamp_ns]
+        yield from (one for one in told if one.stamp_ns <= stamp_ns)
+
+
+def _checked_odometry(record: object) -> OdometryRecord:
+    told = decode(OdometryRecord, record, "datagram")
+    told.at(0)
+    return told
 
 
 def _bound_socket(address: str, option: str) -> socket.socket:

@@ -1,12 +1,22 @@
-"""The whole chain on running sensors: one state a hop, with the time that it took."""
+"""The whole chain on running sensors: one state a hop, its latency and its cost.
 
+Latencies are kept as counts: a day takes no more memory than a minute.
+"""
+
+import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+
+import numpy as np
 
 from worldstate.adapters.listen import Source, Step, listen_steps
 from worldstate.ground.errors import InvalidArgumentError
 
 from .live_sound import LiveSound
+
+# Width of a count, seconds, and the largest latency that is told apart.
+_STEP_S, _LARGEST_S = 0.001, 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,3 +38,51 @@ def live_steps(source: Source) -> Iterator[LiveStep]:
     for step in listen_steps(source):
         latency_s = sound.age_s(step.frame.sample_index)
         yield LiveStep(step, latency_s, sound.overruns, sound.lost_s)
+
+
+class LatencyMeter:
+    """Quantiles of the time from a hop's last sample to its state, to a millisecond.
+
+    Examples
+    --------
+    >>> meter = LatencyMeter()
+    >>> for latency_s in (0.010, 0.012, 0.300):
+    ...     meter.add(latency_s)
+    >>> meter.quantile_s(0.5), meter.quantile_s(0.99)
+    (0.012, 0.3)
+    """
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(round(_LARGEST_S / _STEP_S) + 1, dtype=np.int64)
+
+    def add(self, latency_s: float) -> None:
+        """Count a state."""
+        self._counts[min(max(round(latency_s / _STEP_S), 0), len(self._counts) - 1)] += 1
+
+    def quantile_s(self, share: float) -> float | None:
+        """Return the smallest latency that so many of the states kept, None before the first."""
+        total = int(self._counts.sum())
+        if not total:
+            return None
+        return round(int(np.searchsorted(np.cumsum(self._counts), share * total)) * _STEP_S, 3)
+
+
+class CostMeter:
+    """Measure what the process costs from now on."""
+
+    def __init__(self) -> None:
+        self._wall_s, self._cpu_s = time.monotonic(), time.process_time()
+
+    def read(self) -> dict[str, float | None]:
+        """Return the time passed, the processor's time of all threads, its share of a core, and the load.
+
+        The load is the number of processes that wanted to run, mean of the last minute; None where not known.
+        """
+        wall_s, cpu_s = time.monotonic() - self._wall_s, time.process_time() - self._cpu_s
+        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+        return {
+            "wall_s": wall_s,
+            "cpu_s": cpu_s,
+            "cpu_share": cpu_s / wall_s if wall_s else 0.0,
+            "load": load,
+        }

@@ -2,13 +2,16 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import soundfile
 
 from worldstate.adapters.audio.sound_file import Audio
+from worldstate.adapters.files.atomic import atomic_path
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import nanoseconds
@@ -19,10 +22,13 @@ from .bounded_channel import BoundedChannel
 # 25 ms, and not at all where hops are whole blocks, as at 48 kHz.
 BLOCKS_PER_SECOND = 40
 # Seconds of sound that wait at most. A short stall of the machine is made up for; a state that comes later
-# than this warns nobody, and what is older is dropped.
+# than this is no warning, and what is older is dropped.
 LONGEST_WAIT_S = 2.0
 # A longer gap is no lost block but a device that slept: its zeros would take minutes to work off.
 LONGEST_GAP_S = 60.0
+# 24 bits are what converters of such arrays give. WAV ends at 4 GiB, nine minutes of 56 channels; RF64 does
+# not, and readers of the one read the other.
+_FORMAT, _SUBTYPE = "RF64", "PCM_24"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +112,7 @@ class LiveSound(Audio):
 
     @property
     def overruns(self) -> int:
-        """Times that sound was lost: blocks that nobody took in time, and overflows of the device."""
+        """Times that sound was lost: blocks that were not taken in time, and overflows of the device."""
         return self._channel.dropped + self._feed.overflows
 
     @property
@@ -164,3 +170,20 @@ class LiveSound(Audio):
             some = min(missing, self.sample_rate_hz)
             yield np.zeros((some, self.channels), np.float32)
             missing -= some
+
+
+@contextmanager
+def kept_sound(
+    path: Path | None, sample_rate_hz: int, channels: int
+) -> Iterator[Callable[[Float32Array], None] | None]:
+    """Lend a function that writes blocks to a file, which takes its name at the end; None without a path."""
+    if path is None:
+        yield None
+        return
+    if path.suffix.lower() not in (".wav", ".rf64"):
+        raise InputFileError(path, "expected a name that ends in .wav or .rf64")
+    with (
+        atomic_path(path) as temporary,
+        soundfile.SoundFile(temporary, "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT) as file,
+    ):
+        yield file.write

@@ -1,17 +1,43 @@
-"""Microphones of this machine, through PortAudio."""
+"""Microphones of this machine, through PortAudio and sounddevice, which comes with the extra `live`."""
 
 import time
 from typing import Any
 
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InvalidArgumentError, MissingExtraError, WorldstateError
 from worldstate.ground.typing import Float32Array
 
 from .bounded_channel import BoundedChannel
 from .live_sound import SoundBlock, block_samples
-from .portaudio import portaudio
 
 # Lost samples are told from the jitter of a callback's time by this share of a block.
 _LOST_SHARE = 0.5
+
+
+class MissingPortAudioError(WorldstateError):
+    """The package sounddevice is installed, the system's library PortAudio is not."""
+
+
+def portaudio() -> Any:
+    """Return the module `sounddevice`.
+
+    Raises
+    ------
+    MissingExtraError
+        If it is not installed.
+    MissingPortAudioError
+        If it finds no PortAudio library.
+    """
+    try:
+        import sounddevice
+    except ImportError as error:
+        raise MissingExtraError("sounddevice", "live") from error
+    except OSError as error:
+        raise MissingPortAudioError(
+            "expected the system's library PortAudio, found none: install it "
+            "(Debian, Ubuntu: apt-get install libportaudio2; Fedora: dnf install portaudio; "
+            "macOS and Windows: it comes with sounddevice)"
+        ) from error
+    return sounddevice
 
 
 class PortAudioInput:

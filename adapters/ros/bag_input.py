@@ -14,8 +14,8 @@ from worldstate.adapters.camera.detections import (
     DetectionFrame,
     DetectionLog,
 )
-from worldstate.adapters.files.json_file import refused_as_file
 from worldstate.adapters.files.odometry_file import OdometryLog
+from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.measurement.odometry import Odometry

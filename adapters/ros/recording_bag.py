@@ -10,8 +10,8 @@ from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ, TRUTH_NAME
-from worldstate.adapters.files.json_file import read_json
 from worldstate.adapters.files.odometry_file import OdometryLog
+from worldstate.adapters.files.text_file import read_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.odometry import Odometry

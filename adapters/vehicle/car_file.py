@@ -10,7 +10,7 @@ from typing import Any
 from worldstate.adapters.camera.pinhole import CameraRecord, PinholeCamera
 from worldstate.adapters.files.array_file import checked_array, read_array
 from worldstate.adapters.files.atomic import write_text
-from worldstate.adapters.files.json_file import read_json, refused_as_file
+from worldstate.adapters.files.text_file import read_json, refused_as_file
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import ADDED, decode

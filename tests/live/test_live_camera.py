@@ -15,7 +15,7 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.listen import ListenSettings, Source, open_source
 from worldstate.adapters.live.bounded_channel import BoundedChannel
-from worldstate.adapters.live.detection_socket import DetectionSocket
+from worldstate.adapters.live.datagram_socket import DetectionSocket
 from worldstate.adapters.live.image_feed import CameraFeed, ImageLooks, image_channel
 from worldstate.adapters.live.live_camera import REMEMBERED, LiveCamera
 from worldstate.adapters.live.live_sound import LiveSound

@@ -100,8 +100,7 @@ def _add_camera_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.live.live_sound import LiveSound
-    from worldstate.adapters.live.sound_keeping import kept_sound
+    from worldstate.adapters.live.live_sound import LiveSound, kept_sound
 
     check_outputs(arguments, "out", "keep_sound", "save_state", *LOG_FILES)
     with ExitStack() as opened:
@@ -179,7 +178,7 @@ def _with_camera(
 def _with_detections(
     address: str, source: "Source", sound: "LiveSound", opened: ExitStack
 ) -> "tuple[Source, Losses]":
-    from worldstate.adapters.live.detection_socket import DetectionSocket
+    from worldstate.adapters.live.datagram_socket import DetectionSocket
     from worldstate.adapters.live.live_camera import LiveCamera
 
     looks = opened.enter_context(DetectionSocket(address, sound.stamp_ns))
@@ -208,7 +207,7 @@ def _with_odometry(
     arguments: argparse.Namespace, source: "Source", sound: "LiveSound", opened: ExitStack
 ) -> "tuple[Source, Losses]":
     """Return the source with the odometry that was asked for, and what tells what was lost of it."""
-    from worldstate.adapters.live.odometry_socket import OdometrySocket
+    from worldstate.adapters.live.datagram_socket import OdometrySocket
 
     if arguments.odometry is None:
         return source, dict

@@ -57,8 +57,7 @@ from worldstate.ground.errors import InputFileError
 if TYPE_CHECKING:
     from worldstate.adapters.audio.open_sound import SoundInput
     from worldstate.adapters.camera.detections import DetectionLog
-    from worldstate.adapters.files.engine_file import EngineSpeed
-    from worldstate.adapters.files.odometry_file import OdometryLog
+    from worldstate.adapters.files.odometry_file import EngineSpeed, OdometryLog
     from worldstate.adapters.listen import Source
     from worldstate.frontend.array.microphone_array import MicrophoneArray
 
@@ -196,7 +195,7 @@ def _input(
 
 
 def _engine(arguments: argparse.Namespace) -> "EngineSpeed | None":
-    from worldstate.adapters.files.engine_file import read_engine
+    from worldstate.adapters.files.odometry_file import read_engine
     from worldstate.ground.checks import in_range
 
     if arguments.engine_rpm is None:

@@ -1,8 +1,7 @@
 """What came of a run on running sensors, and what it cost: a few numbers, however long it lasts."""
 
 from worldstate.adapters.listen import Source
-from worldstate.adapters.live.latency import CostMeter, LatencyMeter
-from worldstate.adapters.live.live_listening import LiveStep
+from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter, LiveStep
 from worldstate.adapters.live.live_sound import LiveSound
 
 from .warning import WarningMeter
@@ -25,7 +24,7 @@ class LiveReport:
 
     def to_dict(self, sound: LiveSound) -> dict[str, object]:
         """Return the summary as JSON-able values; unknown is None."""
-        spent, latency_s = self._cost.read(), self._latency.quantile_s
+        latency_s = self._latency.quantile_s
         return {
             "states": self._states,
             "sound_s": sound.frames / sound.sample_rate_hz,
@@ -34,10 +33,7 @@ class LiveReport:
             "latency_median_s": latency_s(0.5),
             "latency_p99_s": latency_s(0.99),
             "latency_largest_s": latency_s(1.0),
-            "wall_s": spent.wall_s,
-            "cpu_s": spent.cpu_s,
-            "cpu_share": spent.cpu_share,
-            "load": spent.load,
+            **self._cost.read(),
             "peak_risk": self._peak_risk,
             "advisory_onsets_s": list(self._warnings.summary().advisory_onsets_s),
         }
