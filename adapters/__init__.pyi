@@ -9,8 +9,8 @@ from .camera.detection_formats import read_any_detections as read_any_detections
 from .camera.detections import DetectionFilter as DetectionFilter
 from .camera.detections import DetectionFrame as DetectionFrame
 from .camera.detections import DetectionLog as DetectionLog
+from .camera.detections import Detector as Detector
 from .camera.detections import read_detections as read_detections
-from .camera.detector import Detector as Detector
 from .camera.miss_rates import MissRates as MissRates
 from .camera.miss_rates import load_miss_rates as load_miss_rates
 from .camera.miss_rates import save_miss_rates as save_miss_rates

@@ -18,8 +18,7 @@ from worldstate.abduction.signature.site_signature import SiteSignature
 from worldstate.adapters.audio.open_sound import SoundInput, SoundStream, as_sound, open_sound, path_of
 from worldstate.adapters.camera.camera_channel import Watcher, video_degradation
 from worldstate.adapters.camera.detection_formats import read_any_detections
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
-from worldstate.adapters.camera.detector import Detector
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
@@ -500,12 +499,8 @@ def _with_camera(
     if detections is not None or recording is None:
         raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
     video = open_video(recording.path / VIDEO_NAME)
-    if rates is None or rates.health is None:
-        boxes = [detector.detect(image) for image in video.frames()]
-        log = DetectionLog.at_rate(boxes, video.frame_rate_hz, source=str(video.path))
-        return replace(source, detections=log)
     # Each image is decoded once, for its boxes and for its quality.
-    watcher = Watcher(detector, rates)
+    watcher = Watcher(detector, rates, str(video.path))
     for number, image in enumerate(video.frames()):
         watcher.look(nanoseconds(number / video.frame_rate_hz), image)
     watched = watcher.watched()

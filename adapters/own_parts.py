@@ -18,7 +18,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
 
-from worldstate.adapters.camera.detector import Detector
+from worldstate.adapters.camera.detections import Detector
 from worldstate.core.fixed_lag import Timed
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state import WorldState

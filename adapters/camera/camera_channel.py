@@ -4,13 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ImageArray
 from worldstate.ground.values import nanoseconds
 
-from .camera_health import CameraHealth, DegradationLog, HealthMonitor
-from .detections import DetectionFilter, DetectionFrame, DetectionLog
-from .detector import Detector
+from .camera_health import DegradationLog, HealthMonitor
+from .detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
 from .image_quality import image_quality
 from .miss_rates import MissRates
 from .video import Video
@@ -27,6 +25,24 @@ class Watched:
     degradation: DegradationLog  # d as last read, on the scale of the measured table
 
 
+class ImageHealth:
+    """Degradation d of a camera, read from its images once a period; 0 without a scale of its health."""
+
+    def __init__(self, rates: MissRates | None, period_ns: int = HEALTH_PERIOD_NS) -> None:
+        self._rates, self._period_ns = rates, period_ns
+        self._monitor = None if rates is None or rates.health is None else HealthMonitor(rates.health)
+        self._read_ns: int | None = None
+        self.level = 0.0
+
+    def read(self, stamp_ns: int, frame: ImageArray) -> float:
+        """Take the next image; return d as last read."""
+        due = self._read_ns is None or stamp_ns - self._read_ns >= self._period_ns
+        if due and self._monitor is not None and self._rates is not None:
+            self._read_ns = stamp_ns
+            self.level = self._rates.level(self._monitor.update(stamp_ns, image_quality(frame)))
+        return self.level
+
+
 class Watcher:
     """Run a detector on the images of one camera as they come, and estimate the camera's degradation.
 
@@ -34,13 +50,10 @@ class Watcher:
     ----------
     detector : Detector
         A new one, if it has a state.
-    rates : MissRates
-        Measured for this detector and camera, with the scale of its health.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If the rates hold no scale of health.
+    rates : MissRates or None
+        Measured for this detector and camera. Without the scale of its health d is 0.
+    source : str
+        Where the images come from, for messages.
 
     Examples
     --------
@@ -58,11 +71,9 @@ class Watcher:
     True
     """
 
-    def __init__(self, detector: Detector, rates: MissRates) -> None:
-        self._detector, self._rates = detector, rates
-        self._monitor = HealthMonitor(_scale(rates))
+    def __init__(self, detector: Detector, rates: MissRates | None, source: str = "watched camera") -> None:
+        self._detector, self._health, self._source = detector, ImageHealth(rates), source
         self._stamps_ns: list[int] = []
-        self._read_ns: list[int] = []
         self._levels: list[float] = []
         self._found: list[DetectionFrame] = []
 
@@ -78,9 +89,7 @@ class Watcher:
         """
         self._stamps_ns.append(stamp_ns)
         self._found.append(self._detector.detect(frame))
-        if not self._read_ns or stamp_ns - self._read_ns[-1] >= HEALTH_PERIOD_NS:
-            self._read_ns.append(stamp_ns)
-            self._levels.append(self._rates.level(self._monitor.update(stamp_ns, image_quality(frame))))
+        self._levels.append(self._health.read(stamp_ns, frame))
 
     def watched(self) -> Watched:
         """Return the detections and degradation so far.
@@ -96,25 +105,19 @@ class Watcher:
             If there was no image.
         """
         stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
-        degradation = DegradationLog(np.array(self._read_ns, dtype=np.int64), np.array(self._levels))
-        return Watched(DetectionLog(tuple(self._found), stamps_ns, "watched camera"), degradation)
+        degradation = DegradationLog(stamps_ns, np.array(self._levels))
+        return Watched(DetectionLog(tuple(self._found), stamps_ns, self._source), degradation)
 
 
 def video_degradation(video: Video, rates: MissRates) -> DegradationLog:
     """Estimate d from every image of a video that starts with the recording."""
-    monitor, stamps_ns, levels = HealthMonitor(_scale(rates)), [], []
+    health, stamps_ns, levels = ImageHealth(rates, period_ns=0), [], []
     for number, frame in enumerate(video.frames()):
         stamps_ns.append(nanoseconds(number / video.frame_rate_hz))
-        levels.append(rates.level(monitor.update(stamps_ns[-1], image_quality(frame))))
+        levels.append(health.read(stamps_ns[-1], frame))
     return DegradationLog(np.array(stamps_ns, dtype=np.int64), np.array(levels))
 
 
-def _scale(rates: MissRates) -> CameraHealth:
-    if rates.health is None:
-        raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
-    return rates.health
-
-
-def any_motion(label: str = "car") -> DetectionFilter:
+def any_motion() -> DetectionFilter:
     """Return the filter that keeps all boxes of a motion detector, whose score is no confidence."""
-    return DetectionFilter(frozenset({label}), 0.0, 0.0)
+    return DetectionFilter(frozenset({"car"}), 0.0, 0.0)

@@ -13,6 +13,11 @@ from worldstate.ground.typing import FloatArray, ImageArray, IntArray
 from .degradation import LEVELS, degrade, level_of
 from .image_quality import ImageQuality, image_quality
 
+# While an image is clean, every d at most `_CLEAN`, the brightness and sharpness of reference follow it with
+# a time constant, but never by more than a factor from the learned values: slow soiling must not become the
+# reference.
+_FOLLOW_S, _CLEAN, _MOST_DRIFT = 120.0, 0.15, 1.5
+
 
 @dataclass(frozen=True, slots=True)
 class Health:
@@ -95,18 +100,8 @@ def health_scale(brightness: FloatArray, sharpness: FloatArray, noise: FloatArra
 class HealthMonitor:
     """Track a camera's degradation against a clean reference that follows the daylight."""
 
-    # While an image is clean (every d at most `clean`) the brightness and sharpness of reference follow it
-    # with time constant `follow_s`, but never by more than a factor `most_drift` from the learned values:
-    # slow soiling must not become the reference.
-
-    def __init__(
-        self, health: CameraHealth, follow_s: float = 120.0, clean: float = 0.15, most_drift: float = 1.5
-    ) -> None:
-        self.reference = health
-        self._learned = health
-        self._follow_s = in_range("follow_s", follow_s, 0.0, math.inf, open_low=True)
-        self._clean = in_range("clean", clean, 0.0, 1.0)
-        self._most_drift = in_range("most_drift", most_drift, 1.0, 100.0)
+    def __init__(self, health: CameraHealth) -> None:
+        self.reference = self._learned = health
         self._stamp_ns: int | None = None
 
     def update(self, stamp_ns: int, quality: ImageQuality) -> Health:
@@ -114,8 +109,8 @@ class HealthMonitor:
         seen = self.reference.estimate(quality)
         elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) / 1e9
         self._stamp_ns = stamp_ns
-        if seen.worst <= self._clean:
-            self._follow(quality, 1.0 - math.exp(-elapsed_s / self._follow_s))
+        if seen.worst <= _CLEAN:
+            self._follow(quality, 1.0 - math.exp(-elapsed_s / _FOLLOW_S))
         return seen
 
     def _follow(self, quality: ImageQuality, weight: float) -> None:
@@ -130,7 +125,7 @@ class HealthMonitor:
 
     def _moved(self, held: float, seen: float, learned: float, weight: float) -> float:
         value = held + weight * (seen - held)
-        return min(max(value, learned / self._most_drift), learned * self._most_drift)
+        return min(max(value, learned / _MOST_DRIFT), learned * _MOST_DRIFT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

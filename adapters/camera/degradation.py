@@ -1,19 +1,19 @@
 """Staged degradation of camera frames: blur, darkness, sensor noise, four levels each."""
 
 from collections.abc import Mapping
-from functools import cache, lru_cache
+from functools import cache
 from types import MappingProxyType
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtri
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, ImageArray
 
-from .opencv import opencv
+from .video import opencv
 
 Family = Literal["blur", "darkness", "noise", "all"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
@@ -34,7 +34,7 @@ _NO_BLUR_PX = 0.25
 # A blur of this many pixels leaves no detail that half the resolution would lose.
 _WIDE_PX = 4.0
 # Number of quantiles of the staged noise, which ends at 4.3 sigma.
-_QUANTILES = 1 << 16
+QUANTILES = 1 << 16
 
 
 def strength(family: str, degradation: float) -> float:
@@ -57,21 +57,16 @@ def level_of(family: str, staged: float) -> float:
     return float(np.interp(staged, knots, LEVELS))
 
 
-def degrade(
-    frame: ImageArray, family: Family, degradation: float, rng: np.random.Generator, reduced: float = 1.0
-) -> ImageArray:
+def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.random.Generator) -> ImageArray:
     r"""Return a frame as a degraded camera would have taken it.
 
     .. math:: y = \mathrm{clip}(\mathrm{round}(a\,(G_\sigma * x) + n)), \qquad n \sim N(0, s^2)
 
     with :math:`\sigma`, a and s those of the family at d; ``"all"`` takes the three together: optics first,
-    exposure next, the sensor last. `reduced` is the number of the camera's pixels per side of one of the
-    frame, whose mean it holds: the frame comes out as if it had been reduced after the degradation.
+    exposure next, the sensor last.
 
     Shapes: frame (height, width).
     """
-    # A detector that works on a reduced image sees the same either way, for a tenth of the time: blur and
-    # darkness commute with the mean over pixels, and of the noise only the mean over pixels is left.
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
     if family not in FAMILIES:
@@ -81,14 +76,13 @@ def degrade(
         return frame
     staged = tuple(STRENGTHS) if family == "all" else (family,)
     for name in staged:
-        frame = _STAGES[name](frame, strength(name, level), rng, reduced)
+        frame = _STAGES[name](frame, strength(name, level), rng)
     return frame
 
 
-def _blurred(frame: ImageArray, sigma: float, rng: np.random.Generator, reduced: float) -> ImageArray:
+def blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> ImageArray:
     """Blur; a wide one on a reduced image, whose pixels are themselves a box of variance (f^2 - 1) / 12."""
     cv2 = opencv()
-    sigma_px = sigma / reduced
     if sigma_px < _NO_BLUR_PX:
         return frame
     height, width = frame.shape[:2]
@@ -100,45 +94,27 @@ def _blurred(frame: ImageArray, sigma: float, rng: np.random.Generator, reduced:
     left_px = np.sqrt(sigma_px**2 - (factor**2 - 1) / 12.0) / factor
     # The border is mirrored in its pixel's middle, which in a reduced image lies nearer to the pixel's edge.
     border = cv2.BORDER_REFLECT if factor > 1 else cv2.BORDER_REFLECT_101
-    blurred: ImageArray = cv2.GaussianBlur(frame, (0, 0), left_px, borderType=border)
-    return cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR) if factor > 1 else blurred
+    smooth: ImageArray = cv2.GaussianBlur(frame, (0, 0), left_px, borderType=border)
+    return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR) if factor > 1 else smooth
 
 
-def _darkened(frame: ImageArray, factor: float, rng: np.random.Generator, reduced: float) -> ImageArray:
+def _darkened(frame: ImageArray, factor: float, rng: np.random.Generator) -> ImageArray:
     table = np.round(np.arange(256) * factor).astype(np.uint8)
     return table[frame]
 
 
-def _noisy(frame: ImageArray, sigma: float, rng: np.random.Generator, reduced: float) -> ImageArray:
-    drawn = rng.integers(0, _QUANTILES, frame.shape, dtype=np.uint16)
-    if reduced > 1.0:
-        # Clipping moves the mean of a dark or bright pixel and narrows its noise, before the mean is taken.
-        mean, std = _clipped_noise(sigma)
-        # Cells that do not lie on whole pixels share those at their edges: the mean square of the weights of
-        # cells anywhere is (r - 1/3) / r^2 a side.
-        left = 1.0 / reduced if reduced.is_integer() else (reduced - 1.0 / 3.0) / reduced**2
-        values = _normal().take(drawn) * (std * np.float32(left)).take(frame) + mean.take(frame)
-        return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+def _noisy(frame: ImageArray, sigma: float, rng: np.random.Generator) -> ImageArray:
     # Grey levels are whole, so the noise may be too: quantiles looked up, a third of the time of drawing it.
-    grey: NDArray[np.int16] = np.rint(sigma * _normal()).astype(np.int16).take(drawn)
+    drawn = rng.integers(0, QUANTILES, frame.shape, dtype=np.uint16)
+    grey: NDArray[np.int16] = np.rint(sigma * normal_quantiles()).astype(np.int16).take(drawn)
     grey += frame
     return np.clip(grey, 0, 255).astype(np.uint8)
 
 
 @cache
-def _normal() -> Float32Array:
+def normal_quantiles() -> Float32Array:
     """Quantiles of the standard normal distribution."""
-    return np.asarray(ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES), dtype=np.float32)
+    return np.asarray(ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES), dtype=np.float32)
 
 
-@lru_cache(maxsize=16)
-def _clipped_noise(sigma: float) -> tuple[Float32Array, Float32Array]:
-    """Mean and standard deviation of each grey level with noise, as a camera stores it; shape (256,)."""
-    grey = np.arange(256.0)
-    edges = ndtr((grey[:-1] + 0.5 - grey[:, None]) / sigma)
-    share = np.diff(edges, axis=1, prepend=0.0, append=1.0)
-    mean = share @ grey
-    return mean.astype(np.float32), np.sqrt(share @ grey**2 - mean**2).astype(np.float32)
-
-
-_STAGES = {"blur": _blurred, "darkness": _darkened, "noise": _noisy}
+_STAGES = {"blur": blurred, "darkness": _darkened, "noise": _noisy}

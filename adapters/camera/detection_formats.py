@@ -98,13 +98,7 @@ def read_any_detections(
     return reader(name, frame_rate_hz)
 
 
-def read_coco_results(
-    path: str | Path,
-    frame_rate_hz: float = 10.0,
-    categories: Mapping[int, str] = COCO_CATEGORIES,
-    first_image: int = 0,
-    frames: int | None = None,
-) -> DetectionLog:
+def read_coco_results(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionLog:
     """Read a COCO results file: ``[{"image_id", "category_id", "bbox": [x, y, w, h], "score"}, ...]``."""
     name = Path(path)
     found = read_json(name, "a detections file", MAX_BYTES)
@@ -115,20 +109,13 @@ def read_coco_results(
         for i, item in enumerate(found):
             result = decode(_CocoResult, item, f"result {i}")
             left, top, width, height = result.bbox
-            label = categories.get(result.category_id, str(result.category_id))
+            label = COCO_CATEGORIES.get(result.category_id, str(result.category_id))
             row = (left, top, left + width, top + height), result.score, label
-            rows.setdefault(result.image_id - first_image, []).append(row)
-    return _log(name, rows, frames, frame_rate_hz)
+            rows.setdefault(result.image_id, []).append(row)
+    return _log(name, rows, frame_rate_hz)
 
 
-def read_yolo_text(
-    path: str | Path,
-    size_px: tuple[int, int],
-    frame_rate_hz: float = 10.0,
-    classes: Mapping[int, str] = YOLO_CLASSES,
-    first_image: int = 0,
-    frames: int | None = None,
-) -> DetectionLog:
+def read_yolo_text(path: str | Path, size_px: tuple[int, int], frame_rate_hz: float = 10.0) -> DetectionLog:
     """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
     folder = Path(path)
     numbered = [(file, match) for file in folder.glob("*.txt") if (match := _FRAME_NUMBER.search(file.name))]
@@ -137,16 +124,16 @@ def read_yolo_text(
         raise InputFileError(folder, problem)
     rows: dict[int, list[Row]] = {}
     for file, match in numbered:
-        number = int(match.group(1)) - first_image
+        number = int(match.group(1))
         if number in rows:
             raise InputFileError(file, "expected every frame once, another file has the same number")
         with refused_as_file(file):
             lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
-            rows[number] = [_yolo_row(line, size_px, classes) for line in lines if line.strip()]
-    return _log(folder, rows, frames, frame_rate_hz)
+            rows[number] = [_yolo_row(line, size_px) for line in lines if line.strip()]
+    return _log(folder, rows, frame_rate_hz)
 
 
-def _yolo_row(line: str, size_px: tuple[int, int], classes: Mapping[int, str]) -> Row:
+def _yolo_row(line: str, size_px: tuple[int, int]) -> Row:
     name, *numbers = line.split()
     expected = "class x y w h [score] with w, h >= 0 and the score in [0, 1]"
     problem = f"expected {expected}, got {line!r:.60}"
@@ -159,11 +146,11 @@ def _yolo_row(line: str, size_px: tuple[int, int], classes: Mapping[int, str]) -
         raise InvalidArgumentError(problem)
     centre, half = (x * size_px[0], y * size_px[1]), (width * size_px[0] / 2, height * size_px[1] / 2)
     box = (centre[0] - half[0], centre[1] - half[1], centre[0] + half[0], centre[1] + half[1])
-    return box, score, classes.get(int(name), name)
+    return box, score, YOLO_CLASSES.get(int(name), name)
 
 
-def _log(path: Path, rows: Mapping[int, list[Row]], frames: int | None, frame_rate_hz: float) -> DetectionLog:
-    count = max(rows, default=-1) + 1 if frames is None else frames
+def _log(path: Path, rows: Mapping[int, list[Row]], frame_rate_hz: float) -> DetectionLog:
+    count = max(rows, default=-1) + 1
     if count > MAX_FRAMES or any(not 0 <= number < count for number in rows):
         raise InputFileError(path, f"expected frame numbers from 0 to {min(count, MAX_FRAMES) - 1}")
     if max(map(len, rows.values()), default=0) > MAX_BOXES_A_FRAME:

@@ -1,9 +1,10 @@
-"""What a camera's detector reported, frame by frame."""
+"""Interface of a detector, and what one reported frame by frame."""
 
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from worldstate.adapters.files.text_file import read_json, refused_as_file
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import Count, Probability, decode
-from worldstate.ground.typing import FloatArray, IntArray
+from worldstate.ground.typing import FloatArray, ImageArray, IntArray
 from worldstate.ground.values import nanoseconds
 
 MAX_BYTES = 64 << 20
@@ -162,7 +163,37 @@ class DetectionLog:
         return index
 
 
-def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int = 0) -> DetectionLog:
+class Detector(Protocol):
+    """Detector of objects in images that are given in the order of time.
+
+    A detector may have a state, as one of motion must; a new one is made for every video.
+
+    Examples
+    --------
+    >>> class Blind:
+    ...     def detect(self, frame): return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
+    >>> detector: Detector = Blind()
+    >>> len(detector.detect(np.zeros((4, 4, 3), dtype=np.uint8)))
+    0
+    """
+
+    def detect(self, frame: ImageArray, /) -> DetectionFrame:
+        """Return the detections in one image.
+
+        Parameters
+        ----------
+        frame : ndarray of uint8, shape (height, width, 3)
+            Blue first.
+
+        Returns
+        -------
+        DetectionFrame
+            Boxes in pixels, scores in [0, 1], labels.
+        """
+        ...
+
+
+def read_detections(path: str | Path, frame_rate_hz: float = 10.0) -> DetectionLog:
     """Read per-frame detections in OVAD's JSON.
 
     ``{"detections_per_frame": [{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...]},
@@ -175,8 +206,6 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int
         The file; at most 64 MiB, 100,000 frames, 1000 boxes a frame.
     frame_rate_hz : float
         Frames a second where the frames carry no stamp.
-    start_ns : int
-        Stamp of the first frame where the frames carry none.
 
     Returns
     -------
@@ -217,7 +246,7 @@ def read_detections(path: str | Path, frame_rate_hz: float = 10.0, start_ns: int
             frames.append(read.frame())
             stamps.append(read.stamp_ns)
         if all(stamp is None for stamp in stamps):
-            return DetectionLog.at_rate(frames, frame_rate_hz, start_ns, str(name))
+            return DetectionLog.at_rate(frames, frame_rate_hz, source=str(name))
         if None in stamps:
             raise InvalidArgumentError(f"frame {stamps.index(None)}: expected stamp_ns, as in other frames")
         return DetectionLog(tuple(frames), np.array(stamps, dtype=np.int64), str(name))

@@ -1,23 +1,24 @@
 """A user's own detector: an ONNX model whose output is of YOLO's form."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntArray
 
+from .box_linking import overlaps
 from .detections import MAX_BOXES_A_FRAME, DetectionFrame
-from .detector import suppress
-from .opencv import opencv
+from .video import opencv
 
 # ONNX files are protocol buffers, which end at 2 GiB.
 MAX_BYTES = 2 << 30
+MIN_SCORE = 0.25  # Lowest score that is reported
+MOST_OVERLAP = 0.5  # Of two boxes that overlap by more, the better one is kept
+SIDE_PX = 640  # Of the square that the model takes, where its input has no fixed size
 # Grey level of the border of a letterbox, that of YOLO's training.
 GREY = 114
 
@@ -34,23 +35,6 @@ class Session(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class OnnxSettings:
-    """Classes, thresholds and input size of a model."""
-
-    labels: tuple[str, ...]  # Names of the classes in the order of the model
-    min_score: float = 0.25  # Lowest score that is reported
-    most_overlap: float = 0.5  # Of two boxes that overlap by more, the better one is kept
-    size_px: int = 640  # Side of the square that the model takes, where its input has no fixed size
-
-    def __post_init__(self) -> None:
-        if not self.labels:
-            raise InvalidArgumentError("labels: expected at least one class name")
-        in_range("min_score", self.min_score, 0.0, 1.0)
-        in_range("most_overlap", self.most_overlap, 0.0, 1.0)
-        in_range("size_px", self.size_px, 1, 8192)
-
-
 class OnnxDetector:
     """Run an ONNX model of YOLO's form on images.
 
@@ -61,13 +45,13 @@ class OnnxDetector:
     ----------
     session : Session
         An open model; `open_onnx` opens one from a file.
-    settings : OnnxSettings
-        Classes, thresholds and input size.
+    labels : tuple of str
+        Names of the classes in the order of the model, at least one.
 
     Raises
     ------
     InvalidArgumentError
-        If the model does not take one image.
+        If the model does not take one image, or no class is named.
 
     Examples
     --------
@@ -78,20 +62,21 @@ class OnnxDetector:
     >>> class OneCar:
     ...     def get_inputs(self): return [image]
     ...     def run(self, names, feed): return [np.array([[[32.0], [32.0], [20.0], [10.0], [0.9]]])]
-    >>> found = OnnxDetector(OneCar(), OnnxSettings(("car",))).detect(np.zeros((64, 64, 3), np.uint8))
+    >>> found = OnnxDetector(OneCar(), ("car",)).detect(np.zeros((64, 64, 3), np.uint8))
     >>> found.labels, found.boxes_px.tolist()
     (('car',), [[22.0, 27.0, 42.0, 37.0]])
     """
 
-    def __init__(self, session: Session, settings: OnnxSettings) -> None:
+    def __init__(self, session: Session, labels: tuple[str, ...]) -> None:
+        if not labels:
+            raise InvalidArgumentError("labels: expected at least one class name")
         inputs = session.get_inputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 4:
             raise InvalidArgumentError("model: expected one input of shape (1, 3, height, width)")
-        self.settings = settings
-        self._session = session
+        self._labels, self._session = labels, session
         self._input = str(inputs[0].name)
         self._size = tuple(
-            side if isinstance(side, int) and side > 0 else settings.size_px for side in inputs[0].shape[2:]
+            side if isinstance(side, int) and side > 0 else SIDE_PX for side in inputs[0].shape[2:]
         )
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
@@ -116,7 +101,7 @@ class OnnxDetector:
             raise InvalidArgumentError(f"frame: expected a colour image, got {frame.dtype} {frame.shape}")
         tensor, scale = self._letterbox(frame)
         outputs = self._session.run(None, {self._input: tensor})
-        boxes, scores, classes = decode_yolo(outputs[0], len(self.settings.labels))
+        boxes, scores, classes = decode_yolo(outputs[0], len(self._labels))
         limits = np.array([frame.shape[1], frame.shape[0]] * 2, dtype=np.float64)
         return self._best(np.clip(boxes / scale, 0.0, limits), scores, classes)
 
@@ -131,24 +116,24 @@ class OnnxDetector:
         return planes[None] / np.float32(255.0), scale
 
     def _best(self, boxes: FloatArray, scores: FloatArray, classes: IntArray) -> DetectionFrame:
-        kept = np.flatnonzero(scores >= self.settings.min_score)
+        kept = np.flatnonzero(scores >= MIN_SCORE)
         kept = kept[np.argsort(-scores[kept], kind="stable")][: 10 * MAX_BOXES_A_FRAME]
         # Boxes of different classes never suppress each other: each class lies in a plane of its own.
         planes = boxes[kept] + 1e5 * classes[kept, None]
-        kept = kept[suppress(planes, scores[kept], self.settings.most_overlap)][:MAX_BOXES_A_FRAME]
-        names = tuple(self.settings.labels[c] for c in classes[kept])
+        kept = kept[suppress(planes, scores[kept], MOST_OVERLAP)][:MAX_BOXES_A_FRAME]
+        names = tuple(self._labels[c] for c in classes[kept])
         return DetectionFrame(boxes[kept], scores[kept], names)
 
 
-def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
+def open_onnx(path: str | Path, labels: tuple[str, ...]) -> OnnxDetector:
     """Open a model file with onnxruntime, on the processor.
 
     Parameters
     ----------
     path : str or Path
         Model file.
-    settings : OnnxSettings
-        Classes, thresholds and input size.
+    labels : tuple of str
+        Names of the classes in the order of the model, at least one.
 
     Returns
     -------
@@ -165,7 +150,7 @@ def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
     Examples
     --------
     >>> try:
-    ...     open_onnx("missing.onnx", OnnxSettings(labels=("car", "bicycle")))
+    ...     open_onnx("missing.onnx", ("car", "bicycle"))
     ... except InputFileError as error:
     ...     print(error)
     missing.onnx: expected an ONNX model (No such file or directory)
@@ -182,7 +167,7 @@ def open_onnx(path: str | Path, settings: OnnxSettings) -> OnnxDetector:
         raise MissingExtraError("onnxruntime", "onnx") from error
     try:
         session = onnxruntime.InferenceSession(str(name), providers=["CPUExecutionProvider"])
-        return OnnxDetector(session, settings)
+        return OnnxDetector(session, labels)
     except Exception as error:  # onnxruntime raises bare classes of its own
         raise InputFileError(name, f"expected an ONNX detector, it does not open: {error}") from error
 
@@ -223,3 +208,14 @@ def _from_corners(rows: FloatArray, classes: int) -> tuple[FloatArray, FloatArra
     if ((found < 0) | (found >= classes)).any():
         raise InvalidArgumentError(f"output: expected classes 0 to {classes - 1}")
     return rows[:, :4], np.clip(rows[:, 4], 0.0, 1.0), found
+
+
+def suppress(boxes_px: FloatArray, scores: FloatArray, most_overlap: float) -> IntArray:
+    """Return the indices after non-maximum suppression of boxes (n, 4) by scores (n,), the best first."""
+    left = np.argsort(-scores, kind="stable")
+    kept = []
+    while left.size:
+        kept.append(left[0])
+        rest = left[1:]
+        left = rest[overlaps(boxes_px[left[:1]], boxes_px[rest])[0] <= most_overlap]
+    return np.array(kept, dtype=np.int64)

@@ -1,20 +1,34 @@
-"""Frames of a video file."""
+"""Frames of a video file, by OpenCV, which comes with the extra `vision`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from worldstate.ground.errors import InputFileError
+from worldstate.ground.errors import InputFileError, MissingExtraError
 from worldstate.ground.typing import ImageArray
 
 from .detections import MAX_FRAMES
-from .opencv import opencv
 
 # OVAD's name for the video beside a recording's sound.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
 # A bound on the memory of one decoded image: 200 MB.
 MAX_SIDE_PX = 8192
+
+
+def opencv() -> Any:
+    """Return the module `cv2`.
+
+    Examples
+    --------
+    >>> opencv().__name__
+    'cv2'
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtraError("opencv-python-headless", "vision") from error
+    return cv2
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,13 @@ from worldstate.abduction.absence import MissRateTable, default_miss_rates
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.measurement.measurement import Bearing, Look, Side, Sighting
 from worldstate.measurement.sector import WHOLE_SIDES, Sector
 
+from .box_linking import kept_and_parked
 from .detections import DetectionFilter, DetectionLog
 from .pinhole import PinholeCamera
-from .static_boxes import ParkedRule, kept_and_parked
 
 SENSOR = "camera"
 # Points at which a miss rate is averaged over the part of the sector that is in view.
@@ -41,8 +40,6 @@ class VisionSettings:
         Largest age, seconds, at which an image is used.
     keep : DetectionFilter
         Classes, scores and sizes of the boxes that are used.
-    still : ParkedRule
-        Rule by which a box is parked.
 
     Raises
     ------
@@ -59,7 +56,6 @@ class VisionSettings:
     clutter_rate: float = 0.01
     max_frame_age_s: float = 0.15
     keep: DetectionFilter = field(default_factory=DetectionFilter)
-    still: ParkedRule = field(default_factory=ParkedRule)
 
     def __post_init__(self) -> None:
         in_range("half_width_rad", self.half_width_rad, 0.0, math.pi / 2, open_low=True)
@@ -264,7 +260,7 @@ class VisionQuery:
 
     def _look(self, log: DetectionLog, number: int) -> tuple[Sighting, ...]:
         frame = log.frames[number]
-        kept, still = kept_and_parked(log, number, self.settings.keep, self.settings.still)
+        kept, still = kept_and_parked(log, number, self.settings.keep)
         return tuple(
             self.camera.sighting(frame.boxes_px[i], frame.labels[i], float(frame.scores[i]), moving=not stood)
             for i, stood in zip(kept, still.tolist(), strict=True)
@@ -302,25 +298,6 @@ class VisionQuery:
         )
         share = in_view.half_width_rad / sector.half_width_rad
         return share * seen + (1.0 - share)
-
-
-def moving_boxes(
-    log: DetectionLog, stamps_ns: Collection[int], settings: VisionSettings | None = None
-) -> list[FloatArray]:
-    """Return the moving boxes that count, of the frame at each stamp.
-
-    Shapes: returns (boxes, 4).
-    """
-    chosen = settings or VisionSettings()
-    found = []
-    for stamp_ns in stamps_ns:
-        number = log.latest(stamp_ns, nanoseconds(chosen.max_frame_age_s))
-        boxes_px = np.empty((0, 4))
-        if number is not None:
-            kept, still = kept_and_parked(log, number, chosen.keep, chosen.still)
-            boxes_px = log.frames[number].boxes_px[kept[~still]]
-        found.append(boxes_px)
-    return found
 
 
 def _check_size(camera: PinholeCamera, log: DetectionLog) -> None:

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from worldstate.adapters.camera.opencv import opencv
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, opencv
 from worldstate.ground.values import nanoseconds
 
 from .log_message import LogMessage, image_message

@@ -5,13 +5,10 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from worldstate.adapters.camera.camera_channel import HEALTH_PERIOD_NS
-from worldstate.adapters.camera.camera_health import HealthMonitor
-from worldstate.adapters.camera.detections import DetectionFrame
-from worldstate.adapters.camera.detector import Detector
-from worldstate.adapters.camera.image_quality import image_quality
+from worldstate.adapters.camera.camera_channel import ImageHealth
+from worldstate.adapters.camera.detections import DetectionFrame, Detector
 from worldstate.adapters.camera.miss_rates import MissRates
-from worldstate.adapters.camera.opencv import opencv
+from worldstate.adapters.camera.video import opencv
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import ImageArray
 
@@ -54,28 +51,19 @@ class ImageLooks:
         rates: MissRates | None = None,
     ) -> None:
         self._images, self._detector, self._stamp_ns, self._size_px = images, detector, stamp_ns, size_px
-        self._rates = rates
-        health = None if rates is None else rates.health
-        self._monitor = None if health is None else HealthMonitor(health)
-        self._level, self._read_ns = 0.0, -HEALTH_PERIOD_NS
+        self._health = ImageHealth(rates)
 
     def __call__(self) -> Iterator[tuple[int, DetectionFrame]]:
         """Yield the looks at the images that wait."""
         for captured_s, image in self._images.take_all():
             self._check_size(image)
             stamp_ns = self._stamp_ns(captured_s)
-            self._read_health(stamp_ns, image)
+            self._health.read(stamp_ns, image)
             yield stamp_ns, self._detector.detect(image)
 
     def degradation(self, stamp_ns: int) -> float:
         """Return d as last read, 0 where no scale of health is known."""
-        return self._level
-
-    def _read_health(self, stamp_ns: int, image: ImageArray) -> None:
-        if self._monitor is None or self._rates is None or stamp_ns - self._read_ns < HEALTH_PERIOD_NS:
-            return
-        self._read_ns = stamp_ns
-        self._level = self._rates.level(self._monitor.update(stamp_ns, image_quality(image)))
+        return self._health.level
 
     def _check_size(self, image: ImageArray) -> None:
         got = image.shape[1], image.shape[0]

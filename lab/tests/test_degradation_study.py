@@ -10,8 +10,16 @@ import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from street_frames import street
 from worldstate_lab.degradation.beta_curves import absence_counts, counts_table
-from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, OFF, Condition, all_conditions
+from worldstate_lab.degradation.conditions import (
+    CLEAN,
+    FAMILIES,
+    OFF,
+    Condition,
+    all_conditions,
+    degrade_reduced,
+)
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate_lab.degradation.looks import (
     READINGS,
@@ -81,6 +89,25 @@ def render(log):
         yield np.clip(image, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.parametrize("reduced", [3.025, 4.0])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_reduced_frame_comes_out_as_if_reduced_afterwards(family, reduced):
+    """Mean and spread of patches, dark and bright ones, in which clipping moves both."""
+    grey, rng = next(street(1)), np.random.default_rng(2)
+    height, width = grey.shape[:2]
+    size = (round(width / reduced), round(height / reduced))
+    shift = np.where(np.arange(width) < width // 2, -100.0, 130.0)[:, None]
+    patches = np.clip(grey + shift, 0, 255).astype(np.uint8)
+    for d in (0.25, 1.0):
+        after = cv2.resize(degrade(patches, family, d, rng), size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(patches, size, interpolation=cv2.INTER_AREA)
+        before = degrade_reduced(small, family, d, rng, width / size[0])
+        for columns in (slice(0, size[0] // 2 - 20), slice(size[0] // 2 + 20, None)):
+            one, other = after[:, columns].astype(float), before[:, columns].astype(float)
+            assert other.mean() == pytest.approx(one.mean(), abs=1.5)
+            assert other.std() == pytest.approx(one.std(), rel=0.04, abs=0.3)
+
+
 @pytest.fixture(scope="module")
 def video(approach, tmp_path_factory):
     path = tmp_path_factory.mktemp("staged") / "street.mp4"
@@ -124,8 +151,9 @@ def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
     assert [len(frame) for frame in watched.detections.frames] == [len(frame) for frame in kept.frames[:90]]
     read = degradation_in(looks[READINGS], CLEAN, rates)
     assert np.median(watched.degradation.degradation) == pytest.approx(np.median(read.degradation), abs=0.05)
-    with pytest.raises(InvalidArgumentError, match="health"):
-        Watcher(MotionDetector(), replace(rates, health=None))
+    without_scale = Watcher(MotionDetector(), replace(rates, health=None))
+    without_scale.look(0, image)
+    assert without_scale.watched().degradation(0) == 0.0
 
 
 def test_d_is_read_from_the_images_alone(looks, rates):

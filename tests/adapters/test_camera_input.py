@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import soundfile
 
+from worldstate.adapters.camera.box_linking import count_boxes
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import read_camera
-from worldstate.adapters.camera.static_boxes import ParkedRule, count_boxes
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.listen import listen, open_source
 from worldstate.cli.common.camera_options import given_detections
@@ -56,7 +56,7 @@ def test_every_box_is_put_down_to_one_reason():
     rows = [("car", 0.9, 200.0), ("car", 0.5, 200.0), ("car", 0.9, 50.0), ("dog", 0.9, 200.0)]
     boxes = np.array([[10.0, 20.0, 60.0, 20.0 + height] for *_, height in rows])
     frame = DetectionFrame(boxes, np.array([row[1] for row in rows]), tuple(row[0] for row in rows))
-    counts = count_boxes(DetectionLog.at_rate([frame] * 20, 10.0), DetectionFilter(), ParkedRule())
+    counts = count_boxes(DetectionLog.at_rate([frame] * 20, 10.0), DetectionFilter())
     assert (counts.boxes, counts.other_class, counts.low_score, counts.too_small) == (80, 20, 20, 20)
     assert (counts.counted, counts.parked) == (10, 10)
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from worldstate.adapters.camera.box_linking import parked
 from worldstate.adapters.camera.detections import (
     DetectionFilter,
     DetectionFrame,
     DetectionLog,
     read_detections,
 )
-from worldstate.adapters.camera.static_boxes import ParkedRule, parked
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 
@@ -97,13 +97,13 @@ def moving_log(step_px: float, missed: frozenset[int] = frozenset()) -> Detectio
 @given(step_px=st.floats(1.0, 60.0), frame=st.integers(10, 29))
 def test_what_moves_is_not_parked_and_what_stands_is(step_px: float, frame: int) -> None:
     log = moving_log(step_px)
-    assert parked(log, frame, log.frames[frame].boxes_px, ParkedRule()).tolist() == [False, True]
+    assert parked(log, frame, log.frames[frame].boxes_px).tolist() == [False, True]
 
 
 def test_two_misses_in_a_second_do_not_unpark() -> None:
     still = np.array([[900.0, 500.0, 1100.0, 650.0]])
-    assert parked(moving_log(20.0, frozenset({14, 17})), 20, still, ParkedRule())
-    assert not parked(moving_log(20.0, frozenset({12, 14, 17})), 20, still, ParkedRule())
+    assert parked(moving_log(20.0, frozenset({14, 17})), 20, still)
+    assert not parked(moving_log(20.0, frozenset({12, 14, 17})), 20, still)
 
 
 @given(frame=st.integers(0, 29))
@@ -111,20 +111,14 @@ def test_parking_uses_the_past_only(frame: int) -> None:
     log = moving_log(20.0)
     known = DetectionLog(log.frames[: frame + 1], log.stamps_ns[: frame + 1])
     boxes_px = log.frames[frame].boxes_px
-    verdicts = [parked(some, frame, boxes_px, ParkedRule()).tolist() for some in (log, known)]
+    verdicts = [parked(some, frame, boxes_px).tolist() for some in (log, known)]
     assert verdicts[0] == verdicts[1]
 
 
 def test_not_known_to_be_parked_before_a_full_second() -> None:
     log = moving_log(20.0)
-    verdicts = [parked(log, i, log.frames[i].boxes_px[1:], ParkedRule()).item() for i in (0, 5, 9, 10)]
+    verdicts = [parked(log, i, log.frames[i].boxes_px[1:]).item() for i in (0, 5, 9, 10)]
     assert verdicts == [False, False, False, True]
-
-
-@pytest.mark.parametrize("setting", [{"span_s": 0.0}, {"share": 0.0}, {"share": 1.1}, {"tolerance_px": -1.0}])
-def test_refuses_a_rule_without_meaning(setting: dict[str, float]) -> None:
-    with pytest.raises(InvalidArgumentError, match=next(iter(setting))):
-        ParkedRule(**setting)
 
 
 @pytest.mark.parametrize("setting", [{"min_score": 1.5}, {"min_height_px": -1.0}])

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.degradation import degrade
 from worldstate.adapters.camera.detections import read_detections
-from worldstate.adapters.camera.detector import overlaps
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video

@@ -16,14 +16,12 @@ from worldstate.adapters.camera.camera_health import (
     health_scale,
 )
 from worldstate.adapters.camera.degradation import LEVELS
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
-from worldstate.adapters.camera.detector import Detector
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
 from worldstate.adapters.camera.image_quality import LARGEST_PX, ImageQuality, image_quality
 from worldstate.adapters.camera.miss_rates import MissRates
-from worldstate.adapters.camera.motion_detector import Background, MotionDetector, MotionSettings
-from worldstate.adapters.camera.opencv import opencv
+from worldstate.adapters.camera.motion_detector import Background, MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import Video
+from worldstate.adapters.camera.video import Video, opencv
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray, ImageArray
 from worldstate.ground.values import nanoseconds
@@ -60,7 +58,7 @@ class StagedDetector:
 def motion_detectors() -> tuple[StagedDetector, ...]:
     """Return background subtraction by mixtures and by neighbours, which need no model."""
     kinds: tuple[Background, ...] = ("mog2", "knn")
-    return tuple(StagedDetector(kind, partial(MotionDetector, MotionSettings(kind))) for kind in kinds)
+    return tuple(StagedDetector(kind, partial(MotionDetector, kind)) for kind in kinds)
 
 
 def look(

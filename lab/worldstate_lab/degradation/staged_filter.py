@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.adapters.acoustic import asked_again
+from worldstate.adapters.camera.box_linking import kept_and_parked, overlaps
 from worldstate.adapters.camera.camera_health import DegradationLog
-from worldstate.adapters.camera.detector import overlaps
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
-from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings, moving_boxes
+from worldstate.adapters.camera.vision_query import VisionQuery, VisionSettings
 from worldstate.adapters.listen import Source, measure_steps, unoccluded_sector
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.blas_threads import one_blas_thread
 from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings
 from worldstate.operations.recordings.hop_stream import hop_stream
@@ -127,13 +129,25 @@ def _reference(source: Source, stamps_ns: Sequence[int]) -> list[FloatArray]:
     """Return the moving boxes that are there at each stamp."""
     if source.detections is None:
         return [np.empty((0, 4))] * len(stamps_ns)
-    return moving_boxes(source.detections, stamps_ns)
+    return _moving_boxes(source.detections, stamps_ns, DetectionFilter())
+
+
+def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFilter) -> list[FloatArray]:
+    """Return the moving boxes that count, shape (boxes, 4), of the frame at each stamp."""
+    longest_ns, found = nanoseconds(VisionSettings().max_frame_age_s), []
+    for number in (log.latest(stamp_ns, longest_ns) for stamp_ns in stamps_ns):
+        boxes_px = np.empty((0, 4))
+        if number is not None:
+            kept, still = kept_and_parked(log, number, keep)
+            boxes_px = log.frames[number].boxes_px[kept[~still]]
+        found.append(boxes_px)
+    return found
 
 
 def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Sequence[int]) -> BoolArray:
     """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
     least = AbsenceSettings().min_overlap
-    detected = moving_boxes(query.detections, stamps_ns, query.settings) if query.detections else []
+    detected = _moving_boxes(query.detections, stamps_ns, query.settings.keep) if query.detections else []
     found = [
         (overlaps(there, boxes) >= least).any() for there, boxes in zip(reference, detected, strict=True)
     ]

@@ -6,6 +6,7 @@ from typing import Self
 
 import numpy as np
 
+from worldstate.adapters.camera.box_linking import gated_pairs, overlaps
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
@@ -30,7 +31,7 @@ class OcSortSettings:
     inertia: float = 0.2  # Weight of the direction of motion in the association
     delta_t: int = 3  # Images over which that direction is read
     # The authors' code applies the box that ends a gap twice, the first time as the end of the replayed
-    # trajectory, and so did everybody who ran OC-SORT. False applies it once, as the paper has it.
+    # trajectory, and so did every use of OC-SORT. False applies it once, as the paper has it.
     twice: bool = True
 
     def __post_init__(self) -> None:
@@ -101,7 +102,7 @@ class OcSort:
         """Return pairs of track and box: by prediction and direction first, then by the last box seen."""
         tracks, least = self._tracks, self._settings.min_iou
         predicted = np.array([track.belief.box_px for track in tracks]).reshape(-1, 4)
-        overlap = _iou(predicted, boxes)
+        overlap = overlaps(predicted, boxes)
         toward = [track.consistency(boxes, self._settings.delta_t) for track in tracks]
         weight = self._settings.inertia * scores * np.array(toward).reshape(overlap.shape)
         pairs = _matched(overlap, weight, least)
@@ -109,7 +110,7 @@ class OcSort:
         idle = np.setdiff1d(np.arange(len(tracks)), [i for i, _ in pairs])
         free = np.setdiff1d(np.arange(len(boxes)), [j for _, j in pairs])
         last = np.array([tracks[i].last_px for i in idle]).reshape(-1, 4)
-        again = _matched(_iou(last, boxes[free]), 0.0, least)
+        again = _matched(overlaps(last, boxes[free]), 0.0, least)
         return pairs + [(int(idle[i]), int(free[j])) for i, j in again]
 
 
@@ -229,18 +230,7 @@ def _direction(start_px: FloatArray, end_px: FloatArray) -> FloatArray:
     return np.asarray(apart / (np.linalg.norm(apart, axis=-1, keepdims=True) + _TINY))
 
 
-def _iou(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return intersection over union of every pair of boxes, shape (n, m)."""
-    low = np.maximum(first[:, None, :2], second[None, :, :2])
-    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
-    shared = np.prod(np.maximum(high - low, 0.0), axis=2)
-    area = [np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (first, second)]
-    return np.asarray(shared / np.maximum(area[0][:, None] + area[1][None] - shared, _TINY))
-
-
 def _matched(overlap: FloatArray, weight: FloatArray | float, least: float) -> list[tuple[int, int]]:
     """Return the assignment of the largest sum of overlap and weight, without pairs that hardly overlap."""
-    from scipy.optimize import linear_sum_assignment  # Slow to import
-
-    rows, columns = linear_sum_assignment(overlap + weight, maximize=True)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlap[i, j] >= least]
+    cost = -(overlap + weight)
+    return [(i, j) for i, j in gated_pairs(cost, overlap >= least, cost).tolist()]

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from worldstate.adapters.camera.box_linking import gated_pairs
 from worldstate.ground.checks import check_shape, finite_array, in_range
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, IntArray
-from worldstate.operations.metrics.assignment import bearing_errors, gated_pairs
+from worldstate.ground.values import wrap_angle
 
 # A miss costs half of it. At the 20 degrees that bearing trackers are often scored at, silence (10) beats
 # every estimate that is 10 degrees off or more; at 60 it costs as much as the gate of the track measures.
@@ -58,7 +59,7 @@ def gospa_bearing(
     truths = finite_array("truths_rad", truths_rad, (None,))
     power = in_range("order", order, 1.0, math.inf)
     cut = in_range("cutoff_rad", cutoff_rad, 0.0, math.inf, open_low=True) ** power
-    cost = bearing_errors(estimates, truths) ** power
+    cost = _bearing_errors(estimates, truths) ** power
     pairs = gated_pairs(cost, cost <= cut, cut)
     parts = (
         float(cost[pairs[:, 0], pairs[:, 1]].sum()),
@@ -262,7 +263,7 @@ def _match_hops(
         sources, names = truths.source[rows].tolist(), estimates.track[said].tolist()
         # Held is what was matched in the hop before, as in CLEAR-MOT; after a miss the nearest is taken.
         held = np.array([[(hop - 1, source, name) in last for name in names] for source in sources])
-        cost = bearing_errors(truths.azimuth_rad[rows], estimates.azimuth_rad[said])
+        cost = _bearing_errors(truths.azimuth_rad[rows], estimates.azimuth_rad[said])
         within = cost <= gate
         price = cost + _TIE * cost**2 - _HOLD * (keep & held & within)
         pairs = gated_pairs(price, within, _MISS)
@@ -271,7 +272,7 @@ def _match_hops(
         last = {(hop, sources[i], names[j]) for i, j in pairs.tolist()}
         rest = estimates.azimuth_rad[np.delete(said, pairs[:, 1])]
         if rest.size:
-            beside = bearing_errors(truths.azimuth_rad[idle.get(hop, _NO_ROWS)], rest)
+            beside = _bearing_errors(truths.azimuth_rad[idle.get(hop, _NO_ROWS)], rest)
             false += rest.size - len(gated_pairs(beside, beside <= gate, _MISS))
     return track, error, false
 
@@ -282,3 +283,8 @@ def _rows_by_hop(hop: IntArray, used: BoolArray | None = None) -> dict[int, Inde
     values, starts = np.unique(hop[rows], return_index=True)
     # The piece before the first start is empty, and the only one where there are no rows.
     return dict(zip(values.tolist(), np.split(rows, starts)[1:], strict=True))
+
+
+def _bearing_errors(truths_rad: FloatArray, estimates_rad: FloatArray) -> FloatArray:
+    """Return the absolute angle of every estimate from every truth, shape (truths, estimates)."""
+    return np.abs(wrap_angle(truths_rad[:, None] - estimates_rad))

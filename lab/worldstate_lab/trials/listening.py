@@ -13,7 +13,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
 from worldstate.adapters.acoustic_grounding import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
-from worldstate.adapters.camera.static_boxes import kept_and_parked
+from worldstate.adapters.camera.box_linking import kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.acoustic_domain import TRAIN, feature_order
 from worldstate.adapters.files.model_file import Model
@@ -236,7 +236,7 @@ def _boxes(source: Source, vision: VisionQuery) -> HopTable:
     rows: list[tuple[Any, ...]] = []
     for number, frame in enumerate(() if log is None else log.frames):
         assert log is not None
-        kept, still = kept_and_parked(log, number, settings.keep, settings.still)
+        kept, still = kept_and_parked(log, number, settings.keep)
         moving = set(kept[~still].tolist())
         for i, box in enumerate(frame.boxes_px):
             sighting = source.camera.sighting(box, frame.labels[i], float(frame.scores[i]))

@@ -97,9 +97,9 @@ def box_counts(source: "Source", *, as_json: bool) -> object:
     """Say how many boxes count and why the others do not; None without a camera."""
     from dataclasses import asdict
 
-    from worldstate.adapters.camera.static_boxes import ParkedRule, count_boxes
+    from worldstate.adapters.camera.box_linking import count_boxes
 
     if source.detections is None:
         return None
-    counts = count_boxes(source.detections, source.settings.boxes, ParkedRule())
+    counts = count_boxes(source.detections, source.settings.boxes)
     return asdict(counts) if as_json else str(counts)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from worldstate.adapters.camera.detections import DetectionFilter
-    from worldstate.adapters.camera.onnx_detector import OnnxDetector, OnnxSettings
+    from worldstate.adapters.camera.onnx_detector import OnnxDetector
     from worldstate.operations.detectors.miss_rate_measurement import MakeDetector
 
 
@@ -33,30 +33,28 @@ def detector_maker(arguments: argparse.Namespace) -> "MakeDetector":
     InvalidArgumentError
         If a model is wanted and none given, or no package brings a detector of that name.
     """
-    from worldstate.adapters.camera.motion_detector import MotionDetector, MotionSettings
-    from worldstate.adapters.camera.onnx_detector import OnnxSettings
+    from worldstate.adapters.camera.motion_detector import MotionDetector
     from worldstate.adapters.own_parts import DetectorPart, load_part
     from worldstate.ground.errors import InvalidArgumentError
 
     if arguments.detector == "onnx":
         if arguments.onnx_model is None:
             raise InvalidArgumentError("--onnx-model: expected a model for --detector onnx")
-        make = partial(_opened, arguments.onnx_model, OnnxSettings(labels=tuple(arguments.labels)))
+        make = partial(_opened, arguments.onnx_model, tuple(arguments.labels))
         make()  # what is wrong with a model is said before the work begins
         return make
     if arguments.detector not in MOVING:
         make_own: DetectorPart = load_part("worldstate.detectors", arguments.detector, "--detector", BUILT_IN)
         return make_own
-    settings = MotionSettings(background="knn" if arguments.detector == "knn" else "mog2")
-    return partial(MotionDetector, settings)
+    return partial(MotionDetector, "knn" if arguments.detector == "knn" else "mog2")
 
 
 @cache
-def _opened(path: Path, settings: "OnnxSettings") -> "OnnxDetector":
+def _opened(path: Path, labels: tuple[str, ...]) -> "OnnxDetector":
     """Open a model once a process."""
     from worldstate.adapters.camera.onnx_detector import open_onnx
 
-    return open_onnx(path, settings)
+    return open_onnx(path, labels)
 
 
 def detector_filter(arguments: argparse.Namespace) -> "DetectionFilter":

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from worldstate.adapters.camera.box_linking import kept_and_parked, overlaps
 from worldstate.adapters.camera.camera_health import CameraHealth, learn_health
 from worldstate.adapters.camera.degradation import FAMILIES, LEVELS, Family, degrade
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
-from worldstate.adapters.camera.detector import Detector, overlaps
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.static_boxes import ParkedRule, kept_and_parked
 from worldstate.adapters.camera.video import VIDEO_NAME, Video
 from worldstate.adapters.datasets.ovad import OvadDataset, Recording
 from worldstate.adapters.datasets.ovad_layout import LOG_NAME
@@ -262,7 +261,7 @@ class _Look:
 
 
 def _counted(reference: DetectionLog, number: int, settings: AbsenceSettings) -> IntArray:
-    kept, still = kept_and_parked(reference, number, settings.keep, ParkedRule())
+    kept, still = kept_and_parked(reference, number, settings.keep)
     return kept[~still] if settings.moving_only else kept
 
 

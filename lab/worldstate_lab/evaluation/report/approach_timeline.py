@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from worldstate.adapters.camera.opencv import opencv
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import open_video
+from worldstate.adapters.camera.video import open_video, opencv
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray
 from worldstate.operations.figure_style import BLUE, GREEN, PURPLE, RED
 from worldstate.operations.recordings.hop_table import HopTable
