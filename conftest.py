@@ -8,8 +8,7 @@ import pytest
 from hypothesis import settings
 from worldstate_lab.cli.main import main as study
 
-from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.demo import simulate_approach
 from worldstate.frontend.array.ovad_array import ovad_array

@@ -1,18 +1,25 @@
-"""Snapshots of a log, whichever form it has: JSON lines, MCAP, or a bag of ROS 2."""
+"""Snapshots of a log in any form: JSON lines of `worldstate run --out`, MCAP, or a bag of ROS 2."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from worldstate.adapters.export.mcap_file import read_snapshot_lines
-from worldstate.adapters.files.states_file import state_lines
+from worldstate.adapters.files.atomic import atomic_path
 from worldstate.adapters.files.text_file import refused_as_file
 from worldstate.adapters.ros.bag_reader import is_bag
 from worldstate.adapters.ros.state_bag import bag_snapshot_lines
-from worldstate.ground.errors import InputFileError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.serialisation import MOST_CHARACTERS, decode_json
+from worldstate.ground.values import nanoseconds, seconds
 from worldstate.state import WorldState
 
+# A hop: the last decision of a recording ends up to so long before it does.
+_SLACK_NS = nanoseconds(0.1)
 # An MCAP file begins with its magic number, then the header, of which the profile comes first.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
+_EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
 
 def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
@@ -23,15 +30,66 @@ def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
             yield line, WorldState.from_json(line)
             empty = False
     if empty:
-        raise InputFileError(path, "expected snapshots, got none: `worldstate run --out` writes them")
+        raise InputFileError(path, _EMPTY)
 
 
 def _lines(path: Path) -> Iterator[str]:
     if path.suffix.lower() == ".mcap" and path.is_file() and not _is_of_ros(path):
         return read_snapshot_lines(path)
-    return bag_snapshot_lines(path) if is_bag(path) else state_lines(path)
+    return bag_snapshot_lines(path) if is_bag(path) else _json_lines(path)
 
 
 def _is_of_ros(path: Path) -> bool:
     with path.open("rb") as file:
         return _ROS_PROFILE in file.read(_HEADER_BYTES)
+
+
+def read_state_near(path: str | Path, stamp_ns: int) -> WorldState:
+    """Return the snapshot of a file that is nearest to a time, which must not lie outside the file's."""
+    with refused_as_file(path):
+        # Only the one that is asked for is read whole: an hour has 36,000.
+        first_ns = last_ns = nearest = None
+        for at_ns, value in _records(path):
+            first_ns, last_ns = at_ns if first_ns is None else first_ns, at_ns
+            if nearest is None or abs(at_ns - stamp_ns) < abs(nearest[0] - stamp_ns):
+                nearest = at_ns, value
+            elif at_ns > stamp_ns >= first_ns:
+                break
+        if nearest is None or first_ns is None or last_ns is None:
+            raise InputFileError(path, _EMPTY)
+        if not first_ns - _SLACK_NS <= stamp_ns <= last_ns + _SLACK_NS:
+            raise InputFileError(
+                path,
+                f"expected a time from {seconds(first_ns):.1f} to {seconds(last_ns):.1f} s, in which it has "
+                f"snapshots, got {seconds(stamp_ns):.1f} s",
+            )
+        return WorldState.from_dict(nearest[1])
+
+
+@contextmanager
+def states_writer(path: Path | None) -> Iterator[Callable[[str], None]]:
+    """Lend a function that writes a snapshot's line; without a path one that writes nothing."""
+    if path is None:
+        yield lambda line: None
+        return
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        yield lambda line: print(line, file=file)
+
+
+def _json_lines(path: str | Path) -> Iterator[str]:
+    """Yield every line of the file, without its end."""
+    with Path(path).open("rb") as file:
+        for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
+            try:
+                yield line.decode().rstrip("\n")
+            except UnicodeDecodeError as error:
+                raise InvalidArgumentError(f"line {number}: expected UTF-8") from error
+
+
+def _records(path: str | Path) -> Iterator[tuple[int, object]]:
+    """Yield stamp and content of every line."""
+    for number, line in enumerate(_json_lines(path), start=1):
+        value = decode_json(line, f"line {number}")
+        stamp_ns = value.get("stamp_ns") if isinstance(value, dict) else None
+        # What has no stamp is refused by the reader of snapshots, which says what is missing.
+        yield stamp_ns if isinstance(stamp_ns, int) else WorldState.from_dict(value).stamp_ns, value

@@ -12,7 +12,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 
-from .ovad_layout import ARRAY_NAME, AUDIO_NAME, LOG_NAME
+from .ovad import ARRAY_NAME, AUDIO_NAME, LOG_NAME
 
 _LOG = logging.getLogger(__name__)
 

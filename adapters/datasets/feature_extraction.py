@@ -21,7 +21,7 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 
 from .feature_table import FeatureTable, t0_of
-from .ovad_layout import AUDIO_NAME
+from .ovad import AUDIO_NAME
 
 WINDOW_S = 1.0
 REQUIRED = ("ID", "Class", "Environment", "Recording ID")

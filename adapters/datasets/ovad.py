@@ -16,7 +16,15 @@ from worldstate.adapters.camera.detections import DetectionLog, read_detections
 from worldstate.adapters.files.text_file import read_rows
 from worldstate.ground.errors import InputFileError
 
-from .ovad_layout import AUDIO_NAME, COLUMNS, DETECTION_NAMES, FRAME_RATE_HZ, LOG_NAME
+LOG_NAME = "DataLog.csv"
+AUDIO_NAME = "out_multi.wav"
+ARRAY_NAME = "array.xml"  # Not of OVAD itself: the array of a data set, in its root
+# The data set's description names the first, its authors' code opens the second.
+DETECTION_NAMES = ("camera_baseline_results.json", "camera_baseline_detections.json")
+# Beside a simulated recording only.
+TRUTH_NAME = "truth.json"
+COLUMNS = ("ID", "Environment", "Class", "T0")
+FRAME_RATE_HZ = 10.0
 
 Label = Literal["left", "none", "right"]
 LABELS: dict[str, Label] = {label: label for label in get_args(Label)}

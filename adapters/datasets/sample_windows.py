@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from .feature_extraction import WINDOW_S, LabelledWindow
-from .ovad import OvadDataset, Recording
-from .ovad_layout import FRAME_RATE_HZ
+from .ovad import FRAME_RATE_HZ, OvadDataset, Recording
 
 MOVING_LATER_S, FRONT_LATER_S = 0.5, 1.5
 FRONT = "front"

@@ -8,8 +8,7 @@ from typing import Any
 from worldstate.adapters.audio.open_sound import SoundInput, open_sound
 from worldstate.adapters.audio.sound_file import open_audio
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
-from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ, TRUTH_NAME
+from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME, Recording
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.files.text_file import read_json
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -56,8 +56,7 @@ from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_
 from worldstate.adapters.camera.motion_detector import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.datasets.ovad import OvadDataset, Recording
-from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
 from worldstate.adapters.listen import listen_steps, measure_steps, open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter

@@ -19,8 +19,7 @@ from worldstate_lab.trials.takes import Take, TakeList
 from worldstate.adapters.camera.degradation import LEVELS
 from worldstate.adapters.camera.miss_rates import FamilyCounts
 from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.adapters.datasets.ovad import Recording
-from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.approach_table import poisson_interval
 from worldstate.operations.recordings.hop_stream import ABSENT, PRESENT, UNQUERIED

@@ -14,8 +14,7 @@ import numpy as np
 from worldstate.adapters.camera.opencv import opencv
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.adapters.datasets.ovad import OvadDataset
-from worldstate.adapters.datasets.ovad_layout import (
+from worldstate.adapters.datasets.ovad import (
     ARRAY_NAME,
     AUDIO_NAME,
     COLUMNS,
@@ -23,6 +22,7 @@ from worldstate.adapters.datasets.ovad_layout import (
     FRAME_RATE_HZ,
     LOG_NAME,
     TRUTH_NAME,
+    OvadDataset,
 )
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.atomic import atomic_path, deferred_signals, write_text

@@ -8,7 +8,7 @@ from typing import Any
 
 import soundfile
 
-from worldstate.adapters.datasets.ovad_layout import TRUTH_NAME
+from worldstate.adapters.datasets.ovad import TRUTH_NAME
 from worldstate.ground.errors import InputFileError
 
 WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64

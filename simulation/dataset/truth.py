@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.simulation.scene.driving import comes_into_view_s
 from worldstate.simulation.scene.settings import SimulationSettings

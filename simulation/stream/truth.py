@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.simulation.camera.simulated_detector import (

@@ -9,8 +9,7 @@ import soundfile
 from released_data import FOLDER
 
 from worldstate.adapters.datasets.feature_table import read_ids
-from worldstate.adapters.datasets.ovad import OvadDataset, Recording
-from worldstate.adapters.datasets.ovad_layout import DETECTION_NAMES
+from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
 from worldstate.ground.errors import InputFileError
 
 HEADER = "ID,Environment,Class,T0"

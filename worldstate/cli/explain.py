@@ -35,8 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.states_file import read_state_near
-    from worldstate.adapters.state_log import read_log
+    from worldstate.adapters.state_log import read_log, read_state_near
     from worldstate.ground.checks import in_range
     from worldstate.ground.values import nanoseconds, seconds
     from worldstate.operations.recordings.evidence_report import common_lines, evidence_report

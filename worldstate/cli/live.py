@@ -222,8 +222,8 @@ def _with_odometry(
 def _listen(arguments: argparse.Namespace, source: "Source", sound: "LiveSound") -> dict[str, object]:
     """Listen until the sound ends; return what came of it and what it cost."""
     from worldstate.adapters.files.checkpoint_file import save_checkpoint
-    from worldstate.adapters.files.states_file import states_writer
     from worldstate.adapters.live.live_listening import live_steps
+    from worldstate.adapters.state_log import states_writer
     from worldstate.cli.common.live_view import live_view, loss_notices
     from worldstate.ground.values import seconds
     from worldstate.operations.recordings.live_report import LiveReport

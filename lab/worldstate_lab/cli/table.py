@@ -319,8 +319,7 @@ def _simulated(arguments: argparse.Namespace) -> Path:
     """Simulate the streets that are not there yet."""
     from dataclasses import replace
 
-    from worldstate.adapters.datasets.ovad import OvadDataset
-    from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+    from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset
     from worldstate.simulation.dataset.dataset import write_dataset
     from worldstate.simulation.dataset.plan import DatasetSettings
 

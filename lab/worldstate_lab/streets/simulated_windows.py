@@ -15,7 +15,7 @@ import scipy.signal
 
 from worldstate.adapters.datasets.feature_extraction import WINDOW_S
 from worldstate.adapters.datasets.feature_table import FeatureTable
-from worldstate.adapters.datasets.ovad_layout import FRAME_RATE_HZ
+from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.adapters.datasets.sample_windows import window_ends_s
 from worldstate.adapters.parallel import in_processes
 from worldstate.frontend.array.microphone_array import MicrophoneArray

@@ -6,8 +6,14 @@ from pathlib import Path
 
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.feature_table import read_ids
-from worldstate.adapters.datasets.ovad import OvadDataset, Recording
-from worldstate.adapters.datasets.ovad_layout import AUDIO_NAME, DETECTION_NAMES, LOG_NAME, TRUTH_NAME
+from worldstate.adapters.datasets.ovad import (
+    AUDIO_NAME,
+    DETECTION_NAMES,
+    LOG_NAME,
+    TRUTH_NAME,
+    OvadDataset,
+    Recording,
+)
 from worldstate.ground.errors import InputFileError
 from worldstate.simulation.stream.truth import stream_hazards
 

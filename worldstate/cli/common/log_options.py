@@ -94,7 +94,7 @@ def _open_stacks(arguments: argparse.Namespace, logs: StateLogs, opened: ExitSta
         logs.stacks.append(opened.enter_context(osi_trace(arguments.osi, crossing_m)))
     if arguments.autoware is not None:
         from worldstate.adapters.export.autoware import autoware_objects
-        from worldstate.adapters.files.states_file import states_writer
+        from worldstate.adapters.state_log import states_writer
 
         write = opened.enter_context(states_writer(arguments.autoware))
         logs.stacks.append(
@@ -126,8 +126,7 @@ def log_hops(
         if not logs.viewers:
             yield lambda step: logs.state(step.state)
             return
-        from worldstate.adapters.export.camera_images import camera_images
-        from worldstate.adapters.export.log_message import srp_message
+        from worldstate.adapters.export.log_message import camera_images, srp_message
 
         image_before = camera_images(source.audio_path.parent, source.start_ns)
 

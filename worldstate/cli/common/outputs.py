@@ -52,7 +52,7 @@ def output_folder(folder: Path, *files: str) -> Path:
 def _is_read(target: Path, source: Path) -> bool:
     """Whether an output is the input file itself, or one of the files of an input in the layout of OVAD."""
     from worldstate.adapters.camera.video import VIDEO_NAME
-    from worldstate.adapters.datasets import ovad_layout as ovad
+    from worldstate.adapters.datasets import ovad
 
     if source.is_dir():
         sound_and_log = ovad.ARRAY_NAME, ovad.AUDIO_NAME, ovad.LOG_NAME, ovad.TRUTH_NAME

@@ -30,8 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return what it found."""
-    from worldstate.adapters.files.states_file import states_writer
-    from worldstate.adapters.state_log import read_log
+    from worldstate.adapters.state_log import read_log, states_writer
     from worldstate.cli.common.progress import progress_bar
     from worldstate.ground.values import seconds
     from worldstate.operations.recordings.warning import WarningMeter

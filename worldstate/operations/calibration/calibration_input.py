@@ -4,8 +4,7 @@ import json
 from pathlib import Path
 from zlib import crc32
 
-from worldstate.adapters.datasets.ovad import OvadDataset, Recording
-from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listen import ListenSettings, measure_steps, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray

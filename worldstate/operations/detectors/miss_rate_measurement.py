@@ -13,8 +13,7 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionFram
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, Video
-from worldstate.adapters.datasets.ovad import OvadDataset, Recording
-from worldstate.adapters.datasets.ovad_layout import LOG_NAME
+from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, ImageArray, IntArray

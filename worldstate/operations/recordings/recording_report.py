@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from worldstate.adapters.files.checkpoint_file import Checkpoint
-from worldstate.adapters.files.states_file import states_writer
 from worldstate.adapters.listen import Source, Step, listen_steps
+from worldstate.adapters.state_log import states_writer
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.values import seconds
 

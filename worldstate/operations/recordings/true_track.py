@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.datasets.ovad_layout import TRUTH_NAME
+from worldstate.adapters.datasets.ovad import TRUTH_NAME
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray
 
