@@ -11,9 +11,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from worldstate.adapters.camera.opencv import opencv
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import VIDEO_NAME
+from worldstate.adapters.camera.video import VIDEO_NAME, opencv
 from worldstate.adapters.datasets.ovad import (
     ARRAY_NAME,
     AUDIO_NAME,

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.fft import rfft, rfftfreq
 
-from worldstate.adapters.datasets.ovad_layout import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
+from worldstate.adapters.datasets.ovad import ARRAY_NAME, AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.ovad_array import ovad_array

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from worldstate.adapters.files.csv_rows import number, read_rows
 
+from worldstate.adapters.files.text_file import number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.srp import srp_phat
